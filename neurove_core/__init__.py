@@ -1,0 +1,1 @@
+"""The paper (NeuroVE) and its models: no network, no clocks, no threads."""

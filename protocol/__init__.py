@@ -1,0 +1,23 @@
+"""What goes over the wire between camera drivers, the NeuroVE service and its consumers.
+
+A driver or a consumer needs this package alone (numpy, msgpack, pydantic): importing it pulls in neither torch nor
+zenoh. README.md beside this file is the contract.
+"""
+
+from protocol.camera import CameraInfo
+from protocol.errors import NeuroVEError
+from protocol.events import EVENT_DTYPE, EventPacket, Events, Sensor
+from protocol.velocity import Flag, Trace, Twist, TwistEstimate
+
+__all__ = [
+    "EVENT_DTYPE",
+    "CameraInfo",
+    "EventPacket",
+    "Events",
+    "Flag",
+    "NeuroVEError",
+    "Sensor",
+    "Trace",
+    "Twist",
+    "TwistEstimate",
+]

@@ -1,0 +1,49 @@
+"""CameraInfo: what a camera looks through, so that a network can see any camera as its canonical one."""
+
+from typing import Annotated, ClassVar, Literal, Self
+
+from pydantic import Field, model_validator
+
+from protocol.codec import Message
+from protocol.events import Sensor
+from protocol.keys import check_name
+
+SCHEMA = "application/msgpack;neurove.camera.1"
+"""Zenoh Encoding of a CameraInfo."""
+
+Positive = Annotated[float, Field(gt=0)]
+
+
+class CameraInfo(Message):
+    """Intrinsics of one stream's camera, in the optical frame (x right, y down, z forward), pixel centres at integers.
+
+    `pinhole` takes the distortion k1 k2 p1 p2 [k3] (radial-tangential, as OpenCV and the Event Camera Dataset);
+    `equidistant` takes k1 k2 k3 k4 (fisheye, as Kalibr and MVSEC). An empty list is a perfect lens.
+    """
+
+    what: ClassVar[str] = "camera info"
+
+    stream: str
+    width: Annotated[int, Field(ge=1, le=1 << 15)]
+    height: Annotated[int, Field(ge=1, le=1 << 15)]
+    lens: Literal["pinhole", "equidistant"]
+    fx: Positive
+    fy: Positive
+    cx: float
+    cy: float
+    distortion: Annotated[tuple[float, ...], Field(strict=False)] = ()
+    height_m: Positive | None = None  # camera above the ground plane [m], where known
+
+    @model_validator(mode="after")
+    def _distortion_fits_the_lens(self) -> Self:
+        check_name("stream", self.stream)
+        allowed = (0, 4, 5) if self.lens == "pinhole" else (0, 4)
+        if len(self.distortion) not in allowed:
+            counts = ", ".join(map(str, allowed))
+            raise ValueError(f"distortion has {len(self.distortion)} coefficients, {self.lens} takes {counts}")
+        return self
+
+    @property
+    def sensor(self) -> Sensor:
+        """The pixel array these intrinsics belong to."""
+        return Sensor(self.width, self.height)

@@ -1,0 +1,93 @@
+"""Bytes <-> checked messages: msgpack maps with a version field, validated by pydantic, refused with our own errors."""
+
+from typing import Any, ClassVar, Final, Literal, Self, TypeVar, cast
+
+import msgpack
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from protocol.errors import InvalidField, Malformed, NeuroVEError, UnsupportedVersion
+
+PROTOCOL_VERSION: Final = 1
+"""Major version on the wire. Fields may be added within a version; readers of data messages ignore unknown ones."""
+
+MAX_STRING_BYTES = 4096
+MAX_ITEMS = 4096
+MAX_MESSAGE_BYTES = 1 << 20
+"""Cap of every message but the event packet, which has its own (events.Limits)."""
+
+
+class Part(BaseModel):
+    """A part of a message: immutable, strictly typed, finite numbers only."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="ignore", allow_inf_nan=False)
+
+
+class Message(Part):
+    """A message on the wire: a part that stands alone and says which protocol version it speaks."""
+
+    what: ClassVar[str] = "message"
+    v: Literal[1] = PROTOCOL_VERSION
+
+    def encode(self) -> bytes:
+        """This message as a msgpack map."""
+        return cast(bytes, msgpack.packb(self.model_dump()))
+
+    @classmethod
+    def decode(cls, data: bytes) -> Self:
+        """Read and check a message.
+
+        Raises:
+            Malformed, UnsupportedVersion, InvalidField: the first thing that is wrong, never any other exception.
+        """
+        return validate(cls, unpack(data, cls.what))
+
+
+MessageT = TypeVar("MessageT", bound=Message)
+
+
+def validate(kind: type[MessageT], fields: dict[str, Any]) -> MessageT:
+    """The message of this kind that the fields make, or the first reason why not as InvalidField."""
+    try:
+        return kind.model_validate(fields)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        name = ".".join(str(part) for part in first["loc"]) or "?"
+        value = "missing" if first["type"] == "missing" else first["input"]
+        raise InvalidField(kind.what, name, value, first["msg"]) from None
+
+
+def unpack(data: bytes, what: str, max_bytes: int = MAX_MESSAGE_BYTES) -> dict[str, Any]:
+    """The msgpack map in `data`: no duplicate key, bounded in size, of our protocol version.
+
+    Raises:
+        Malformed: not one whole msgpack map. InvalidField: too large. UnsupportedVersion: another major version.
+    """
+    if len(data) > max_bytes:
+        raise InvalidField(what, "size", len(data), f"a message has at most {max_bytes} bytes")
+    try:
+        fields = msgpack.unpackb(
+            data,
+            object_pairs_hook=_map_without_duplicates,
+            max_str_len=MAX_STRING_BYTES,
+            max_bin_len=max_bytes,
+            max_array_len=MAX_ITEMS,
+            max_map_len=MAX_ITEMS,
+            max_ext_len=0,
+        )
+    except NeuroVEError:
+        raise
+    except (ValueError, TypeError, RecursionError, msgpack.UnpackException) as error:
+        raise Malformed(what, str(error) or type(error).__name__) from None
+    if not isinstance(fields, dict):
+        raise Malformed(what, f"a map is expected, not {type(fields).__name__}")
+    version = fields.get("v")
+    if type(version) is not int or version != PROTOCOL_VERSION:
+        raise UnsupportedVersion(what, version, PROTOCOL_VERSION)
+    return fields
+
+
+def _map_without_duplicates(pairs: list[tuple[Any, Any]]) -> dict[str, Any]:
+    fields = dict(pairs)
+    if len(fields) != len(pairs):
+        raise ValueError("a key stands twice in one map")
+    return fields

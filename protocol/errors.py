@@ -1,0 +1,125 @@
+"""NeuroVEError and the errors that a peer can be told.
+
+Every error has a stable `code` (part of the wire contract), a sentence that names field, value and bound, and the same
+three as `details` for machines.
+"""
+
+from typing import ClassVar
+
+Detail = str | int | float | bool | None
+
+
+class NeuroVEError(Exception):
+    """Base of all errors that a user or a peer may see: a stable code, a sentence, and its parts as fields."""
+
+    code: ClassVar[str] = "internal"
+
+    def __init__(self, message: str, **details: Detail) -> None:
+        super().__init__(message)
+        self.message = message
+        self.details: dict[str, Detail] = details
+
+
+class InternalError(NeuroVEError):
+    """A bug on the answering side; its log has the trace back."""
+
+    code = "internal"
+
+    def __init__(self) -> None:
+        super().__init__("internal error: see the log of the node that answered")
+
+
+class Malformed(NeuroVEError):
+    """The bytes are no message at all: not msgpack, cut short, trailing bytes, or a key twice."""
+
+    code = "malformed"
+
+    def __init__(self, what: str, why: str) -> None:
+        super().__init__(f"{what}: not a valid message: {why}", what=what)
+
+
+class UnsupportedVersion(NeuroVEError):
+    """The message speaks another major version of the protocol."""
+
+    code = "unsupported_version"
+
+    def __init__(self, what: str, got: object, want: int) -> None:
+        value = got if isinstance(got, int) else repr(got)
+        super().__init__(f"{what}: protocol version v={value}, this side speaks v={want}", field="v", value=value)
+
+
+class InvalidField(NeuroVEError):
+    """One field is missing, of the wrong type, or out of its bound."""
+
+    code = "invalid_field"
+
+    def __init__(self, what: str, field: str, value: object, bound: str) -> None:
+        shown = repr(value)
+        shown = shown if len(shown) <= 80 else shown[:77] + "..."
+        super().__init__(f"{what}: {field}={shown}: {bound}", field=field, value=shown, bound=bound)
+
+
+class UnknownFormat(NeuroVEError):
+    """The event blob is in a layout that this side cannot read."""
+
+    code = "unknown_format"
+
+    def __init__(self, got: str, known: tuple[str, ...]) -> None:
+        super().__init__(
+            f"event packet: format={got!r}: known formats are {', '.join(known)}", field="format", value=got
+        )
+
+
+class BlobLength(NeuroVEError):
+    """The event blob is not n times the record size of its format."""
+
+    code = "blob_length"
+
+    def __init__(self, got: int, n: int, record_bytes: int) -> None:
+        super().__init__(
+            f"event packet: data is {got} bytes, n={n} events of {record_bytes} bytes need {n * record_bytes}",
+            field="data",
+            value=got,
+            bound=n * record_bytes,
+        )
+
+
+class EventOutsideSensor(NeuroVEError):
+    """An event lies outside the sensor that its packet names."""
+
+    code = "event_outside_sensor"
+
+    def __init__(self, index: int, x: int, y: int, sensor: object) -> None:
+        super().__init__(f"event {index} at x={x} y={y} lies outside the sensor {sensor}", index=index, x=x, y=y)
+
+
+class TimeBackwards(NeuroVEError):
+    """Times of a packet run backwards."""
+
+    code = "time_backwards"
+
+    def __init__(self, index: int, before_us: int, t_us: int) -> None:
+        super().__init__(
+            f"event {index} at t={t_us} us comes after t={before_us} us: time runs backwards",
+            index=index,
+            value=t_us,
+            bound=before_us,
+        )
+
+
+class UnknownModel(NeuroVEError):
+    """No model of this name is available on the node."""
+
+    code = "unknown_model"
+
+    def __init__(self, name: str, available: tuple[str, ...]) -> None:
+        super().__init__(f"model={name!r}: not on this node; available: {', '.join(available) or 'none'}", value=name)
+
+
+class BadModel(NeuroVEError):
+    """A model file is unreadable, foreign, or does not hold what its header declares."""
+
+    code = "bad_model"
+
+    def __init__(self, name: str, why: str) -> None:
+        super().__init__(f"model {name}: {why}", value=name)

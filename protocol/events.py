@@ -1,0 +1,236 @@
+"""Events and the packet that carries them: EVENT_DTYPE, Sensor, Events, EventPacket, encode_packet, decode_packet."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, NamedTuple, cast
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from protocol.codec import PROTOCOL_VERSION, Message, unpack, validate
+from protocol.errors import BlobLength, EventOutsideSensor, InvalidField, TimeBackwards, UnknownFormat
+from protocol.keys import check_name
+
+EVENT_DTYPE = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1")])
+"""One event as a record, for files and tables: t sensor clock [us], x and y [px], p polarity (1 ON, 0 OFF)."""
+
+FORMATS = ("soa6", "soa8")
+"""Layouts of the event blob, bytes per event at the end of the name; `evt3` is reserved for raw Prophesee words."""
+
+SCHEMA = "application/msgpack;neurove.events.1"
+"""Zenoh Encoding of an event packet."""
+
+_Y_MASK = np.uint16((1 << 15) - 1)
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """The pixel array of a camera.
+
+    >>> print(Sensor(346, 260))
+    346x260
+    """
+
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        for name, value in (("width", self.width), ("height", self.height)):
+            if not 1 <= value <= 1 << 15:
+                raise InvalidField("sensor", name, value, "must be 1 to 32768 px")
+
+    def __str__(self) -> str:
+        return f"{self.width}x{self.height}"
+
+
+class Events(NamedTuple):
+    """Events as columns, all of the same length N and ordered by t. Columns may be read-only views."""
+
+    t: NDArray[np.int64]  # sensor clock [us]
+    x: NDArray[np.uint16]  # [px], right
+    y: NDArray[np.uint16]  # [px], down
+    p: NDArray[np.uint8]  # 1 ON (brighter), 0 OFF
+
+    @property
+    def n(self) -> int:
+        """How many events these are."""
+        return int(self.t.size)
+
+    def span(self, first: int, stop: int) -> "Events":
+        """Events number `first` up to but without `stop`, as views."""
+        return Events(self.t[first:stop], self.x[first:stop], self.y[first:stop], self.p[first:stop])
+
+    def to_records(self) -> NDArray[np.void]:
+        """A copy as one array of EVENT_DTYPE."""
+        records = np.empty(self.n, EVENT_DTYPE)
+        for name, column in zip(EVENT_DTYPE.names or (), self, strict=True):
+            records[name] = column
+        return records
+
+    @classmethod
+    def from_columns(cls, t: Any, x: Any, y: Any, p: Any) -> "Events":
+        """Events from anything array-like; copies only where a column has another type."""
+        return cls(np.asarray(t, np.int64), np.asarray(x, np.uint16), np.asarray(y, np.uint16), np.asarray(p, np.uint8))
+
+    @classmethod
+    def from_records(cls, records: NDArray[np.void]) -> "Events":
+        """Columns of an array with the fields t, x, y, p."""
+        return cls.from_columns(*(np.ascontiguousarray(records[name]) for name in ("t", "x", "y", "p")))
+
+    @classmethod
+    def empty(cls) -> "Events":
+        """No events."""
+        return cls.from_columns((), (), (), ())
+
+    @classmethod
+    def join(cls, parts: Sequence["Events"]) -> "Events":
+        """All events of the parts, in the order given."""
+        if len(parts) == 1:
+            return parts[0]
+        return cls(*(np.concatenate(columns) for columns in zip(*parts, strict=True))) if parts else cls.empty()
+
+
+def check_events(events: Events, sensor: Sensor, not_before_us: int | None = None) -> None:
+    """Refuse events that lie outside the sensor or whose times run backwards.
+
+    Args:
+        events: what to check.
+        sensor: the pixel array they must lie on.
+        not_before_us: the first event must not be earlier than this [us], where given.
+
+    Raises:
+        EventOutsideSensor, TimeBackwards: the first event that is wrong is named.
+    """
+    if not events.n:
+        return
+    if int(events.x.max()) >= sensor.width or int(events.y.max()) >= sensor.height:
+        index = int(np.flatnonzero((events.x >= sensor.width) | (events.y >= sensor.height))[0])
+        raise EventOutsideSensor(index, int(events.x[index]), int(events.y[index]), sensor)
+    if not_before_us is not None and events.t[0] < not_before_us:
+        raise TimeBackwards(0, not_before_us, int(events.t[0]))
+    backwards = events.t[1:] < events.t[:-1]
+    if backwards.any():
+        index = int(np.flatnonzero(backwards)[0]) + 1
+        raise TimeBackwards(index, int(events.t[index - 1]), int(events.t[index]))
+
+
+@dataclass(frozen=True, slots=True)
+class EventPacket:
+    """What a driver sends at once: the ordered events of one stream from t0_us on.
+
+    A packet without events is a clock tick: it says that nothing happened before t0_us that was not sent.
+    """
+
+    stream: str
+    seq: int  # counts packets of this stream from 0, without holes
+    sensor: Sensor
+    t0_us: int  # sensor clock; no event of this packet is earlier
+    events: Events
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Caps on what a packet may claim; beyond them it is refused."""
+
+    max_events: int = 1_000_000
+    max_side_px: int = 4096
+
+    @property
+    def max_bytes(self) -> int:
+        """Largest packet on the wire: the largest blob and its header."""
+        return self.max_events * 8 + 1024
+
+
+DEFAULT_LIMITS = Limits()
+
+
+class _Header(Message):
+    what: ClassVar[str] = "event packet"
+
+    stream: str
+    seq: Annotated[int, Field(ge=0, lt=1 << 63)]
+    width: Annotated[int, Field(ge=1)]
+    height: Annotated[int, Field(ge=1)]
+    t0_us: Annotated[int, Field(ge=-(1 << 62), lt=1 << 62)]
+    n: Annotated[int, Field(ge=0)]
+    format: str
+    data: bytes
+
+
+def encode_packet(packet: EventPacket, blob_format: str | None = None) -> bytes:
+    """The packet's bytes; see README.md of this package for the layout.
+
+    Args:
+        packet: events ordered by time, on the sensor, none before t0_us.
+        blob_format: one of FORMATS; by default the smallest that the packet's time span fits.
+
+    Raises:
+        EventOutsideSensor, TimeBackwards, InvalidField: the packet is not what it must be.
+    """
+    check_name("stream", packet.stream)
+    check_events(packet.events, packet.sensor, packet.t0_us)
+    offset = packet.events.t - packet.t0_us
+    span_us = int(offset[-1]) if offset.size else 0
+    blob_format = blob_format or ("soa6" if span_us < 1 << 16 else "soa8")
+    if blob_format not in FORMATS:
+        raise UnknownFormat(blob_format, FORMATS)
+    offset_type, limit_us = ("<u2", 1 << 16) if blob_format == "soa6" else ("<u4", 1 << 32)
+    if span_us >= limit_us:
+        raise InvalidField("event packet", "t", span_us, f"{blob_format} holds offsets below {limit_us} us")
+    y_and_p = packet.events.y | (packet.events.p.astype(np.uint16) << np.uint16(15))
+    blob = b"".join(
+        (
+            offset.astype(offset_type).tobytes(),
+            packet.events.x.astype("<u2", copy=False).tobytes(),
+            y_and_p.astype("<u2", copy=False).tobytes(),
+        )
+    )
+    header = {
+        "v": PROTOCOL_VERSION,
+        "stream": packet.stream,
+        "seq": packet.seq,
+        "width": packet.sensor.width,
+        "height": packet.sensor.height,
+        "t0_us": packet.t0_us,
+        "n": packet.events.n,
+        "format": blob_format,
+        "data": blob,
+    }
+    return cast(bytes, msgpack.packb(header))
+
+
+def decode_packet(data: bytes, limits: Limits = DEFAULT_LIMITS) -> EventPacket:
+    """Read and check an event packet; x is a view into `data`, the other columns are computed.
+
+    Raises:
+        NeuroVEError: Malformed, UnsupportedVersion, InvalidField, UnknownFormat, BlobLength, EventOutsideSensor or
+            TimeBackwards; never any other exception.
+    """
+    header = validate(_Header, unpack(data, _Header.what, limits.max_bytes))
+    check_name("stream", header.stream)
+    for name, value, bound in (
+        ("n", header.n, limits.max_events),
+        ("width", header.width, limits.max_side_px),
+        ("height", header.height, limits.max_side_px),
+    ):
+        if value > bound:
+            raise InvalidField(_Header.what, name, value, f"the configured cap is {bound}")
+    if header.format not in FORMATS:
+        raise UnknownFormat(header.format, FORMATS)
+    record_bytes = 6 if header.format == "soa6" else 8
+    if len(header.data) != header.n * record_bytes:
+        raise BlobLength(len(header.data), header.n, record_bytes)
+    events = _columns(header.data, header.n, "<u2" if header.format == "soa6" else "<u4", header.t0_us)
+    sensor = Sensor(header.width, header.height)
+    check_events(events, sensor)
+    return EventPacket(header.stream, header.seq, sensor, header.t0_us, events)
+
+
+def _columns(blob: bytes, n: int, offset_type: str, t0_us: int) -> Events:
+    offset = np.frombuffer(blob, offset_type, n)
+    x = np.frombuffer(blob, "<u2", n, offset.nbytes)
+    y_and_p = np.frombuffer(blob, "<u2", n, offset.nbytes + x.nbytes)
+    p = (y_and_p >> np.uint16(15)).astype(np.uint8)
+    return Events(offset.astype(np.int64) + t0_us, x, y_and_p & _Y_MASK, p)

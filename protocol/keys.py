@@ -1,0 +1,97 @@
+"""Zenoh key expressions: build and parse; nothing else spells a key.
+
+The `@node` chunk is what Zenoh calls verbatim: a wildcard never matches it, so a stream can not shadow a node.
+"""
+
+import re
+from dataclasses import dataclass
+
+from protocol.errors import InvalidField
+
+DEFAULT_PREFIX = "neurove/v1"
+NAME_RULE = "1 to 64 characters of A-Z a-z 0-9 _ . - and no dot or dash first"
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
+_PREFIX = re.compile(r"[A-Za-z0-9_.-]{1,64}(/[A-Za-z0-9_.-]{1,64}){0,7}")
+
+
+def check_name(what: str, name: str) -> str:
+    """The name, if it is fit to be one chunk of a key.
+
+    >>> check_name("stream", "cam0")
+    'cam0'
+    """
+    if not _NAME.fullmatch(name):
+        raise InvalidField("key", what, name, NAME_RULE)
+    return name
+
+
+@dataclass(frozen=True, slots=True)
+class Keys:
+    """All keys of one deployment, under its prefix.
+
+    >>> Keys().events("cam0")
+    'neurove/v1/cam0/events'
+    >>> Keys("site1/neurove").health("*")
+    'site1/neurove/@node/*/health'
+    >>> Keys().stream_of("neurove/v1/cam0/events")
+    'cam0'
+    """
+
+    prefix: str = DEFAULT_PREFIX
+
+    def __post_init__(self) -> None:
+        if not _PREFIX.fullmatch(self.prefix):
+            raise InvalidField("key", "prefix", self.prefix, "up to 8 chunks of A-Z a-z 0-9 _ . - joined by /")
+
+    def _of_stream(self, stream: str, leaf: str) -> str:
+        return f"{self.prefix}/{stream if stream == '*' else check_name('stream', stream)}/{leaf}"
+
+    def _of_node(self, node: str, leaf: str) -> str:
+        return f"{self.prefix}/@node/{node if node == '*' else check_name('node', node)}/{leaf}"
+
+    def events(self, stream: str = "*") -> str:
+        """Event packets of a stream; driver to service."""
+        return self._of_stream(stream, "events")
+
+    def camera(self, stream: str = "*") -> str:
+        """CameraInfo of a stream; put at start and answered on query by the driver."""
+        return self._of_stream(stream, "camera")
+
+    def velocity(self, stream: str = "*") -> str:
+        """Twist estimates of a stream; service to anyone."""
+        return self._of_stream(stream, "velocity")
+
+    def status(self, stream: str = "*") -> str:
+        """Verdict and counters of a stream; service to anyone."""
+        return self._of_stream(stream, "status")
+
+    def health(self, node: str = "*") -> str:
+        """Queryable: the health of a node."""
+        return self._of_node(node, "health")
+
+    def models(self, node: str = "*") -> str:
+        """Queryable: the models of a node."""
+        return self._of_node(node, "models")
+
+    def activate(self, node: str = "*") -> str:
+        """Queryable: change the model of a node. Under `model/`, so that an access list can guard it alone."""
+        return self._of_node(node, "model/activate")
+
+    def alive(self, node: str = "*") -> str:
+        """Liveliness token of a node."""
+        return self._of_node(node, "alive")
+
+    def serves(self, node: str = "*", stream: str = "*") -> str:
+        """Liveliness token of a node that serves a stream."""
+        return self._of_node(node, f"serves/{stream if stream == '*' else check_name('stream', stream)}")
+
+    def stream_of(self, key: str) -> str:
+        """The stream that a concrete stream key (events, camera, velocity, status) belongs to.
+
+        Raises:
+            InvalidField: the key is not below this prefix, or its stream is no valid name.
+        """
+        head, _, leaf = key.removeprefix(self.prefix + "/").partition("/")
+        if not key.startswith(self.prefix + "/") or "/" in leaf or not leaf:
+            raise InvalidField("key", "key", key, f"{self.prefix}/<stream>/<message>")
+        return check_name("stream", head)

@@ -1,0 +1,89 @@
+"""Twist, TwistEstimate and its quality flags: what the service says about a stream, once per window."""
+
+from enum import StrEnum
+from typing import Annotated, ClassVar, NamedTuple, Self
+
+from pydantic import Field, model_validator
+
+from protocol.codec import Message, Part
+from protocol.keys import check_name
+
+SCHEMA = "application/msgpack;neurove.velocity.1"
+"""Zenoh Encoding of a TwistEstimate."""
+
+AXES = ("vx", "vy", "vz", "wx", "wy", "wz")
+"""Order of a twist's six numbers: linear [m/s], then angular [rad/s]."""
+
+
+class Flag(StrEnum):
+    """What a consumer should know before it trusts an estimate. Readers ignore flags that they do not know."""
+
+    UNTRAINED = "untrained"  # the model was never trained: the numbers mean nothing
+    UNCALIBRATED = "uncalibrated"  # no CameraInfo: the sensor was scaled plainly onto the canonical camera
+    UNSCALED = "unscaled"  # no camera height: the linear part is up to scale
+    SETTLING = "settling"  # the recurrent state is younger than the model's settling time
+    RESET = "reset"  # the state began anew in this window
+    SENSOR_CHANGED = "sensor_changed"  # and it did because the stream's geometry or CameraInfo changed
+    GAP = "gap"  # packets of this window, or windows just before it, were lost
+    OVERLOAD = "overload"  # and they were dropped here, because this node could not keep up
+    LOW_ACTIVITY = "low_activity"  # fewer events than the model needs to see motion
+    SATURATED = "saturated"  # some cell counted more events than it can hold
+
+
+class Twist(NamedTuple):
+    """A rigid body's velocity in the camera's optical frame (x right, y down, z forward)."""
+
+    vx: float  # [m/s]
+    vy: float
+    vz: float
+    wx: float  # [rad/s]
+    wy: float
+    wz: float
+
+
+class Trace(Part):
+    """When one estimate passed where, on the service's monotonic clock [ns]; only differences have a meaning."""
+
+    received_ns: int  # the packet that completed the window came in from the network
+    queued_ns: int  # the stream's worker took it out of its queue
+    computed_ns: int  # the network had answered
+    published_ns: int  # handed over to Zenoh
+
+    @property
+    def latency_ms(self) -> float:
+        """From receiving the last packet of the window to publishing its estimate [ms]."""
+        return (self.published_ns - self.received_ns) / 1e6
+
+
+class TwistEstimate(Message):
+    """One window's answer: n twists, one per chronological bin (the paper's [n, 6]), and how far to trust them."""
+
+    what: ClassVar[str] = "twist estimate"
+
+    stream: str
+    seq: Annotated[int, Field(ge=0)]  # counts estimates of this stream from 0, without holes
+    start_us: int  # window [start_us, end_us), sensor clock
+    end_us: int
+    bin_end_us: Annotated[tuple[int, ...], Field(strict=False, min_length=1)]
+    twists: Annotated[tuple[Twist, ...], Field(strict=False, min_length=1)]
+    frame_id: str = "camera_optical"
+    model: str  # name of the model
+    digest: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]  # sha256 of its bundle
+    epoch: Annotated[int, Field(ge=0)]  # counts model changes of the node
+    events: Annotated[int, Field(ge=0)]  # events of this window, all of the sensor
+    flags: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    trace: Trace
+
+    @model_validator(mode="after")
+    def _one_twist_per_bin(self) -> Self:
+        check_name("stream", self.stream)
+        if len(self.twists) != len(self.bin_end_us):
+            raise ValueError(f"{len(self.twists)} twists for {len(self.bin_end_us)} bins")
+        if self.end_us <= self.start_us:
+            raise ValueError(f"end_us={self.end_us} is not after start_us={self.start_us}")
+        return self
+
+    @property
+    def twist(self) -> Twist:
+        """The newest twist: that of the last bin."""
+        return self.twists[-1]

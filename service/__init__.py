@@ -1,0 +1,1 @@
+"""The long-running process: camera streams in over Zenoh, velocity out."""
