@@ -1,0 +1,221 @@
+"""Model bundle: one safetensors file; its header holds config, scaling, provenance; its digest names it.
+
+Nothing is unpickled. What a file claims is checked before it is used: size, header, names, shapes and types of all
+tensors for the architecture that the header declares, finite values.
+"""
+
+import hashlib
+import json
+import os
+import struct
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final, Self
+
+import safetensors.torch
+import torch
+from pydantic import Field, ValidationError
+from safetensors import SafetensorError
+from torch import Tensor
+
+from neurove_core.config import Config, ModelConfig
+from neurove_core.network import NeuroVE
+from protocol.control import ModelInfo
+from protocol.errors import BadModel
+
+BUNDLE_VERSION: Final = 1
+SUFFIX = ".safetensors"
+MAX_BYTES = 256 << 20
+MAX_HEADER_BYTES = 1 << 20
+MAX_TENSORS = 4096
+
+_KEY = "neurove"
+_OFFSET, _SCALE = "output.offset", "output.scale"
+
+
+class Header(Config):
+    """What a bundle says about itself, as JSON in the file's safetensors header."""
+
+    bundle_version: int = BUNDLE_VERSION
+    name: str = Field(min_length=1, max_length=64, pattern="^[A-Za-z0-9_][A-Za-z0-9_.-]*$")
+    trained: bool
+    provenance: str = Field(max_length=1000, description="One line: how this model was made.")
+    config: ModelConfig
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A model in memory."""
+
+    name: str
+    trained: bool
+    provenance: str
+    config: ModelConfig
+    network: NeuroVE
+    offset: Tensor  # (6): twist = network output * scale + offset, in m/s and rad/s
+    scale: Tensor  # (6)
+    digest: str = ""  # sha256 of the bundle's bytes, hex
+
+    @property
+    def info(self) -> ModelInfo:
+        """What a node tells about this model."""
+        parameters = sum(parameter.numel() for parameter in self.network.parameters())
+        return ModelInfo(
+            name=self.name,
+            digest=self.digest,
+            trained=self.trained,
+            provenance=self.provenance,
+            parameters=parameters,
+        )
+
+    def to_bytes(self) -> bytes:
+        """The bundle as the bytes of its file."""
+        header = Header(name=self.name, trained=self.trained, provenance=self.provenance, config=self.config)
+        tensors = {**_stored(self.network), _OFFSET: self.offset, _SCALE: self.scale}
+        return safetensors.torch.save(tensors, {_KEY: header.model_dump_json()})
+
+    def with_digest(self) -> Self:
+        """This bundle, its digest computed."""
+        return replace(self, digest=hashlib.sha256(self.to_bytes()).hexdigest())
+
+
+def save(bundle: Bundle, path: Path) -> None:
+    """Write a bundle's file; it is whole or it is not there."""
+    part = path.with_name(path.name + ".part")
+    with part.open("wb") as file:
+        file.write(bundle.to_bytes())
+        file.flush()
+        os.fsync(file.fileno())
+    part.replace(path)
+
+
+def load(path: Path) -> Bundle:
+    """Read and check a bundle's file.
+
+    Raises:
+        BadModel: it is missing, foreign, broken, or not what its header declares; the sentence says why.
+    """
+    try:
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise BadModel(path.name, f"size={size}: a bundle has at most {MAX_BYTES} bytes")
+        data = path.read_bytes()
+    except OSError as error:
+        raise BadModel(path.name, error.strerror or str(error)) from None
+    return from_bytes(data, path.name)
+
+
+def from_bytes(data: bytes, name: str) -> Bundle:
+    """The bundle that these bytes hold; `name` says in errors whose bytes they are.
+
+    Raises:
+        BadModel: as load.
+    """
+    header = read_header(data, name)
+    try:
+        tensors = safetensors.torch.load(data)
+    except (SafetensorError, ValueError, KeyError) as error:
+        raise BadModel(name, f"not a whole safetensors file: {error}") from None
+    network = NeuroVE(header.config)
+    wanted = {**_stored(network), _OFFSET: torch.zeros(6), _SCALE: torch.ones(6)}
+    _check_tensors(tensors, wanted, name)
+    offset, scale = tensors.pop(_OFFSET), tensors.pop(_SCALE)
+    network.load_state_dict(tensors, strict=False)  # names are checked; only the norms' batch counters are not stored
+    return Bundle(
+        name=header.name,
+        trained=header.trained,
+        provenance=header.provenance,
+        config=header.config,
+        network=network.eval(),
+        offset=offset,
+        scale=scale,
+        digest=hashlib.sha256(data).hexdigest(),
+    )
+
+
+def read_header(data: bytes, name: str) -> Header:
+    """The header of a bundle's bytes, checked.
+
+    Raises:
+        BadModel: as load.
+    """
+    if len(data) < 8:
+        raise BadModel(name, f"size={len(data)}: not a safetensors file")
+    (length,) = struct.unpack("<Q", data[:8])
+    if length > min(MAX_HEADER_BYTES, len(data) - 8):
+        raise BadModel(
+            name, f"header length {length}: not a safetensors file, or a header over {MAX_HEADER_BYTES} bytes"
+        )
+    try:
+        entries = json.loads(data[8 : 8 + length], object_pairs_hook=_object_without_duplicates)
+        own = entries["__metadata__"][_KEY]
+        fields = json.loads(own, object_pairs_hook=_object_without_duplicates)
+    except (KeyError, TypeError):
+        raise BadModel(
+            name, "a safetensors file, but not a NeuroVE bundle: its header has no 'neurove' entry"
+        ) from None
+    except (ValueError, RecursionError) as error:
+        raise BadModel(name, f"its header can not be read: {error}") from None
+    if len(entries) > MAX_TENSORS + 1:
+        raise BadModel(name, f"{len(entries) - 1} tensors: at most {MAX_TENSORS}")
+    version = fields.get("bundle_version") if isinstance(fields, dict) else None
+    if version != BUNDLE_VERSION:
+        raise BadModel(name, f"bundle_version={version!r}: this program reads version {BUNDLE_VERSION}")
+    try:
+        return Header.model_validate(fields)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        raise BadModel(name, f"header field {where}={first['input']!r}: {first['msg']}") from None
+
+
+def untrained(seed: int = 0, config: ModelConfig | None = None, name: str = "untrained") -> Bundle:
+    """A model with random weights drawn from a seed: it runs as a trained one would, its numbers mean nothing.
+
+    The norms' statistics are taken from random input, so that neurons fire. The same seed gives the same model on one
+    machine and torch version.
+    """
+    config = config or ModelConfig()
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        network = NeuroVE(config)
+        shape = (16, 4, 2 * config.window.bins, config.canonical.height, config.canonical.width)
+        with torch.no_grad():
+            for _ in range(3):
+                network.train()(torch.poisson(torch.full(shape, 0.3)).log1p(), network.initial_state(4))
+    return Bundle(
+        name=name,
+        trained=False,
+        provenance=f"random weights, neurove_core.bundle.untrained(seed={seed}), torch {torch.__version__}",
+        config=config,
+        network=network.eval(),
+        offset=torch.zeros(6),
+        scale=torch.ones(6),
+    ).with_digest()
+
+
+def _stored(network: NeuroVE) -> dict[str, Tensor]:
+    return {
+        name: tensor.contiguous()
+        for name, tensor in network.state_dict().items()
+        if not name.endswith("num_batches_tracked")
+    }
+
+
+def _check_tensors(tensors: dict[str, Tensor], wanted: dict[str, Tensor], name: str) -> None:
+    for key in sorted(wanted.keys() ^ tensors.keys()):
+        raise BadModel(name, f"tensor {key!r} is {'missing' if key in wanted else 'not one of this architecture'}")
+    for key, tensor in tensors.items():
+        want = wanted[key]
+        if tensor.shape != want.shape or tensor.dtype != want.dtype:
+            got, needs = f"{tensor.dtype} {tuple(tensor.shape)}", f"{want.dtype} {tuple(want.shape)}"
+            raise BadModel(name, f"tensor {key!r} is {got}, its header's architecture needs {needs}")
+        if not bool(torch.isfinite(tensor).all()):
+            raise BadModel(name, f"tensor {key!r} holds values that are not finite")
+
+
+def _object_without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    fields = dict(pairs)
+    if len(fields) != len(pairs):
+        raise ValueError("a key stands twice in one object")
+    return fields

@@ -1,0 +1,83 @@
+"""Frozen, checked configurations of a model: its windows, its canonical camera and its network.
+
+They travel in the header of the model's bundle; a wrong value stops the start with a sentence that names it.
+"""
+
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+MAX_CANONICAL_CELLS = 1 << 20
+
+
+class Config(BaseModel):
+    """Base of all configurations: immutable, unknown keys are errors, finite numbers only."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class WindowConfig(Config):
+    """How sensor time is cut: windows [k * duration_us, (k + 1) * duration_us), each of n equal chronological bins."""
+
+    duration_us: int = Field(50_000, gt=0, le=10_000_000, description="Length of one window [us].")
+    bins: int = Field(5, ge=1, le=64, description="n: bins per window; a window's bins are 2n input channels.")
+    max_hole_windows: int = Field(
+        20, ge=1, le=10_000, description="A hole in sensor time of more windows than this is skipped, not computed."
+    )
+
+    @model_validator(mode="after")
+    def _bins_fill_the_window(self) -> Self:
+        if self.duration_us % self.bins:
+            raise ValueError(f"duration_us={self.duration_us} does not split into {self.bins} equal bins")
+        return self
+
+    @property
+    def bin_us(self) -> int:
+        """Length of one bin [us]."""
+        return self.duration_us // self.bins
+
+
+class CanonicalConfig(Config):
+    """The pinhole camera that the network sees, whatever the sensor: its grid is also the spatial down-sampling."""
+
+    width: int = Field(86, ge=8, description="Grid columns.")
+    height: int = Field(65, ge=8, description="Grid rows.")
+    hfov_deg: float = Field(75.0, gt=1, lt=170, description="Horizontal field of view [deg]; cells are square.")
+
+    @model_validator(mode="after")
+    def _bounded(self) -> Self:
+        if self.width * self.height > MAX_CANONICAL_CELLS:
+            raise ValueError(f"width * height = {self.width * self.height}: at most {MAX_CANONICAL_CELLS} cells")
+        return self
+
+
+class NetworkConfig(Config):
+    """The network of paper section III: spiking feature extractor and velocity estimator."""
+
+    encoding: Literal["binary", "log1p"] = Field("log1p", description="Counts to input: 0/1, or log(1 + count).")
+    channels: Annotated[tuple[int, ...], Field(min_length=1, max_length=8)] = (16, 32, 64, 64)
+    features: int = Field(128, ge=1, le=4096, description="Width of the layer between extractor and estimator.")
+    hidden: int = Field(128, ge=1, le=4096, description="Units of each ASLSTM cell.")
+    cells: int = Field(2, ge=1, le=8, description="ASLSTM layers; the paper has two.")
+    decay: float = Field(0.5, ge=0, lt=1, description="LIF leak per time step: 1 - dt/tau.")
+    v_th: float = Field(1.0, gt=0, description="Firing threshold of all neurons.")
+    alpha: float = Field(0.9, ge=0, le=1, description="ASLSTM: share of h that stays in the membrane.")
+    diffusion: bool = Field(True, description="Astrocyte diffusion J; without it the model is the paper's w/o.")
+    surrogate: Literal["rectangular", "arctan", "triangle"] = "rectangular"
+    surrogate_width: float = Field(1.0, gt=0, description="Width of the surrogate gradient, in thresholds.")
+
+    @model_validator(mode="after")
+    def _channels_positive(self) -> Self:
+        if not all(1 <= count <= 1024 for count in self.channels):
+            raise ValueError(f"channels={self.channels}: each must be 1 to 1024")
+        return self
+
+
+class ModelConfig(Config):
+    """Everything that shapes a model and its input."""
+
+    window: WindowConfig = WindowConfig()
+    canonical: CanonicalConfig = CanonicalConfig()
+    network: NetworkConfig = NetworkConfig()
+    settle_windows: int = Field(16, ge=0, le=256, description="Windows until a fresh state is settled.")
+    low_activity_events: int = Field(200, ge=0, description="A window with fewer events is flagged low_activity.")

@@ -1,0 +1,152 @@
+"""Estimator.push: the one entry for inference; the same windows and encoding as training."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from neurove_core import windows
+from neurove_core.bundle import Bundle
+from neurove_core.encoding import to_spikes
+from neurove_core.geometry import lookup_table
+from neurove_core.network import NetworkState
+from neurove_core.windows import Window, WindowsState
+from protocol import CameraInfo, Events, Sensor
+from protocol.errors import BadModel
+
+
+class StreamState(NamedTuple):
+    """All that one camera stream carries from packet to packet."""
+
+    lut: NDArray[np.int32]  # sensor pixel -> canonical cell
+    windows: WindowsState
+    network: NetworkState
+    age: int  # windows since the network state began
+    recent: tuple[NDArray[np.uint8], ...]  # counts of the newest windows, to prime another model with
+
+
+class WindowEstimate(NamedTuple):
+    """The answer to one window."""
+
+    start_us: int
+    end_us: int
+    twists: NDArray[np.float64]  # (n, 6): vx vy vz [m/s], wx wy wz [rad/s], optical frame, one row per bin
+    events: int
+    first: bool  # the state began in this window
+    settled: bool
+    low_activity: bool
+    saturated: bool
+
+
+class Answer(NamedTuple):
+    """What came of some events: an estimate for each window that they completed, and what was left out."""
+
+    estimates: list[WindowEstimate]
+    state: StreamState
+    late_events: int
+    outside_events: int
+    skipped_windows: int
+
+
+class Estimator:
+    """A loaded model, ready to answer any number of streams; holds no stream's state and is safe to share.
+
+    Args:
+        bundle: the model; its network is put into evaluation mode.
+    """
+
+    def __init__(self, bundle: Bundle) -> None:
+        self.bundle = bundle
+        self.config = bundle.config
+        self.network = bundle.network.eval().requires_grad_(requires_grad=False)
+        self._offset, self._scale = bundle.offset.double().numpy(), bundle.scale.double().numpy()
+
+    def initial_state(self, sensor: Sensor, camera: CameraInfo | None = None) -> StreamState:
+        """A stream at rest.
+
+        Args:
+            sensor: of its events.
+            camera: its lens, where known.
+
+        Raises:
+            InvalidField: the camera info is of another sensor.
+        """
+        lut = lookup_table(self.config.canonical, sensor, camera)
+        return StreamState(lut, WindowsState(), self.network.initial_state(), 0, ())
+
+    def push(self, events: Events, state: StreamState, horizon_us: int) -> Answer:
+        """Take a packet's events and answer every window that they complete.
+
+        Args:
+            events: ordered, on the stream's sensor.
+            state: of the stream; used up by this call.
+            horizon_us: sensor time reached even without events, such as the packet's t0_us.
+        """
+        pushed = windows.push(events, horizon_us, state.windows, state.lut, self.config.window, self.config.canonical)
+        network, age, recent = state.network, state.age, state.recent
+        estimates: list[WindowEstimate] = []
+        end_us: int | None = None
+        for window in pushed.windows:
+            if end_us is not None and window.start_us != end_us:
+                network, age, recent = self.network.initial_state(), 0, ()
+            twists, network = self._step(window.counts, network)
+            estimates.append(self._estimate(window, twists, age))
+            age += 1
+            recent = (*recent, window.counts)[-self.config.settle_windows :]
+            end_us = window.start_us + self.config.window.duration_us
+        if end_us is not None and pushed.state.start_us != end_us:
+            network, age, recent = self.network.initial_state(), 0, ()
+        outside = sum(window.outside for window in pushed.windows)
+        following = StreamState(state.lut, pushed.state, network, age, recent)
+        return Answer(estimates, following, pushed.late_events, outside, pushed.skipped_windows)
+
+    def primed(self, state: StreamState, before: "Estimator") -> StreamState:
+        """The state of a stream that another model served until now, as if this model had seen its recent windows.
+
+        Windows and their counts go over unchanged where both models cut and see alike; else the stream starts anew.
+        """
+        if (before.config.window, before.config.canonical) != (self.config.window, self.config.canonical):
+            return StreamState(state.lut, WindowsState(), self.network.initial_state(), 0, ())
+        network = self.network.initial_state()
+        for counts in state.recent:
+            _, network = self._step(counts, network)
+        return state._replace(network=network, age=len(state.recent))
+
+    def warm_up(self) -> None:
+        """Compile and touch all that the first packet would otherwise wait for.
+
+        Raises:
+            BadModel: the model answers numbers that are not finite.
+        """
+        sensor = Sensor(self.config.canonical.width, self.config.canonical.height)
+        duration = self.config.window.duration_us
+        t = np.arange(0, 4 * duration, max(1, duration // 500))
+        rng = np.random.default_rng(0)
+        x, y, p = (rng.integers(0, high, t.size) for high in (sensor.width, sensor.height, 2))
+        events = Events.from_columns(t, x, y, p)
+        from_wire = Events(events.t, np.frombuffer(events.x.tobytes(), np.uint16), events.y, events.p)  # x read-only
+        state = self.initial_state(sensor)
+        for half in (events, from_wire):
+            answer = self.push(half, state._replace(windows=WindowsState()), 0)
+            state = answer.state
+            if not all(np.isfinite(estimate.twists).all() for estimate in answer.estimates):
+                raise BadModel(self.bundle.name, "it answers numbers that are not finite")
+
+    @torch.inference_mode()
+    def _step(self, counts: NDArray[np.uint8], state: NetworkState) -> tuple[NDArray[np.float64], NetworkState]:
+        spikes = to_spikes(torch.from_numpy(counts), self.config.network.encoding)
+        twists, state = self.network(spikes[None, None], state)
+        return twists[0, 0].double().numpy() * self._scale + self._offset, state
+
+    def _estimate(self, window: Window, twists: NDArray[np.float64], age: int) -> WindowEstimate:
+        return WindowEstimate(
+            start_us=window.start_us,
+            end_us=window.start_us + self.config.window.duration_us,
+            twists=twists,
+            events=window.events,
+            first=age == 0,
+            settled=age >= self.config.settle_windows,
+            low_activity=window.events - window.outside < self.config.low_activity_events,
+            saturated=bool(window.counts.max() == 255),
+        )

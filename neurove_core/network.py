@@ -1,0 +1,131 @@
+"""NeuroVE: spiking feature extractor and velocity estimator, (spikes, state) -> (twists, state); paper section III."""
+
+import itertools
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from neurove_core.cells import ASLSTM, ASLSTMState, readout_step
+from neurove_core.config import ModelConfig
+from neurove_core.neurons import LIFParams, LIFState, diffuse, lif_scan
+
+
+class NetworkState(NamedTuple):
+    """All that streams from window to window, for a batch of B streams."""
+
+    membranes: tuple[LIFState, ...]  # one per block of the feature extractor, (B, C, H, W)
+    cells: tuple[ASLSTMState, ...]  # one per ASLSTM layer, (B, N)
+    readout: Tensor  # potential of the output neurons (B, 6n)
+
+
+class SpikingBlock(nn.Module):
+    """Convolution of stride 2, threshold-dependent batch norm (tdBN, Zheng 2021), LIF.
+
+    Differs: tdBN's factor v_th is the initial value of the norm's learnable weight, which spans the same functions.
+    """
+
+    def __init__(self, inputs: int, outputs: int, lif: LIFParams) -> None:
+        super().__init__()
+        self.conv = nn.Conv2d(inputs, outputs, 3, stride=2, padding=1, bias=False)
+        self.norm = nn.BatchNorm2d(outputs)
+        nn.init.constant_(self.norm.weight, lif.v_th)
+        self.lif = lif
+
+    def forward(self, spikes: Tensor, state: LIFState) -> tuple[Tensor, LIFState]:
+        """(T, B, C, H, W) to (T, B, C', H', W'); the norm's statistics run over time and batch together."""
+        steps, batch = spikes.shape[:2]
+        current = self.norm(self.conv(spikes.flatten(0, 1)))
+        return lif_scan(current.unflatten(0, (steps, batch)), state, self.lif)
+
+
+class NeuroVE(nn.Module):
+    """The network of paper Fig. 2: one time step per window, 2n channels in, n twists out, all state streamed.
+
+    Its outputs are in the bundle's scaled units; Estimator turns them into m/s and rad/s.
+    """
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        net = config.network
+        self.config = config
+        self.bins = config.window.bins
+        lif = LIFParams(net.decay, net.v_th, net.surrogate, net.surrogate_width * net.v_th)
+        widths = (2 * self.bins, *net.channels)
+        self.blocks = nn.ModuleList(SpikingBlock(a, b, lif) for a, b in itertools.pairwise(widths))
+        rows, columns = self.map_sizes()[-1]
+        self.project = nn.Linear(net.channels[-1] * rows * columns, net.features, bias=False)
+        self.project_norm = nn.BatchNorm1d(net.features)
+        inputs = (net.features, *(net.hidden,) * (net.cells - 1))
+        self.cells = nn.ModuleList(
+            ASLSTM(
+                width,
+                net.hidden,
+                alpha=net.alpha,
+                v_th=net.v_th,
+                diffusion=net.diffusion,
+                surrogate=net.surrogate,
+                surrogate_width=net.surrogate_width * net.v_th,
+            )
+            for width in inputs
+        )
+        d_space = torch.full((net.cells, net.hidden), 0.5 if net.diffusion else 0.0)
+        self.d_space: Tensor
+        if net.diffusion:
+            self.d_space = nn.Parameter(d_space)
+        else:
+            self.register_buffer("d_space", d_space, persistent=False)
+        self.readout = nn.Linear(net.hidden, 6 * self.bins)
+        self.kappa_logit = nn.Parameter(torch.tensor(-1.386))  # sigmoid gives 0.2
+
+    def map_sizes(self) -> list[tuple[int, int]]:
+        """Rows and columns of every block's output."""
+        rows, columns = self.config.canonical.height, self.config.canonical.width
+        sizes = []
+        for _ in self.config.network.channels:
+            rows, columns = (rows + 1) // 2, (columns + 1) // 2
+            sizes.append((rows, columns))
+        return sizes
+
+    def initial_state(self, batch: int = 1) -> NetworkState:
+        """Every membrane and memory of `batch` streams at rest."""
+        zeros = self.readout.weight.new_zeros
+        membranes = tuple(
+            LIFState(zeros(batch, channels, rows, columns))
+            for channels, (rows, columns) in zip(self.config.network.channels, self.map_sizes(), strict=True)
+        )
+        cells = tuple(cell.initial_state(batch) for cell in self._layers())
+        return NetworkState(membranes, cells, zeros(batch, 6 * self.bins))
+
+    def _layers(self) -> list[ASLSTM]:
+        return [cell for cell in self.cells if isinstance(cell, ASLSTM)]
+
+    def forward(self, spikes: Tensor, state: NetworkState) -> tuple[Tensor, NetworkState]:
+        """Velocities of T consecutive windows, and the state after them.
+
+        Source: NeuroVE, section III-A to III-D: layer by layer, each over all time steps.
+
+        Args:
+            spikes: (T, B, 2n, H, W) from encoding.to_spikes.
+            state: of these B streams, from initial_state or the call before.
+
+        Returns:
+            twists (T, B, n, 6) in scaled units: vx vy vz wx wy wz, one per bin; and the next state.
+        """
+        steps, batch = spikes.shape[:2]
+        membranes = []
+        for block, membrane in zip(self.blocks, state.membranes, strict=True):
+            spikes, membrane = block(spikes, membrane)
+            membranes.append(membrane)
+        x = self.project_norm(self.project(spikes.flatten(2).flatten(0, 1))).unflatten(0, (steps, batch))
+        cells = []
+        for index, (layer, cell) in enumerate(zip(self._layers(), state.cells, strict=True)):
+            scanned, last = layer(x, cell)
+            x = diffuse(scanned.s, scanned.v, self.d_space[index])
+            cells.append(last)
+        y, kappa, answers = state.readout, torch.sigmoid(self.kappa_logit), []
+        for z in x:
+            y = readout_step(z, y, self.readout.weight, self.readout.bias, kappa)
+            answers.append(y)
+        twists = torch.stack(answers).view(steps, batch, self.bins, 6)
+        return twists, NetworkState(tuple(membranes), tuple(cells), y)

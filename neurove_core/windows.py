@@ -1,0 +1,114 @@
+"""push: events -> complete windows. Half-open, on the sensor's clock, the same however a driver cuts its packets.
+
+The grid is absolute: a window starts at a whole multiple of its duration on the sensor clock, so a lost first packet
+or a late start changes no later window (decision 2). Events are counted into the open window as they come, so a
+window costs the same memory however many events it has.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurove_core.config import CanonicalConfig, WindowConfig
+from neurove_core.counting import count_events
+from protocol import Events
+
+
+class Window(NamedTuple):
+    """One complete window, counted on the canonical grid."""
+
+    start_us: int
+    counts: NDArray[np.uint8]  # (2n, H, W), saturating at 255: channel 2i is OFF, 2i + 1 is ON of bin i
+    events: int  # of the whole sensor
+    outside: int  # of these, seen by pixels that look past the grid
+
+
+class WindowsState(NamedTuple):
+    """What a stream carries between packets: the open window. Its counts go into the next state, not into a copy."""
+
+    start_us: int | None = None  # none before the first packet
+    horizon_us: int = 0  # sensor time up to which all events are known
+    counts: NDArray[np.uint8] | None = None  # none while the open window is empty
+    events: int = 0
+    outside: int = 0
+
+
+class Pushed(NamedTuple):
+    """What came of some events."""
+
+    windows: list[Window]
+    state: WindowsState
+    late_events: int  # of windows that were complete before they came
+    skipped_windows: int  # complete windows left out, for the hole in sensor time was too long
+
+
+def push(
+    events: Events,
+    horizon_us: int,
+    state: WindowsState,
+    lut: NDArray[np.int32],
+    config: WindowConfig,
+    canonical: CanonicalConfig,
+) -> Pushed:
+    """Add events to a stream's open window and close every window that is complete.
+
+    Args:
+        events: ordered by time, on the sensor of `lut`.
+        horizon_us: sensor time that the driver has reached even if nothing happened, such as the packet's t0_us.
+        state: of the stream; used up by this call.
+        lut: (sensor.height, sensor.width) from geometry.lookup_table.
+        config: length and bins of a window.
+        canonical: the grid.
+
+    Returns:
+        the windows that ended at or before the newest time known, oldest first, and the next state.
+    """
+    duration = config.duration_us
+    newest_us = max(horizon_us, int(events.t[-1]) if events.n else horizon_us, state.horizon_us)
+    first_us = min(horizon_us, int(events.t[0])) if events.n else horizon_us
+    start_us = first_us // duration * duration if state.start_us is None else state.start_us
+    late = int(np.searchsorted(events.t, start_us))
+    events = events.span(late, events.n)
+    windows: list[Window] = []
+    skipped = 0
+    open_window = _Open(start_us, state, config, canonical)
+    while newest_us >= open_window.start_us + duration:
+        end_us = open_window.start_us + duration
+        inside = int(np.searchsorted(events.t, end_us))
+        open_window.add(events.span(0, inside), lut)
+        events = events.span(inside, events.n)
+        windows.append(open_window.close())
+        next_us = int(events.t[0]) // duration * duration if events.n else newest_us // duration * duration
+        hole = (next_us - end_us) // duration
+        if hole > config.max_hole_windows:
+            skipped += hole
+            end_us = next_us
+        open_window = _Open(end_us, WindowsState(), config, canonical)
+    open_window.add(events, lut)
+    return Pushed(windows, open_window.state(newest_us), late, skipped)
+
+
+class _Open:
+    """The window that events are being counted into."""
+
+    def __init__(self, start_us: int, state: WindowsState, config: WindowConfig, canonical: CanonicalConfig) -> None:
+        self.start_us, self.counts, self.events, self.outside = start_us, state.counts, state.events, state.outside
+        self._bin_us = config.bin_us
+        self._shape = (2 * config.bins, canonical.height, canonical.width)
+
+    def add(self, events: Events, lut: NDArray[np.int32]) -> None:
+        if events.n:
+            self.outside += count_events(events, self.start_us, self._bin_us, lut, self._grid())
+            self.events += events.n
+
+    def _grid(self) -> NDArray[np.uint8]:
+        if self.counts is None:
+            self.counts = np.zeros(self._shape, np.uint8)
+        return self.counts
+
+    def close(self) -> Window:
+        return Window(self.start_us, self._grid(), self.events, self.outside)
+
+    def state(self, horizon_us: int) -> WindowsState:
+        return WindowsState(self.start_us, horizon_us, self.counts, self.events, self.outside)
