@@ -1,0 +1,203 @@
+"""Composition root: build, start, stop; the only file that knows everything."""
+
+import threading
+import time
+from collections.abc import Callable
+
+from protocol import CameraInfo
+from protocol.control import STATUS_SCHEMA, StreamStatus
+from protocol.errors import NeuroVEError
+from protocol.velocity import SCHEMA as VELOCITY_SCHEMA
+from service import logs
+from service.config import ServiceConfig
+from service.handlers import Handlers
+from service.health import stream_status
+from service.lifecycle import notify
+from service.model_slot import ModelSlot
+from service.stream import Stream
+from service.transport import Publisher, Transport, open_transport
+from service.worker import Inbox, Outlet, StreamWorker
+
+log = logs.get(__name__)
+
+_TICK_S = 0.1
+_WATCHDOG_S = 1.0
+_WEDGED_S = 10.0
+_ASK_CAMERA_S = 1.0
+_MOST_REFUSED = 1024
+_ROUTER_PATIENCE_S = 365 * 86_400.0
+
+
+class Service:
+    """A node: serves every stream that it hears of.
+
+    Args:
+        config: checked settings.
+        stop: set by whoever wants it to end.
+
+    Raises:
+        BadModel, UnknownModel: the configured model can not be loaded.
+    """
+
+    def __init__(self, config: ServiceConfig, stop: threading.Event) -> None:
+        self._config, self._stop = config, stop
+        self._keys = config.keys
+        self._slot = ModelSlot(config.model, config.models_dir)
+        self._workers: dict[str, StreamWorker] = {}
+        self._changing = threading.Lock()  # of the dict; a worker's stream is the worker's alone
+        self._refused: dict[str, float] = {}  # stream -> when it was last heard of
+        self._handlers = Handlers(config.node, self._slot, self._statuses, lambda: len(self._refused))
+
+    def run(self) -> None:
+        """Serve until the stop event is set, then end everything in order.
+
+        Raises:
+            EndpointError: an endpoint is taken or wrong.
+        """
+        config = self._config
+        with open_transport(
+            config.mode,
+            listen=config.listen,
+            connect=config.connect,
+            config_file=config.zenoh_config,
+            patience_s=_ROUTER_PATIENCE_S,
+            stop=self._stop,
+        ) as transport:
+            self._declare(transport)
+            model = self._slot.active.estimator.bundle
+            endpoints = ", ".join((*config.listen, *config.connect))
+            log.info("ready", node=config.node, endpoints=endpoints, model=model.name, trained=model.trained)
+            notify("READY=1")
+            try:
+                self._keep_house(transport)
+            finally:
+                notify("STOPPING=1")
+                self._end_workers(list(self._workers))
+        log.info("stopped", node=config.node)
+
+    def _declare(self, transport: Transport) -> None:
+        keys, node = self._keys, self._config.node
+        transport.answer(keys.health(node), self._handlers.health)
+        transport.answer(keys.models(node), self._handlers.models)
+        transport.answer(keys.activate(node), self._handlers.activate)
+        transport.subscribe(keys.camera(), self._route(transport, StreamWorker.put_camera))
+        transport.subscribe(keys.events(), self._route(transport, StreamWorker.put_packet))
+        transport.token(keys.alive(node))
+
+    def _route(
+        self, transport: Transport, put: Callable[[StreamWorker, bytes, int], None]
+    ) -> Callable[[str, bytes, int], None]:
+        """Zenoh's thread: find or start the stream's worker and append to its queue, nothing else."""
+
+        def on_sample(key: str, payload: bytes, received_ns: int) -> None:
+            with self._changing:
+                worker = self._worker_of(key, transport)
+                if worker is not None:
+                    put(worker, payload, received_ns)
+
+        return on_sample
+
+    def _worker_of(self, key: str, transport: Transport) -> StreamWorker | None:
+        try:
+            name = self._keys.stream_of(key)
+        except NeuroVEError:
+            name = key  # no name we could serve: counted with the refused ones
+        worker = self._workers.get(name)
+        if worker is not None or self._stop.is_set():
+            return worker
+        if name == key or len(self._workers) >= self._config.max_streams:
+            self._refuse(name)
+            return None
+        stream = Stream(name, self._slot)
+        worker = StreamWorker(
+            stream,
+            lambda: self._outlet(name, transport),
+            Inbox(self._config.queue_s, self._config.queue_mib << 20),
+            self._config.limits,
+        )
+        self._workers[name] = worker
+        return worker
+
+    def _refuse(self, name: str) -> None:
+        known = name in self._refused
+        if not known and len(self._refused) < _MOST_REFUSED:
+            log.warning("stream refused", stream=name, serving=len(self._workers), cap=self._config.max_streams)
+        if known or len(self._refused) < _MOST_REFUSED:
+            self._refused[name] = time.monotonic()
+
+    def _outlet(self, stream: str, transport: Transport) -> Outlet:
+        publisher = transport.publisher(self._keys.velocity(stream), VELOCITY_SCHEMA, urgent=True)
+        take_back = transport.token(self._keys.serves(self._config.node, stream))
+        log.info("stream began", stream=stream)
+
+        def ask_camera() -> CameraInfo | None:
+            answers = transport.ask(self._keys.camera(stream), b"", _ASK_CAMERA_S)
+            return CameraInfo.decode(answers[0].payload) if answers else None
+
+        def close() -> None:
+            take_back()
+            publisher.close()
+
+        return Outlet(ask_camera, publisher.put, close)
+
+    def _statuses(self) -> list[StreamStatus]:
+        with self._changing:
+            streams = [worker.stream for worker in self._workers.values()]
+        return [stream_status(self._config.node, stream) for stream in streams]
+
+    def _keep_house(self, transport: Transport) -> None:
+        """Status messages on change and once per period, eviction of silent streams, the watchdog."""
+        publishers: dict[str, Publisher] = {}
+        told: dict[str, str] = {}
+        next_status = next_watchdog = time.monotonic()
+        while not self._stop.wait(_TICK_S):
+            now = time.monotonic()
+            due = now >= next_status
+            for status in self._statuses():
+                if due or told.get(status.stream) != status.verdict:
+                    self._tell(status, told, publishers, transport)
+            if due:
+                next_status = now + self._config.status_period_s
+                self._evict(publishers, told)
+            if now >= next_watchdog and self._alive():
+                next_watchdog = now + _WATCHDOG_S
+                notify("WATCHDOG=1")
+
+    def _tell(
+        self, status: StreamStatus, told: dict[str, str], publishers: dict[str, Publisher], transport: Transport
+    ) -> None:
+        name = status.stream
+        if name not in publishers:
+            publishers[name] = transport.publisher(self._keys.status(name), STATUS_SCHEMA)
+        if name in told and told[name] != status.verdict:
+            log.info("verdict", stream=name, before=told[name], now=status.verdict, why=status.why)
+        told[name] = status.verdict
+        publishers[name].put(status.encode())
+
+    def _evict(self, publishers: dict[str, Publisher], told: dict[str, str]) -> None:
+        idle_ns = self._config.idle_evict_s * 1e9
+        now_ns = time.monotonic_ns()
+        with self._changing:
+            silent = [name for name, one in self._workers.items() if now_ns - one.stream.last_packet_ns > idle_ns]
+            for name in [name for name, heard in self._refused.items() if (now_ns - heard * 1e9) > idle_ns]:
+                del self._refused[name]
+        self._end_workers(silent)
+        for name in silent:
+            log.info("stream forgotten", stream=name, idle_s=self._config.idle_evict_s)
+            told.pop(name, None)
+            if name in publishers:
+                publishers.pop(name).close()
+
+    def _end_workers(self, names: list[str]) -> None:
+        with self._changing:
+            ending = [self._workers.pop(name) for name in names]
+        for worker in ending:
+            worker.stop()
+        for worker in ending:
+            worker.join(timeout_s=1.0)
+
+    def _alive(self) -> bool:
+        """Whether every worker's loop has turned lately: what the watchdog wants to know."""
+        with self._changing:
+            beats = [worker.beat_ns for worker in self._workers.values()]
+        return all((time.monotonic_ns() - beat) / 1e9 < _WEDGED_S for beat in beats)

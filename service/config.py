@@ -1,0 +1,141 @@
+"""Configuration of the service and of its clients: defaults < TOML file < environment NEUROVE_* < flags.
+
+Unknown keys and wrong values stop the start with one sentence that names field, value, bound and where it came from.
+"""
+
+import os
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+
+from protocol.errors import NeuroVEError
+from protocol.events import Limits
+from protocol.keys import DEFAULT_PREFIX, Keys, check_name
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+ENVIRONMENT = "NEUROVE_"
+
+
+class ConfigError(NeuroVEError):
+    """A setting is unknown or wrong."""
+
+    code = "config"
+
+
+def _listed(value: object) -> object:
+    return [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
+
+
+Endpoints = Annotated[tuple[str, ...], BeforeValidator(_listed)]
+
+
+class _Settings(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    prefix: Annotated[str, BeforeValidator(lambda value: Keys(str(value)).prefix)] = Field(
+        DEFAULT_PREFIX, description="Key prefix of the deployment."
+    )
+    log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="Least severe line logged.")
+    zenoh_config: Path | None = Field(None, description="Zenoh configuration (JSON5) to start from, as for TLS.")
+
+    @property
+    def keys(self) -> Keys:
+        """The keys under the configured prefix."""
+        return Keys(self.prefix)
+
+
+class ClientConfig(_Settings):
+    """Settings of drive, watch, health and the other commands that talk to a service."""
+
+    connect: Endpoints = Field((DEFAULT_ENDPOINT,), min_length=1, description="Endpoints to connect to.")
+
+
+class ServiceConfig(_Settings):
+    """Settings of `neurove serve`."""
+
+    node: Annotated[str, BeforeValidator(lambda value: check_name("node", str(value)))] = Field(
+        "edge", description="Name of this node, one key chunk."
+    )
+    mode: Literal["peer", "client", "router"] = Field(
+        "peer", description="Zenoh mode: peer for direct links, client towards a router."
+    )
+    listen: Endpoints = Field((DEFAULT_ENDPOINT,), description="Endpoints to listen on; none in client mode.")
+    connect: Endpoints = Field((), description="Endpoints to connect to, such as a router's.")
+    model: str = Field("untrained", min_length=1, description="Active model at start: its name, or a bundle's file.")
+    models_dir: Path | None = Field(None, description="Folder of the bundles that may be activated.")
+    queue_s: float = Field(1.0, gt=0, le=60, description="Packets that wait longer are dropped, oldest first [s].")
+    queue_mib: int = Field(64, ge=1, le=4096, description="Most bytes waiting per stream [MiB].")
+    max_streams: int = Field(16, ge=1, le=1024, description="Streams served at once; more are refused and counted.")
+    max_packet_events: int = Field(1_000_000, ge=1, le=16_000_000, description="Larger packets are refused.")
+    max_side_px: int = Field(4096, ge=16, le=32768, description="Larger sensors are refused.")
+    idle_evict_s: float = Field(30.0, gt=0, le=86_400, description="A stream silent for so long is forgotten [s].")
+    status_period_s: float = Field(1.0, gt=0, le=60, description="Period of the status messages [s].")
+
+    @property
+    def limits(self) -> Limits:
+        """Caps on event packets."""
+        return Limits(self.max_packet_events, self.max_side_px)
+
+
+SettingsT = TypeVar("SettingsT", bound=_Settings)
+
+
+def load(kind: type[SettingsT], flags: dict[str, Any], file: Path | None = None) -> tuple[SettingsT, dict[str, str]]:
+    """The settings of a command, and for each field where its value came from.
+
+    Args:
+        kind: ServiceConfig or ClientConfig.
+        flags: what the command line says; None means not given.
+        file: TOML file, where given.
+
+    Raises:
+        ConfigError: the first thing that is wrong.
+    """
+    layers = [
+        (f"file {file}" if file else "file", _from_file(file) if file else {}),
+        ("environment", _from_environment(kind)),
+        ("flag", {name: value for name, value in flags.items() if value is not None}),
+    ]
+    values: dict[str, Any] = {}
+    origin = dict.fromkeys(kind.model_fields, "default")
+    for where, layer in layers:
+        values |= layer
+        origin |= dict.fromkeys(layer, where)
+    try:
+        return kind.model_validate(values), origin
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        field = str(first["loc"][0])
+        raise _wrong(field, first["input"], first["msg"], origin[field], kind) from None
+    except NeuroVEError as error:  # a name or prefix that is no key
+        field = str(error.details.get("field"))
+        raise _wrong(field, values.get(field), str(error.details.get("bound")), origin.get(field, "?"), kind) from None
+
+
+def _wrong(field: str, value: object, why: str, where: str, kind: type[_Settings]) -> ConfigError:
+    if field not in kind.model_fields:
+        why = f"unknown setting; known are {', '.join(sorted(kind.model_fields))}"
+    return ConfigError(f"config: {field}={value!r} (from {where}): {why}", field=field, value=repr(value), bound=why)
+
+
+def _from_file(file: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"config file {file}: {error.strerror}") from None
+    except ValueError as error:  # not TOML, not UTF-8
+        raise ConfigError(f"config file {file}: {error}") from None
+
+
+def _from_environment(kind: type[_Settings]) -> dict[str, Any]:
+    known = {*ServiceConfig.model_fields, *ClientConfig.model_fields}
+    given = {
+        name.removeprefix(ENVIRONMENT).lower(): value
+        for name, value in os.environ.items()
+        if name.startswith(ENVIRONMENT)
+    }
+    for field in sorted(given.keys() - known):
+        raise _wrong(field, given[field], "", f"environment {ENVIRONMENT}{field.upper()}", kind)
+    return {field: value for field, value in given.items() if field in kind.model_fields}

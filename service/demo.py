@@ -1,0 +1,203 @@
+"""The main job on one machine: a driver, the service and a consumer, three processes joined by Zenoh on loopback."""
+
+import contextlib
+import json
+import math
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from typing import Any
+
+from rich.console import Console
+from rich.live import Live
+
+from protocol import Flag
+from protocol.control import StreamStatus
+from protocol.errors import NeuroVEError
+from service import ask
+from service.config import ENVIRONMENT, ClientConfig
+from service.latency import latency
+from service.transport import Transport
+from service.views import Board
+
+STREAM = "cam0"
+_START_S = 90.0
+_DRAIN_S = 3.0
+_END_S = 2.5
+_POLL_S = 0.1
+
+
+class DemoFailed(NeuroVEError):
+    """One of the demo's processes ended before its time."""
+
+    code = "demo"
+
+
+def run(
+    source: str,
+    *,
+    sensor: str | None,
+    speed: str,
+    loop: bool,
+    duration_s: float,
+    model: str | None,
+    stop: threading.Event,
+    console: Console,
+    screenshot: str | None = None,
+) -> dict[str, Any]:
+    """Play a source through the whole service and tell what came of it.
+
+    Args:
+        source: as io.open_source.
+        sensor: WIDTHxHEIGHT, where the source lacks it.
+        speed: as `neurove drive --speed`.
+        loop: play it again at its end.
+        duration_s: sensor time to play; infinity until its end or the stop event.
+        model: as `neurove serve --model`.
+        stop: ends the demo early.
+        console: where the live table goes; drawn on a terminal only.
+        screenshot: SVG file for the last table.
+
+    Raises:
+        DemoFailed: the service or the driver ended with an error; its own lines are on stderr.
+    """
+    endpoint = f"tcp/127.0.0.1:{_free_port()}"
+    config = ClientConfig(connect=(endpoint,))
+    board = Board()
+    serve = ["serve", "--listen", endpoint, "--node", "demo", *(["--model", model] if model else [])]
+    drive = ["drive", source, "--connect", endpoint, "--stream", STREAM, "--speed", speed, "--wait", "10", "--json"]
+    drive += ["--sensor", sensor] if sensor else []
+    drive += ["--loop"] if loop else []
+    drive += ["--duration", str(duration_s)] if math.isfinite(duration_s) else []
+    with _process(*serve) as service, _session(config, service, stop) as transport:
+        ask.listen(transport, config, board.on_estimate, board.on_status)
+        with _process(*drive, stdout=subprocess.PIPE) as driver:
+            _show(board, console, lambda: driver.poll() is None and service.poll() is None, stop)
+            sent = _sent(driver)
+        status = _drained(transport, config, sent, stop)
+    if screenshot:
+        _draw(board, screenshot)
+    return _summary(source, sent, status, board)
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@contextlib.contextmanager
+def _process(*arguments: str, stdout: int | None = None) -> Iterator[subprocess.Popen[str]]:
+    """One of our commands as a child that ends with the block, and with us if we are killed."""
+    command = [sys.executable, "-m", "service.cli", *arguments, "--with-parent"]
+    quiet = {name: value for name, value in os.environ.items() if not name.startswith(ENVIRONMENT)}
+    quiet |= {f"{ENVIRONMENT}LOG_LEVEL": "warning"}
+    child = subprocess.Popen(command, stdout=stdout, stdin=subprocess.DEVNULL, text=True, env=quiet)
+    try:
+        yield child
+    finally:
+        child.terminate()
+        try:
+            child.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            child.kill()
+            child.wait()
+        if child.stdout:
+            child.stdout.close()
+
+
+@contextlib.contextmanager
+def _session(config: ClientConfig, service: subprocess.Popen[str], stop: threading.Event) -> Iterator[Transport]:
+    """A session with the service, as soon as it is up."""
+    deadline = time.monotonic() + _START_S
+    while time.monotonic() < deadline and service.poll() is None and not stop.is_set():
+        with contextlib.suppress(ask.NoService):
+            transport = ask.connect(config, patience_s=0)
+            with transport:
+                if transport.tokens(config.keys.alive(), ask.ANSWER_S):
+                    yield transport
+                    return
+        stop.wait(_POLL_S)
+    if stop.is_set():
+        raise DemoFailed("stopped before the service was up")
+    raise DemoFailed(
+        f"the service did not start within {_START_S:.0f} s" if service.poll() is None else "the service ended"
+    )
+
+
+def _show(board: Board, console: Console, running: Any, stop: threading.Event) -> None:
+    if not console.is_terminal:
+        while running() and not stop.wait(_POLL_S):
+            pass
+        return
+    with Live(board, console=console, refresh_per_second=8):
+        while running() and not stop.wait(_POLL_S):
+            pass
+
+
+def _sent(driver: subprocess.Popen[str]) -> dict[str, Any]:
+    """The driver's own account, after asking it to end."""
+    driver.terminate()
+    out, _ = driver.communicate(timeout=_END_S)
+    try:
+        return dict(json.loads(out))
+    except ValueError:
+        raise DemoFailed(f"the driver ended with exit code {driver.returncode}") from None
+
+
+def _drained(
+    transport: Transport, config: ClientConfig, sent: dict[str, Any], stop: threading.Event
+) -> StreamStatus | None:
+    """The service's account of the stream, once it has seen all that was sent or some seconds have passed."""
+    deadline = time.monotonic() + _DRAIN_S
+    status = None
+    while time.monotonic() < deadline:
+        streams = [one for reply in ask.health(transport, config) for one in reply.streams if one.stream == STREAM]
+        status = streams[0] if streams else None
+        if status and status.packets_received + sum(status.lost.nonzero().values()) >= sent["packets"]:
+            break
+        if stop.wait(_POLL_S):
+            time.sleep(_POLL_S)
+    return status
+
+
+def _draw(board: Board, file: str) -> None:
+    """The last table as a picture."""
+    console = Console(record=True, width=100, file=open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115, PTH123
+    console.print(board)
+    console.save_svg(file, title="neurove demo")
+
+
+def _summary(source: str, sent: dict[str, Any], status: StreamStatus | None, board: Board) -> dict[str, Any]:
+    heard = board.of(STREAM)
+    lost = status.lost.nonzero() if status else {}
+    received = status.packets_received if status else 0
+    undelivered = sent["packets"] - received - sum(lost.get(name, 0) for name in _PACKET_LOSSES)
+    lost |= {"undelivered_packets": undelivered} if undelivered > 0 else {}
+    missed = (status.estimates if status else 0) - heard.count
+    lost |= {"estimates": missed} if missed > 0 else {}
+    numbers = latency(heard.latencies_ms)
+    return {
+        "source": source,
+        "sensor": sent["sensor"],
+        "packets_sent": sent["packets"],
+        "packets_received": received,
+        "events_sent": sent["events"],
+        "events_received": status.events_received if status else 0,
+        "windows": status.windows if status else 0,
+        "estimates": heard.count,
+        "lost": lost,
+        "latency_ms": {name: round(value, 3) for name, value in numbers.model_dump().items()} if numbers else None,
+        "rate_hz": round(heard.mean_rate_hz, 3),
+        "model": heard.last.model if heard.last else None,
+        "model_digest": heard.last.digest if heard.last else None,
+        "trained": bool(heard.last and Flag.UNTRAINED not in heard.last.flags),
+        "broken": sent["broken"],
+    }
+
+
+_PACKET_LOSSES = ("gap_packets", "overload_packets", "malformed_packets", "failed_packets")

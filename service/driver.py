@@ -1,0 +1,168 @@
+"""A camera driver: a recording or synthetic source becomes event packets on Zenoh, paced by its own clock."""
+
+import math
+import threading
+import time
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from neurove_core.io import BrokenRecording, Recording
+from protocol import EventPacket, Events
+from protocol.camera import SCHEMA as CAMERA_SCHEMA
+from protocol.events import SCHEMA as EVENTS_SCHEMA
+from protocol.events import encode_packet
+from protocol.keys import Keys
+from service.transport import Transport
+
+PACKET_US = 4_000
+PACKET_EVENTS = 20_000
+
+_POLL_S = 0.02
+
+
+class Slice(NamedTuple):
+    """Some events of a recording that go into one packet."""
+
+    t0_us: int
+    end_us: int  # sensor time by which a real camera could have sent it
+    events: Events
+
+
+class Summary(NamedTuple):
+    """What a driver has sent."""
+
+    packets: int
+    events: int
+    first_us: int | None
+    last_us: int | None
+    broken: BrokenRecording | None  # where and why the recording ended early
+
+
+def slices(chunks: Iterator[Events]) -> Iterator[Slice]:
+    """Cut ordered events into slices of at most PACKET_US and PACKET_EVENTS.
+
+    A span without events gives an empty slice, which tells the service how far sensor time has come; so does the end.
+
+    Raises:
+        BrokenRecording: what the chunks raise, after everything before it was handed out.
+    """
+    start_us: int | None = None
+    last_us = 0
+    carried = Events.empty()
+    broken: BrokenRecording | None = None
+    try:
+        for chunk in chunks:
+            events = Events.join([carried, chunk]) if carried.n else chunk
+            start_us = int(events.t[0]) if start_us is None else start_us
+            last_us = int(events.t[-1])
+            done = 0
+            while start_us + PACKET_US <= last_us:
+                stop = done + int(events.t[done:].searchsorted(start_us + PACKET_US))
+                yield from _split(start_us, events.span(done, stop))
+                done, start_us = stop, start_us + PACKET_US
+            carried = events.span(done, events.n)
+    except BrokenRecording as error:
+        broken = error
+    if start_us is not None:
+        yield from _split(start_us, carried)
+        yield Slice(last_us + 1, last_us + 1, Events.empty())
+    if broken is not None:
+        raise broken
+
+
+def _split(start_us: int, events: Events) -> Iterator[Slice]:
+    end_us = start_us + PACKET_US
+    if events.n <= PACKET_EVENTS:
+        yield Slice(start_us, end_us, events)
+        return
+    for first in range(0, events.n, PACKET_EVENTS):
+        part = events.span(first, min(first + PACKET_EVENTS, events.n))
+        yield Slice(int(part.t[0]) if first else start_us, int(part.t[-1]) + 1, part)
+
+
+def repeated(recording: Recording) -> Iterator[Events]:
+    """The recording again and again, each turn's times following the last one's."""
+    shift_us, end_us, first_us = 0, 0, None
+    while True:
+        for chunk in recording.chunks():
+            first_us = int(chunk.t[0]) if first_us is None else first_us
+            end_us = int(chunk.t[-1]) + shift_us
+            yield chunk._replace(t=chunk.t + shift_us)
+        if first_us is None:
+            return
+        shift_us = end_us + 1 - first_us
+
+
+class Driver:
+    """Publishes one stream.
+
+    Args:
+        recording: what it plays.
+        stream: name of the stream.
+        transport: an open session.
+        keys: of the deployment.
+    """
+
+    def __init__(self, recording: Recording, stream: str, transport: Transport, keys: Keys) -> None:
+        self._recording, self._stream = recording, stream
+        self._transport, self._keys = transport, keys
+        self._publisher = transport.publisher(keys.events(stream), EVENTS_SCHEMA)
+        self._announce_camera()
+
+    def _announce_camera(self) -> None:
+        camera = self._recording.camera(self._stream)
+        if camera is not None:
+            payload = camera.encode()
+            self._transport.answer(self._keys.camera(self._stream), lambda _: payload)
+            self._transport.put(self._keys.camera(self._stream), payload, CAMERA_SCHEMA)
+
+    def wait_for_listener(self, timeout_s: float, stop: threading.Event) -> bool:
+        """Wait until some service listens, for a real camera would be on before it is used."""
+        deadline = time.monotonic() + timeout_s
+        while not self._publisher.matching:
+            if time.monotonic() >= deadline or stop.wait(_POLL_S):
+                return False
+        return True
+
+    def play(
+        self,
+        stop: threading.Event,
+        *,
+        speed: float = 1.0,
+        loop: bool = False,
+        duration_s: float = math.inf,
+    ) -> Summary:
+        """Publish the recording until its end, the duration, or the stop event.
+
+        Args:
+            stop: ends it early.
+            speed: sensor seconds per second; infinity sends as fast as it reads.
+            loop: begin again at the end.
+            duration_s: sensor time to play [s].
+        """
+        chunks = repeated(self._recording) if loop and not self._recording.endless else self._recording.chunks()
+        sent = Summary(0, 0, None, None, None)
+        began = 0.0
+        try:
+            for piece in slices(chunks):
+                if sent.first_us is None:
+                    began = time.monotonic()  # not before: opening and decoding takes its time
+                first_us = piece.t0_us if sent.first_us is None else sent.first_us
+                elapsed_s = (piece.end_us - first_us) / 1e6
+                if elapsed_s > duration_s or _stopped(stop, began + elapsed_s / speed):
+                    break
+                self._send(sent.packets, piece)
+                last_us = int(piece.events.t[-1]) if piece.events.n else sent.last_us
+                sent = Summary(sent.packets + 1, sent.events + piece.events.n, first_us, last_us, None)
+        except BrokenRecording as error:
+            return sent._replace(broken=error)
+        return sent
+
+    def _send(self, seq: int, piece: Slice) -> None:
+        packet = EventPacket(self._stream, seq, self._recording.sensor, piece.t0_us, piece.events)
+        self._publisher.put(encode_packet(packet))
+
+
+def _stopped(stop: threading.Event, due: float) -> bool:
+    """Wait until `due` on the monotonic clock; whether the stop event came first."""
+    return stop.wait(max(0.0, due - time.monotonic()))
