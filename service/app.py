@@ -15,7 +15,7 @@ from service.health import stream_status
 from service.lifecycle import notify
 from service.model_slot import ModelSlot
 from service.stream import Stream
-from service.transport import Publisher, Transport, open_transport
+from service.transport import EndpointError, Publisher, Transport, open_transport
 from service.worker import Inbox, Outlet, StreamWorker
 
 log = logs.get(__name__)
@@ -55,18 +55,18 @@ class Service:
             EndpointError: an endpoint is taken or wrong.
         """
         config = self._config
-        with open_transport(
-            config.mode,
-            listen=config.listen,
-            connect=config.connect,
-            config_file=config.zenoh_config,
-            patience_s=_ROUTER_PATIENCE_S,
-            stop=self._stop,
-        ) as transport:
+        try:
+            opened = self._open()
+        except EndpointError:
+            if self._stop.is_set():  # told to end while it waited for a router
+                return
+            raise
+        with opened as transport:
             self._declare(transport)
             model = self._slot.active.estimator.bundle
             endpoints = ", ".join((*config.listen, *config.connect))
             log.info("ready", node=config.node, endpoints=endpoints, model=model.name, trained=model.trained)
+            notify("STATUS=serving")
             notify("READY=1")
             try:
                 self._keep_house(transport)
@@ -74,6 +74,18 @@ class Service:
                 notify("STOPPING=1")
                 self._end_workers(list(self._workers))
         log.info("stopped", node=config.node)
+
+    def _open(self) -> Transport:
+        config = self._config
+        notify("STATUS=opening a Zenoh session")
+        return open_transport(
+            config.mode,
+            listen=config.listen,
+            connect=config.connect,
+            config_file=config.zenoh_config,
+            patience_s=_ROUTER_PATIENCE_S,
+            stop=self._stop,
+        )
 
     def _declare(self, transport: Transport) -> None:
         keys, node = self._keys, self._config.node

@@ -6,9 +6,11 @@ usage (an unknown source, setting or file).
 
 import argparse
 import contextlib
+import gc
 import json
 import math
 import os
+import signal
 import sys
 import threading
 from collections.abc import Callable, Sequence
@@ -40,6 +42,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except NeuroVEError as error:
         print(f"neurove: {error.message}", file=sys.stderr)
         return _exit_code(error)
+    except KeyboardInterrupt:  # before a command took the signals over
+        return 128 + signal.SIGINT
     except BrokenPipeError:  # the reader of our output has gone, such as `| head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
@@ -63,6 +67,7 @@ def serve(args: argparse.Namespace) -> int:
     torch.set_num_threads(1)
     sys.setswitchinterval(0.0005)  # Zenoh's threads wait for ours: 5 ms, the default, is a packet's period
     Service(config, stop).run()
+    gc.freeze()  # else Python collects all of torch once more on the way out: up to 2 s on a busy machine
     return 0
 
 
@@ -227,16 +232,18 @@ def demo(args: argparse.Namespace) -> int:
 
 
 def _told(summary: dict[str, Any]) -> str:
+    sensor, numbers = summary["sensor"], summary["latency_ms"]
+    if sensor is None:
+        return "stopped before the driver began"
     lost = ", ".join(f"{name} {count}" for name, count in summary["lost"].items()) or "nothing"
-    numbers = summary["latency_ms"] or {"p50": math.nan, "p99": math.nan}
-    sensor = summary["sensor"]
+    latency = f"p50 {numbers['p50']:.1f} ms, p99 {numbers['p99']:.1f} ms" if numbers else "no estimate"
     model = summary["model"] if summary["trained"] else f"{summary['model']}, UNTRAINED: the velocities mean nothing"
     lines = (
         f"source     {summary['source']} ({sensor['width']}x{sensor['height']})",
         f"packets    {summary['packets_received']:,} of {summary['packets_sent']:,}",
         f"events     {summary['events_received']:,} of {summary['events_sent']:,}",
         f"estimates  {summary['estimates']:,} of {summary['windows']:,} windows, {summary['rate_hz']:.1f} per second",
-        f"latency    p50 {numbers['p50']:.1f} ms, p99 {numbers['p99']:.1f} ms",
+        f"latency    {latency}",
         f"lost       {lost}",
         f"model      {model}",
         *([f"broken     {summary['broken']}"] if summary["broken"] else []),

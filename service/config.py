@@ -4,11 +4,18 @@ Unknown keys and wrong values stop the start with one sentence that names field,
 """
 
 import os
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
+from pydantic import BeforeValidator, Field, ValidationError, ValidationInfo, field_validator, model_validator
+from pydantic_settings import (
+    BaseSettings,
+    EnvSettingsSource,
+    NoDecode,
+    PydanticBaseSettingsSource,
+    SettingsConfigDict,
+    TomlConfigSettingsSource,
+)
 
 from protocol.errors import NeuroVEError
 from protocol.events import Limits
@@ -28,11 +35,23 @@ def _listed(value: object) -> object:
     return [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
 
 
-Endpoints = Annotated[tuple[str, ...], BeforeValidator(_listed)]
+Endpoints = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_listed)]
 
 
-class _Settings(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+class _Settings(BaseSettings):
+    model_config = SettingsConfigDict(env_prefix=ENVIRONMENT, frozen=True, extra="forbid", allow_inf_nan=False)
+
+    @classmethod
+    def settings_customise_sources(
+        cls,
+        settings_cls: type[BaseSettings],
+        init_settings: PydanticBaseSettingsSource,
+        env_settings: PydanticBaseSettingsSource,
+        dotenv_settings: PydanticBaseSettingsSource,
+        file_secret_settings: PydanticBaseSettingsSource,
+    ) -> tuple[PydanticBaseSettingsSource, ...]:
+        """Only what load() hands over: it reads the sources itself, to know where each value came from."""
+        return (init_settings,)
 
     prefix: Annotated[str, BeforeValidator(lambda value: Keys(str(value)).prefix)] = Field(
         DEFAULT_PREFIX, description="Key prefix of the deployment."
@@ -61,8 +80,8 @@ class ServiceConfig(_Settings):
     mode: Literal["peer", "client", "router"] = Field(
         "peer", description="Zenoh mode: peer for direct links, client towards a router."
     )
-    listen: Endpoints = Field((DEFAULT_ENDPOINT,), description="Endpoints to listen on; none in client mode.")
-    connect: Endpoints = Field((), description="Endpoints to connect to, such as a router's.")
+    listen: Endpoints = Field((DEFAULT_ENDPOINT,), description="Endpoints to listen on; in client mode none.")
+    connect: Endpoints = Field((), validate_default=True, description="Endpoints to connect to, such as a router's.")
     model: str = Field("untrained", min_length=1, description="Active model at start: its name, or a bundle's file.")
     models_dir: Path | None = Field(None, description="Folder of the bundles that may be activated.")
     queue_s: float = Field(1.0, gt=0, le=60, description="Packets that wait longer are dropped, oldest first [s].")
@@ -72,6 +91,20 @@ class ServiceConfig(_Settings):
     max_side_px: int = Field(4096, ge=16, le=32768, description="Larger sensors are refused.")
     idle_evict_s: float = Field(30.0, gt=0, le=86_400, description="A stream silent for so long is forgotten [s].")
     status_period_s: float = Field(1.0, gt=0, le=60, description="Period of the status messages [s].")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _a_client_only_connects(cls, values: dict[str, Any]) -> dict[str, Any]:
+        if values.get("mode") == "client":
+            return {"listen": ()} | values
+        return values
+
+    @field_validator("connect")
+    @classmethod
+    def _a_client_connects(cls, connect: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
+        if info.data.get("mode") == "client" and not connect:
+            raise ValueError("client mode needs an endpoint to connect to")
+        return connect
 
     @property
     def limits(self) -> Limits:
@@ -94,7 +127,7 @@ def load(kind: type[SettingsT], flags: dict[str, Any], file: Path | None = None)
         ConfigError: the first thing that is wrong.
     """
     layers = [
-        (f"file {file}" if file else "file", _from_file(file) if file else {}),
+        (f"file {file}" if file else "file", _from_file(kind, file) if file else {}),
         ("environment", _from_environment(kind)),
         ("flag", {name: value for name, value in flags.items() if value is not None}),
     ]
@@ -104,11 +137,11 @@ def load(kind: type[SettingsT], flags: dict[str, Any], file: Path | None = None)
         values |= layer
         origin |= dict.fromkeys(layer, where)
     try:
-        return kind.model_validate(values), origin
+        return kind(**values), origin
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         field = str(first["loc"][0])
-        raise _wrong(field, first["input"], first["msg"], origin[field], kind) from None
+        raise _wrong(field, first["input"], first["msg"].removeprefix("Value error, "), origin[field], kind) from None
     except NeuroVEError as error:  # a name or prefix that is no key
         field = str(error.details.get("field"))
         raise _wrong(field, values.get(field), str(error.details.get("bound")), origin.get(field, "?"), kind) from None
@@ -120,9 +153,10 @@ def _wrong(field: str, value: object, why: str, where: str, kind: type[_Settings
     return ConfigError(f"config: {field}={value!r} (from {where}): {why}", field=field, value=repr(value), bound=why)
 
 
-def _from_file(file: Path) -> dict[str, Any]:
+def _from_file(kind: type[_Settings], file: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(file.read_text(encoding="utf-8"))
+        file.read_bytes()  # the source below passes over a missing file in silence
+        return TomlConfigSettingsSource(kind, file)()
     except OSError as error:
         raise ConfigError(f"config file {file}: {error.strerror}") from None
     except ValueError as error:  # not TOML, not UTF-8
@@ -131,11 +165,8 @@ def _from_file(file: Path) -> dict[str, Any]:
 
 def _from_environment(kind: type[_Settings]) -> dict[str, Any]:
     known = {*ServiceConfig.model_fields, *ClientConfig.model_fields}
-    given = {
-        name.removeprefix(ENVIRONMENT).lower(): value
-        for name, value in os.environ.items()
-        if name.startswith(ENVIRONMENT)
-    }
-    for field in sorted(given.keys() - known):
-        raise _wrong(field, given[field], "", f"environment {ENVIRONMENT}{field.upper()}", kind)
-    return {field: value for field, value in given.items() if field in kind.model_fields}
+    for name, value in os.environ.items():
+        field = name.removeprefix(ENVIRONMENT).lower()
+        if name.startswith(ENVIRONMENT) and field not in known:
+            raise _wrong(field, value, "", "environment", kind)
+    return EnvSettingsSource(kind)()

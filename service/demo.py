@@ -1,15 +1,18 @@
 """The main job on one machine: a driver, the service and a consumer, three processes joined by Zenoh on loopback."""
 
 import contextlib
+import io
 import json
 import math
 import os
+import re
 import socket
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -73,11 +76,11 @@ def run(
     drive += ["--sensor", sensor] if sensor else []
     drive += ["--loop"] if loop else []
     drive += ["--duration", str(duration_s)] if math.isfinite(duration_s) else []
-    with _process(*serve) as service, _session(config, service, stop) as transport:
+    with _process(*serve) as service, _session(config, service, stop, console) as transport:
         ask.listen(transport, config, board.on_estimate, board.on_status)
         with _process(*drive, stdout=subprocess.PIPE) as driver:
             _show(board, console, lambda: driver.poll() is None and service.poll() is None, stop)
-            sent = _sent(driver)
+            sent = _sent(driver, stop)
         status = _drained(transport, config, sent, stop)
     if screenshot:
         _draw(board, screenshot)
@@ -96,7 +99,14 @@ def _process(*arguments: str, stdout: int | None = None) -> Iterator[subprocess.
     command = [sys.executable, "-m", "service.cli", *arguments, "--with-parent"]
     quiet = {name: value for name, value in os.environ.items() if not name.startswith(ENVIRONMENT)}
     quiet |= {f"{ENVIRONMENT}LOG_LEVEL": "warning"}
-    child = subprocess.Popen(command, stdout=stdout, stdin=subprocess.DEVNULL, text=True, env=quiet)
+    child = subprocess.Popen(
+        command,
+        stdout=stdout,
+        stdin=subprocess.DEVNULL,
+        text=True,
+        env=quiet,
+        start_new_session=True,  # Ctrl-C comes to us alone, and we end the others in order
+    )
     try:
         yield child
     finally:
@@ -111,16 +121,24 @@ def _process(*arguments: str, stdout: int | None = None) -> Iterator[subprocess.
 
 
 @contextlib.contextmanager
-def _session(config: ClientConfig, service: subprocess.Popen[str], stop: threading.Event) -> Iterator[Transport]:
+def _session(
+    config: ClientConfig, service: subprocess.Popen[str], stop: threading.Event, console: Console
+) -> Iterator[Transport]:
     """A session with the service, as soon as it is up."""
+    with console.status("starting the service") if console.is_terminal else contextlib.nullcontext():
+        transport = _connected(config, service, stop)
+    with transport:
+        yield transport
+
+
+def _connected(config: ClientConfig, service: subprocess.Popen[str], stop: threading.Event) -> Transport:
     deadline = time.monotonic() + _START_S
     while time.monotonic() < deadline and service.poll() is None and not stop.is_set():
         with contextlib.suppress(ask.NoService):
             transport = ask.connect(config, patience_s=0)
-            with transport:
-                if transport.tokens(config.keys.alive(), ask.ANSWER_S):
-                    yield transport
-                    return
+            if transport.tokens(config.keys.alive(), ask.ANSWER_S):
+                return transport
+            transport.close()
         stop.wait(_POLL_S)
     if stop.is_set():
         raise DemoFailed("stopped before the service was up")
@@ -139,13 +157,15 @@ def _show(board: Board, console: Console, running: Any, stop: threading.Event) -
             pass
 
 
-def _sent(driver: subprocess.Popen[str]) -> dict[str, Any]:
-    """The driver's own account, after asking it to end."""
+def _sent(driver: subprocess.Popen[str], stop: threading.Event) -> dict[str, Any]:
+    """The driver's own account, after asking it to end; of nothing if we stopped it before it began."""
     driver.terminate()
     out, _ = driver.communicate(timeout=_END_S)
     try:
         return dict(json.loads(out))
     except ValueError:
+        if stop.is_set():
+            return {"sensor": None, "packets": 0, "events": 0, "broken": None}
         raise DemoFailed(f"the driver ended with exit code {driver.returncode}") from None
 
 
@@ -153,23 +173,24 @@ def _drained(
     transport: Transport, config: ClientConfig, sent: dict[str, Any], stop: threading.Event
 ) -> StreamStatus | None:
     """The service's account of the stream, once it has seen all that was sent or some seconds have passed."""
-    deadline = time.monotonic() + _DRAIN_S
-    status = None
+    deadline = time.monotonic() + (_POLL_S if stop.is_set() else _DRAIN_S)
+    status: StreamStatus | None = None
     while time.monotonic() < deadline:
-        streams = [one for reply in ask.health(transport, config) for one in reply.streams if one.stream == STREAM]
-        status = streams[0] if streams else None
+        with contextlib.suppress(ask.NoService):
+            replies = ask.health(transport, config)
+            status = next((one for reply in replies for one in reply.streams if one.stream == STREAM), status)
         if status and status.packets_received + sum(status.lost.nonzero().values()) >= sent["packets"]:
             break
-        if stop.wait(_POLL_S):
-            time.sleep(_POLL_S)
+        time.sleep(_POLL_S)
     return status
 
 
 def _draw(board: Board, file: str) -> None:
-    """The last table as a picture."""
-    console = Console(record=True, width=100, file=open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115, PTH123
+    """The last table as a picture that needs nothing from the network."""
+    console = Console(record=True, width=100, file=io.StringIO())
     console.print(board)
-    console.save_svg(file, title="neurove demo")
+    svg = console.export_svg(title="neurove demo")
+    Path(file).write_text(re.sub(r"@font-face \{.*?\}", "", svg, flags=re.DOTALL), encoding="utf-8")
 
 
 def _summary(source: str, sent: dict[str, Any], status: StreamStatus | None, board: Board) -> dict[str, Any]:

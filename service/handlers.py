@@ -44,7 +44,8 @@ class Handlers:
         """How this node is."""
         HealthRequest.decode(request)
         streams = self._streams()
-        ok, why = node_verdict(streams)
+        refused = self._refused_streams()
+        ok, why = node_verdict(streams, refused)
         active = self._slot.active
         reply = HealthReply(
             node=self._node,
@@ -54,7 +55,7 @@ class Handlers:
             version=VERSION,
             model=active.estimator.bundle.info,
             epoch=active.epoch,
-            refused_streams=self._refused_streams(),
+            refused_streams=refused,
             streams=tuple(streams),
         )
         return reply.encode()

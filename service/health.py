@@ -52,9 +52,10 @@ def _verdict(stream: Stream, now_ns: int) -> tuple[Verdict, str]:
     return "ok", "every packet became part of an estimate"
 
 
-def node_verdict(streams: list[StreamStatus]) -> tuple[bool, str]:
+def node_verdict(streams: list[StreamStatus], refused_streams: int = 0) -> tuple[bool, str]:
     """Whether a node is fine, and the sentence that says why not."""
     bad = [f"{status.stream} is {status.verdict}: {status.why}" for status in streams if status.verdict in _BAD]
+    bad += [f"{refused_streams} streams refused, for it serves as many as it may"] if refused_streams else []
     if bad:
         return False, "; ".join(bad)
     return True, f"{len(streams)} streams" if streams else "no stream yet"

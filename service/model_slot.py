@@ -1,5 +1,6 @@
 """ModelSlot: the active estimator, the one before, and the models that may take its place."""
 
+import functools
 import threading
 from pathlib import Path
 from typing import NamedTuple
@@ -46,7 +47,7 @@ class ModelSlot:
         self._models_dir = models_dir
         self._changing = threading.Lock()
         self.previous: Bundle | None = None
-        self._given = bundle.untrained(name=BUILT_IN)
+        self._given = _built_in()
         path = Path(model)
         self._given = bundle.load(path) if path.suffix == bundle.SUFFIX else self._find(model)
         self._active = Serving(_warm(self._given), 0)
@@ -97,7 +98,7 @@ class ModelSlot:
         raise UnknownModel(model, tuple(one.name for one in bundles))
 
     def _bundles(self) -> tuple[list[Bundle], dict[str, str]]:
-        bundles = [bundle.untrained(name=BUILT_IN), self._given]
+        bundles = [_built_in(), self._given]
         unreadable = {}
         for path in sorted(self._models_dir.glob(f"*{bundle.SUFFIX}")) if self._models_dir else ():
             try:
@@ -105,6 +106,11 @@ class ModelSlot:
             except BadModel as error:
                 unreadable[path.name] = error.message.partition(": ")[2]
         return list({one.digest: one for one in bundles}.values()), unreadable
+
+
+@functools.cache
+def _built_in() -> Bundle:
+    return bundle.untrained(name=BUILT_IN)
 
 
 def _warm(model: Bundle) -> Estimator:

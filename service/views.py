@@ -6,17 +6,20 @@ from collections import deque
 from dataclasses import dataclass, field
 
 from rich.console import Group, RenderableType
+from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from protocol import Flag, TwistEstimate
+from protocol import Flag, Twist, TwistEstimate
 from protocol.control import HealthReply, ModelsReply, StreamStatus
 from protocol.velocity import AXES
 from service.latency import latency
 
 _VERDICT_STYLE = {"ok": "green", "lossy": "yellow", "stalled": "bold red", "idle": "dim"}
 _RATE_ESTIMATES = 40
-_BAR = 9
+_BLOCKS = "▁▂▃▄▅▆▇█"
+_HISTORY = 26
+_WIDTH = 98
 
 
 @dataclass
@@ -28,10 +31,10 @@ class Heard:
     last: TwistEstimate | None = None
     status: StreamStatus | None = None
     arrivals: deque[float] = field(default_factory=lambda: deque(maxlen=_RATE_ESTIMATES))
+    twists: deque[Twist] = field(default_factory=lambda: deque(maxlen=_HISTORY))
     latencies_ms: list[float] = field(default_factory=list)
     first_at: float = 0.0
     last_at: float = 0.0
-    epoch_changes: int = 0
 
     @property
     def rate_hz(self) -> float:
@@ -65,6 +68,7 @@ class Board:
             heard.last_at = now
             heard.count += 1
             heard.last = estimate
+            heard.twists.append(estimate.twist)
             heard.arrivals.append(now)
             if len(heard.latencies_ms) < self._keep:
                 heard.latencies_ms.append(estimate.trace.latency_ms)
@@ -92,18 +96,25 @@ class Board:
 
 
 def _stream_panel(name: str, heard: Heard) -> RenderableType:
-    status, last = heard.status, heard.last
-    table = Table(title=_title(name, heard), title_justify="left", expand=False, pad_edge=False)
-    for axis in ("", *AXES):
-        table.add_column(axis, justify="right", min_width=_BAR)
-    if last is not None:
-        linear, angular = last.twist[:3], last.twist[3:]
-        values = [f"{value:+.3f}" for value in (*linear, *angular)]
-        table.add_row("", *values, style="bold")
-        table.add_row("", *("m/s",) * 3, *("rad/s",) * 3, style="dim")
-        bars = [*(_bar(value, 2.0) for value in linear), *(_bar(value, 2.0) for value in angular)]
-        table.add_row("", *bars)
-    return Group(table, _footer(heard, status))
+    grid = Table.grid(padding=(0, 2))
+    for left, right in zip(range(3), range(3, 6), strict=True):
+        grid.add_row(*_axis(heard, left), *_axis(heard, right))
+    return Panel(Group(grid, _footer(heard, heard.status)), title=_title(name, heard), title_align="left", width=_WIDTH)
+
+
+def _axis(heard: Heard, axis: int) -> tuple[Text, Text, Text]:
+    """Name, newest value with its unit, and the newest estimates as a line."""
+    unit = "m/s" if axis < 3 else "rad/s"
+    values = [twist[axis] for twist in heard.twists]
+    newest = f"{values[-1]:+7.3f} {unit:5}" if values else ""
+    return Text(AXES[axis], style="bold"), Text(newest), Text(_line(values), style="cyan")
+
+
+def _line(values: list[float]) -> str:
+    """Values as a row of blocks between their least and greatest."""
+    low, high = min(values, default=0.0), max(values, default=0.0)
+    scale = (len(_BLOCKS) - 1) / (high - low) if high > low else 0.0
+    return "".join(_BLOCKS[round((value - low) * scale)] for value in values)
 
 
 def _title(name: str, heard: Heard) -> Text:
@@ -134,15 +145,6 @@ def _footer(heard: Heard, status: StreamStatus | None) -> Text:
     return text
 
 
-def _bar(value: float, full: float) -> str:
-    """A signed bar around the middle of a cell."""
-    half = _BAR // 2
-    length = min(half, round(abs(value) / full * half))
-    left = "━" * length if value < 0 else ""
-    right = "━" * length if value > 0 else ""
-    return f"{left:>{half}}│{right:<{half}}"
-
-
 def health_table(replies: list[HealthReply]) -> RenderableType:
     """Nodes and their streams."""
     parts: list[RenderableType] = []
@@ -151,8 +153,6 @@ def health_table(replies: list[HealthReply]) -> RenderableType:
         model = f"{reply.model.name} ({'trained' if reply.model.trained else 'untrained'}, {reply.model.digest[:12]})"
         about = f": {reply.why}. Up {reply.uptime_s:.0f} s, version {reply.version}, model {model}, epoch {reply.epoch}"
         parts.append(Text.assemble((f"{reply.node} ", "bold"), verdict, about))
-        if reply.refused_streams:
-            parts.append(Text(f"{reply.refused_streams} streams refused: the node serves all it may", style="yellow"))
         if reply.streams:
             parts.append(_streams_table(reply.streams))
     return Group(*parts)

@@ -60,6 +60,11 @@ class Inbox:
                     break
             self._changed.notify()
 
+    def wake(self) -> None:
+        """Let a waiting take return."""
+        with self._changed:
+            self._changed.notify_all()
+
     def take(self, timeout_s: float) -> tuple[_Sample | None, int]:
         """The oldest sample, or None after the time out; and how many were dropped since the last call."""
         with self._changed:
@@ -109,6 +114,7 @@ class StreamWorker:
     def stop(self) -> None:
         """Ask the thread to end; what is queued is not worked on any more."""
         self._stopping.set()
+        self._inbox.wake()
 
     def join(self, timeout_s: float) -> None:
         """Wait for the thread's end."""

@@ -1,0 +1,127 @@
+"""Real processes and real Zenoh sessions on loopback: multicast off, free ports, everything ended by its own id."""
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+
+import pytest
+
+from service import ask
+from service.config import ClientConfig
+from service.transport import open_transport
+
+START_S = 90
+
+
+def free_endpoint():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def wait_until(condition, timeout_s=30.0):
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        if condition():
+            return
+        threading.Event().wait(0.02)
+    pytest.fail(f"did not become true within {timeout_s} s")
+
+
+class Process:
+    """One of our commands as a child process."""
+
+    def __init__(self, *arguments, module="service.cli", **environment):
+        self.child = subprocess.Popen(
+            [sys.executable, "-m", module, *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=os.environ | environment,
+        )
+
+    def end(self, number=signal.SIGTERM, timeout_s=20.0):
+        """Signal it, and give its exit code, output and errors."""
+        if self.child.poll() is None:
+            self.child.send_signal(number)
+        out, err = self.child.communicate(timeout=timeout_s)
+        return self.child.returncode, out, err
+
+
+@contextlib.contextmanager
+def running(*arguments, **environment):
+    process = Process(*arguments, **environment)
+    try:
+        yield process
+    finally:
+        if process.child.poll() is None:
+            process.child.kill()
+        process.child.communicate()
+
+
+def neurove(*arguments, timeout_s=60.0):
+    """Run one command to its end."""
+    return subprocess.run(
+        [sys.executable, "-m", "service.cli", *arguments],
+        capture_output=True,
+        text=True,
+        timeout=timeout_s,
+        check=False,
+    )
+
+
+def client(endpoint):
+    return open_transport("client", connect=(endpoint,), patience_s=20)
+
+
+def is_alive(transport, config):
+    return bool(transport.tokens(config.keys.alive(), 1.0))
+
+
+@contextlib.contextmanager
+def service(endpoint, *arguments):
+    """A serving node and a session with it."""
+    config = ClientConfig(connect=(endpoint,))
+    with running("serve", "--listen", endpoint, "--node", "n1", "--log-level", "warning", *arguments) as process:
+        wait_until(lambda: _connects(endpoint) or process.child.poll() is not None, START_S)
+        with client(endpoint) as transport:
+            wait_until(lambda: is_alive(transport, config), START_S)
+            yield process, transport, config
+
+
+def _connects(endpoint):
+    host, port = endpoint.removeprefix("tcp/").split(":")
+    with contextlib.suppress(OSError), socket.create_connection((host, int(port)), timeout=1):
+        return True
+    return False
+
+
+class Heard:
+    """Estimates that a consumer has heard, by stream."""
+
+    def __init__(self, transport, config):
+        self.estimates = []
+        self.statuses = {}
+        ask.listen(transport, config, self.estimates.append, self._on_status)
+
+    def _on_status(self, status):
+        self.statuses[status.stream] = status
+
+    def of(self, stream):
+        return [one for one in list(self.estimates) if one.stream == stream]
+
+
+class Source:
+    """A driver's publisher that waits for the service before it publishes."""
+
+    def __init__(self, transport, config, stream):
+        self._publisher = transport.publisher(config.keys.events(stream), "application/msgpack")
+        wait_until(lambda: self._publisher.matching)
+
+    def put(self, payload):
+        self._publisher.put(payload)

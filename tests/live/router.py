@@ -1,0 +1,15 @@
+"""A Zenoh router for tests: `python tests/live/router.py ENDPOINT`. There is no zenohd in the registries we use."""
+
+import sys
+import threading
+
+from service.transport import open_transport
+
+
+def main() -> None:
+    with open_transport("router", listen=(sys.argv[1],)):
+        threading.Event().wait()
+
+
+if __name__ == "__main__":
+    main()

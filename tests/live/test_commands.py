@@ -1,0 +1,187 @@
+import json
+import signal
+from pathlib import Path
+
+import pytest
+
+from neurove_core import bundle
+from neurove_core.io import open_source
+from service.driver import slices
+from tests.live.conftest import Process, free_endpoint, neurove, running, service, wait_until
+from tests.recordings import shared
+
+pytestmark = pytest.mark.live
+
+
+@pytest.fixture(scope="module")
+def node(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("models")
+    bundle.save(bundle.untrained(1, name="other"), folder / "other.safetensors")
+    (folder / "foreign.safetensors").write_text("not a model")
+    with service(free_endpoint(), "--models-dir", str(folder)) as (_, _, config):
+        yield config.connect[0]
+
+
+def test_drive_watch_health_models_and_activate_work_together(node):
+    with running("drive", "pattern://", "--connect", node, "--stream", "cam1", "--wait", "20") as driver:
+        watched = neurove("watch", "--connect", node, "--json", "--count", "5")
+        lines = [json.loads(line) for line in watched.stdout.splitlines()]
+        assert len(lines) == 5
+        assert all(len(line["twists"]) == 5 and len(line["twists"][0]) == 6 for line in lines)
+        assert all("untrained" in line["flags"] for line in lines)
+        people = neurove("watch", "--connect", node, "--count", "1").stdout
+        assert people.startswith("cam1 ")
+        assert "model=untrained" in people
+
+        (health,) = json.loads(neurove("health", "--connect", node, "--json").stdout)
+        assert health["streams"][0]["stream"] == "cam1"
+        assert "cam1" in neurove("health", "--connect", node).stdout
+
+        activated = neurove("activate", "other", "--connect", node)
+        assert (activated.returncode, activated.stderr) == (0, "")
+        assert "other" in activated.stdout
+        (line,) = neurove("watch", "--connect", node, "--json", "--count", "1").stdout.splitlines()
+        assert (json.loads(line)["model"], json.loads(line)["epoch"]) == ("other", 1)
+
+        models = neurove("models", "--connect", node).stdout
+        assert "active" in models
+        assert "foreign.safetensors" in models
+        (told,) = json.loads(neurove("models", "--connect", node, "--json").stdout)
+        assert told["previous"]["name"] == "untrained"
+
+        code, out, _ = driver.end(signal.SIGINT)
+        assert code == 0
+        assert "packets" in out
+
+
+def test_activating_what_is_not_there_is_refused_by_the_node(node):
+    refused = neurove("activate", "../foreign", "--connect", node)
+    assert refused.returncode == 1
+    assert refused.stderr.count("\n") == 1
+    assert "model='../foreign': not on this node; available: untrained, other" in refused.stderr
+    assert "not a safetensors file" in neurove("activate", "foreign", "--connect", node).stderr
+
+
+def test_a_taken_port_is_one_clear_line(node):
+    second = neurove("serve", "--listen", node)
+    assert second.returncode == 2
+    assert second.stderr.strip().splitlines()[-1].startswith("neurove: can not open a Zenoh session")
+    assert "Address already in use" in second.stderr
+    assert "Traceback" not in second.stderr
+
+
+@pytest.mark.parametrize("command", [("health",), ("watch",), ("models",), ("activate", "other")])
+def test_without_a_service_a_client_says_so(command):
+    told = neurove(*command, "--connect", free_endpoint())
+    assert told.returncode == 1
+    assert told.stderr.startswith("neurove: no service")
+    assert told.stderr.count("\n") == 1
+
+
+def test_a_router_without_a_service_is_no_service_either():
+    from tests.live.test_feed import start_router
+
+    endpoint = free_endpoint()
+    router = start_router(endpoint)
+    try:
+        from tests.live.conftest import client
+
+        with client(endpoint):
+            pass
+        assert neurove("watch", "--connect", endpoint).returncode == 1
+        assert "is `neurove serve` running there" in neurove("health", "--connect", endpoint).stderr
+        nobody = neurove("drive", "pattern://", "--connect", endpoint, "--wait", "0.5")
+        assert (nobody.returncode, "no service took up stream cam0" in nobody.stderr) == (1, True)
+    finally:
+        router.kill()
+        router.wait()
+
+
+def test_the_demo_accounts_for_every_packet_event_and_window(tmp_path):
+    picture = tmp_path / "demo.svg"
+    shown = neurove("demo", "--duration", "2", "--json", "--screenshot", str(picture), timeout_s=180)
+    assert shown.returncode == 0, shown.stderr
+    told = json.loads(shown.stdout)
+    assert told["packets_sent"] == 500
+    assert told["packets_received"] + sum(told["lost"].values()) == told["packets_sent"]
+    assert told["estimates"] == told["windows"] > 0
+    assert told["sensor"] == {"width": 173, "height": 130}
+    assert (told["model"], told["trained"]) == ("untrained", False)
+    assert 0 < told["latency_ms"]["p50"] <= told["latency_ms"]["p95"] <= told["latency_ms"]["p99"]
+    assert "UNTRAINED" in picture.read_text()
+
+
+def test_the_demo_plays_a_real_recording_and_tells_people_what_came_of_it():
+    path = shared("ecd/shapes_rotation")
+    shown = neurove("demo", str(path), timeout_s=180)
+    assert shown.returncode == 0, shown.stderr
+    events = sum(piece.events.n for piece in slices(open_source(str(path)).chunks()))
+    assert f"events     {events:,} of {events:,}" in shown.stdout
+    assert "estimates  3 of 3 windows" in shown.stdout
+    assert "lost       nothing" in shown.stdout
+    assert "UNTRAINED: the velocities mean nothing" in shown.stdout
+
+
+def test_the_demo_of_a_truncated_recording_plays_what_is_whole_and_says_where_it_broke(tmp_path):
+    lines = [f"{i / 1000:.6f} {i % 240} {i % 180} {i % 2}" for i in range(300)]
+    (tmp_path / "events.txt").write_text("\n".join(lines) + "\n0.300 7 br\n")
+    shown = neurove("demo", str(tmp_path), timeout_s=180)
+    assert shown.returncode == 1
+    assert "events     300 of 300" in shown.stdout
+    assert "line 301" in shown.stderr
+
+
+def test_the_demo_of_nothing_is_one_line_that_lists_what_is_supported():
+    shown = neurove("demo", "nowhere.xyz")
+    assert shown.returncode == 2
+    assert shown.stderr.count("\n") == 1
+    assert "nowhere.xyz" in shown.stderr
+    assert "aedat4" in shown.stderr
+
+
+def test_a_demo_whose_model_can_not_be_loaded_says_why(tmp_path):
+    foreign = tmp_path / "foreign.safetensors"
+    foreign.write_text("hello, I am no model at all")
+    shown = neurove("demo", "--model", str(foreign), "--duration", "1", timeout_s=180)
+    assert shown.returncode == 1
+    assert "not a safetensors file" in shown.stderr
+    assert "Traceback" not in shown.stderr
+
+
+def test_ctrl_c_ends_the_demo_and_all_its_processes_in_order():
+    demo = Process("demo", "--duration", "60", "--json")
+    wait_until(lambda: len(children(demo.child.pid)) == 2, timeout_s=90)  # the service and the driver
+    started = children(demo.child.pid)
+    code, out, errors = demo.end(signal.SIGINT)
+    assert (code, errors) == (0, "")
+    assert json.loads(out)["packets_sent"] >= 0
+    assert not any(Path(f"/proc/{pid}").exists() for pid in started)
+
+
+def children(pid):
+    """Processes that a process started; empty where it has ended."""
+    try:
+        return [
+            int(child)
+            for task in Path(f"/proc/{pid}/task").iterdir()
+            for child in (task / "children").read_text().split()
+        ]
+    except OSError:
+        return []
+
+
+def test_killing_the_demo_leaves_no_process_behind():
+    demo = Process("demo", "--duration", "60", "--json")
+    wait_until(lambda: len(children(demo.child.pid)) == 2, timeout_s=90)
+    started = children(demo.child.pid)
+    demo.end(signal.SIGKILL)
+    wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in started))
+
+
+def test_a_service_that_waits_for_a_router_ends_in_order_when_told():
+    with running("serve", "--mode", "client", "--connect", free_endpoint(), "--node", "n1") as waiting:
+        for line in waiting.child.stderr:
+            if "waiting for a router" in line:
+                break
+        code, _, errors = waiting.end(signal.SIGTERM)
+    assert (code, "Traceback" in errors) == (0, False)

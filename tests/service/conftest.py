@@ -1,0 +1,25 @@
+import pytest
+
+from neurove_core import bundle
+from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
+from service.model_slot import ModelSlot
+
+SMALL = ModelConfig(
+    canonical=CanonicalConfig(width=24, height=16),
+    network=NetworkConfig(channels=(4, 4), features=8, hidden=8),
+    settle_windows=4,
+    low_activity_events=10,
+)
+
+
+@pytest.fixture(scope="session")
+def models_dir(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("models")
+    for seed, name in ((1, "one"), (2, "two")):
+        bundle.save(bundle.untrained(seed, SMALL, name), folder / f"{name}.safetensors")
+    return folder
+
+
+@pytest.fixture
+def slot(models_dir):
+    return ModelSlot("one", models_dir)

@@ -1,0 +1,133 @@
+import threading
+
+import pytest
+
+from protocol import CameraInfo, TwistEstimate
+from protocol.errors import Malformed
+from protocol.events import Limits, encode_packet
+from service.stream import Stream
+from service.worker import Inbox, Outlet, StreamWorker, _Sample
+from tests.builders import make_packets
+
+
+def sample(number, received_ns=0, size=0):
+    return _Sample(bytes([number]) + bytes(size), received_ns, is_camera=False)
+
+
+def drain(inbox):
+    taken, dropped = [], 0
+    while True:
+        one, lost = inbox.take(0)
+        dropped += lost
+        if one is None:
+            return taken, dropped
+        taken.append(one.payload[0])
+
+
+def test_an_inbox_hands_out_in_order_and_loses_nothing_within_its_bounds():
+    inbox = Inbox(max_age_s=1, max_bytes=1 << 20)
+    for number in range(100):
+        inbox.put(sample(number, received_ns=number * 1_000_000))
+    assert drain(inbox) == (list(range(100)), 0)
+
+
+def test_an_inbox_drops_the_oldest_that_waited_too_long_and_counts_them():
+    inbox = Inbox(max_age_s=0.01, max_bytes=1 << 20)
+    for number in range(100):
+        inbox.put(sample(number, received_ns=number * 1_000_000))
+    assert drain(inbox) == (list(range(89, 100)), 89)
+
+
+def test_an_inbox_never_holds_more_bytes_than_it_may():
+    inbox = Inbox(max_age_s=1, max_bytes=10_000)
+    for number in range(20):
+        inbox.put(sample(number, size=1000))
+    kept, dropped = drain(inbox)
+    assert kept == list(range(20 - len(kept), 20))
+    assert 0 < len(kept) * 1000 <= 10_000
+    assert dropped == 20 - len(kept)
+    inbox.put(sample(0, size=100_000))  # larger than everything it may hold
+    assert drain(inbox) == ([], 1)
+
+
+class Published:
+    """A worker's outlet that keeps what is published."""
+
+    def __init__(self, camera=None):
+        self.estimates: list[TwistEstimate] = []
+        self.closed = threading.Event()
+        self.camera = camera
+        self.came = threading.Condition()
+
+    def open(self):
+        return Outlet(self.camera or (lambda: None), self.publish, self.closed.set)
+
+    def publish(self, payload):
+        with self.came:
+            self.estimates.append(TwistEstimate.decode(payload))
+            self.came.notify_all()
+
+    def wait_for(self, count):
+        with self.came:
+            assert self.came.wait_for(lambda: len(self.estimates) >= count, timeout=20)
+        return self.estimates
+
+
+@pytest.fixture
+def published():
+    return Published()
+
+
+@pytest.fixture
+def worker(slot, published):
+    worker = StreamWorker(Stream("cam0", slot), published.open, Inbox(60, 1 << 26), Limits())
+    yield worker
+    worker.stop()
+    worker.join(5)
+
+
+def test_bytes_in_estimates_out(worker, published):
+    for packet in make_packets(100):
+        worker.put_packet(encode_packet(packet), 1)
+    assert [one.seq for one in published.wait_for(7)] == list(range(7))
+    assert all(one.trace.received_ns <= one.trace.queued_ns <= one.trace.computed_ns for one in published.estimates)
+
+
+def test_garbage_between_packets_is_counted_and_costs_nothing_else(worker, published):
+    for packet in make_packets(100):
+        worker.put_packet(encode_packet(packet), 1)
+        worker.put_packet(b"\x81garbage", 1)
+    published.wait_for(7)
+    assert worker.stream.counters.losses().nonzero().keys() <= {"malformed_packets"}
+
+
+def test_a_fault_while_working_on_a_packet_does_not_end_the_stream(worker, published, monkeypatch, caplog):
+    accept = worker.stream.accept
+
+    def faulty(packet, arrival):
+        if packet.seq == 20:
+            raise RuntimeError("planted")
+        return accept(packet, arrival)
+
+    monkeypatch.setattr(worker.stream, "accept", faulty)
+    for packet in make_packets(100):
+        worker.put_packet(encode_packet(packet), 1)
+    published.wait_for(6)
+    assert worker.stream.counters.failed_packets == 1
+
+
+def test_a_camera_that_can_not_be_read_is_refused_and_the_stream_goes_on(slot):
+    def broken():
+        raise Malformed("camera info", "planted")
+
+    published = Published(broken)
+    worker = StreamWorker(Stream("cam0", slot), published.open, Inbox(60, 1 << 26), Limits())
+    worker.put_camera(b"garbage", 1)
+    good = CameraInfo(stream="cam0", width=64, height=48, lens="pinhole", fx=40, fy=40, cx=32, cy=24)
+    worker.put_camera(good.encode(), 1)
+    for packet in make_packets(30):
+        worker.put_packet(encode_packet(packet), 1)
+    assert "uncalibrated" not in published.wait_for(2)[0].flags
+    worker.stop()
+    worker.join(5)
+    assert published.closed.is_set()
