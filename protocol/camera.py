@@ -4,9 +4,9 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from protocol.codec import Message
+from protocol.codec import Message, Name
+from protocol.errors import InvalidField
 from protocol.events import Sensor
-from protocol.keys import check_name
 
 SCHEMA = "application/msgpack;neurove.camera.1"
 """Zenoh Encoding of a CameraInfo."""
@@ -23,7 +23,7 @@ class CameraInfo(Message):
 
     what: ClassVar[str] = "camera info"
 
-    stream: str
+    stream: Name
     width: Annotated[int, Field(ge=1, le=1 << 15)]
     height: Annotated[int, Field(ge=1, le=1 << 15)]
     lens: Literal["pinhole", "equidistant"]
@@ -36,11 +36,10 @@ class CameraInfo(Message):
 
     @model_validator(mode="after")
     def _distortion_fits_the_lens(self) -> Self:
-        check_name("stream", self.stream)
         allowed = (0, 4, 5) if self.lens == "pinhole" else (0, 4)
         if len(self.distortion) not in allowed:
             counts = ", ".join(map(str, allowed))
-            raise ValueError(f"distortion has {len(self.distortion)} coefficients, {self.lens} takes {counts}")
+            raise InvalidField(self.what, "distortion", self.distortion, f"{self.lens} takes {counts} coefficients")
         return self
 
     @property

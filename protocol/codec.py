@@ -1,11 +1,13 @@
 """Bytes <-> checked messages: msgpack maps with a version field, validated by pydantic, refused with our own errors."""
 
-from typing import Any, ClassVar, Final, Literal, Self, TypeVar, cast
+from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeVar, cast
 
 import msgpack
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic_core import PydanticCustomError
 
-from protocol.errors import InvalidField, Malformed, NeuroVEError, UnsupportedVersion
+from protocol.errors import InvalidField, Malformed, UnsupportedVersion
+from protocol.keys import NAME_RULE, is_name
 
 PROTOCOL_VERSION: Final = 1
 """Major version on the wire. Fields may be added within a version; readers of data messages ignore unknown ones."""
@@ -14,6 +16,20 @@ MAX_STRING_BYTES = 4096
 MAX_ITEMS = 4096
 MAX_MESSAGE_BYTES = 1 << 20
 """Cap of every message but the event packet, which has its own (events.Limits)."""
+
+
+def _name(value: str) -> str:
+    if not is_name(value):
+        raise PydanticCustomError("name", NAME_RULE)
+    return value
+
+
+Name = Annotated[str, AfterValidator(_name)]
+"""Of a stream or a node: fit to be one chunk of a key."""
+
+Int64 = Annotated[int, Field(ge=-(1 << 63), lt=1 << 63)]
+Count = Annotated[int, Field(ge=0, lt=1 << 63)]
+"""Integers stay within 63 bits and a sign, which every language has."""
 
 
 class Part(BaseModel):
@@ -74,8 +90,6 @@ def unpack(data: bytes, what: str, max_bytes: int = MAX_MESSAGE_BYTES) -> dict[s
             max_map_len=MAX_ITEMS,
             max_ext_len=0,
         )
-    except NeuroVEError:
-        raise
     except (ValueError, TypeError, RecursionError, msgpack.UnpackException) as error:
         raise Malformed(what, str(error) or type(error).__name__) from None
     if not isinstance(fields, dict):
@@ -88,6 +102,8 @@ def unpack(data: bytes, what: str, max_bytes: int = MAX_MESSAGE_BYTES) -> dict[s
 
 def _map_without_duplicates(pairs: list[tuple[Any, Any]]) -> dict[str, Any]:
     fields = dict(pairs)
+    if not all(isinstance(key, str) for key in fields):
+        raise ValueError("a key of a map is no string")
     if len(fields) != len(pairs):
         raise ValueError("a key stands twice in one map")
     return fields

@@ -4,10 +4,9 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import ConfigDict, Field
 
-from protocol.codec import Message, Part
+from protocol.codec import Count, Message, Name, Part
 from protocol.errors import NeuroVEError
 
-Count = Annotated[int, Field(ge=0)]
 Verdict = Literal["ok", "lossy", "stalled", "idle"]
 
 STATUS_SCHEMA = "application/msgpack;neurove.status.1"
@@ -73,8 +72,8 @@ class StreamStatus(Message):
 
     what: ClassVar[str] = "stream status"
 
-    node: str
-    stream: str
+    node: Name
+    stream: Name
     verdict: Verdict
     why: str  # one sentence
     width: Count
@@ -106,7 +105,7 @@ class HealthReply(Message):
 
     what: ClassVar[str] = "health reply"
 
-    node: str
+    node: Name
     ok: bool
     why: str
     uptime_s: float
@@ -122,7 +121,7 @@ class ModelsReply(Message):
 
     what: ClassVar[str] = "models reply"
 
-    node: str
+    node: Name
     active: ModelInfo
     previous: ModelInfo | None
     epoch: Count
@@ -135,7 +134,7 @@ class ActivateReply(Message):
 
     what: ClassVar[str] = "activate reply"
 
-    node: str
+    node: Name
     active: ModelInfo
     previous: ModelInfo
     epoch: Count

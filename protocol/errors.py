@@ -4,9 +4,42 @@ Every error has a stable `code` (part of the wire contract), a sentence that nam
 three as `details` for machines.
 """
 
+import reprlib
 from typing import ClassVar
 
 Detail = str | int | float | bool | None
+
+MAX_TEXT_BYTES = 1024
+"""Cap of an error's sentence and of each of its details: what a peer is told must fit the caps of a message."""
+
+
+class _Short(reprlib.Repr):
+    """A repr whose length, depth and cost are bounded, for values that a peer sent."""
+
+    repr_bytes = reprlib.Repr.repr_str
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxlevel = 2
+        self.maxstring = self.maxother = 80
+
+
+_SHORT = _Short()
+
+
+def shown(value: object) -> str:
+    """The value as a sentence shows it: its repr, at most 80 characters however long or deep the value is.
+
+    >>> shown([[[1]]])
+    '[[...]]'
+    """
+    text = _SHORT.repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+def _clipped(text: str) -> str:
+    data = text.encode("utf-8", "backslashreplace")  # a file name may hold what UTF-8 does not
+    return (data if len(data) <= MAX_TEXT_BYTES else data[: MAX_TEXT_BYTES - 3] + b"...").decode("utf-8", "ignore")
 
 
 class NeuroVEError(Exception):
@@ -14,10 +47,12 @@ class NeuroVEError(Exception):
 
     code: ClassVar[str] = "internal"
 
-    def __init__(self, message: str, **details: Detail) -> None:
-        super().__init__(message)
-        self.message = message
-        self.details: dict[str, Detail] = details
+    def __init__(self, message: str, /, **details: Detail) -> None:
+        self.message = _clipped(message)
+        self.details: dict[str, Detail] = {
+            name: _clipped(value) if isinstance(value, str) else value for name, value in details.items()
+        }
+        super().__init__(self.message)
 
 
 class InternalError(NeuroVEError):
@@ -44,7 +79,7 @@ class UnsupportedVersion(NeuroVEError):
     code = "unsupported_version"
 
     def __init__(self, what: str, got: object, want: int) -> None:
-        value = got if isinstance(got, int) else repr(got)
+        value = got if isinstance(got, int) else shown(got)
         super().__init__(f"{what}: protocol version v={value}, this side speaks v={want}", field="v", value=value)
 
 
@@ -54,9 +89,8 @@ class InvalidField(NeuroVEError):
     code = "invalid_field"
 
     def __init__(self, what: str, field: str, value: object, bound: str) -> None:
-        shown = repr(value)
-        shown = shown if len(shown) <= 80 else shown[:77] + "..."
-        super().__init__(f"{what}: {field}={shown}: {bound}", field=field, value=shown, bound=bound)
+        field = field if len(field) <= 80 else field[:77] + "..."  # a misspelt one is the peer's, of any length
+        super().__init__(f"{what}: {field}={shown(value)}: {bound}", field=field, value=shown(value), bound=bound)
 
 
 class UnknownFormat(NeuroVEError):
@@ -66,7 +100,7 @@ class UnknownFormat(NeuroVEError):
 
     def __init__(self, got: str, known: tuple[str, ...]) -> None:
         super().__init__(
-            f"event packet: format={got!r}: known formats are {', '.join(known)}", field="format", value=got
+            f"event packet: format={shown(got)}: known formats are {', '.join(known)}", field="format", value=got
         )
 
 

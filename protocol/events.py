@@ -2,16 +2,14 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, NamedTuple, cast
+from typing import Annotated, Any, ClassVar, NamedTuple
 
-import msgpack
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from protocol.codec import PROTOCOL_VERSION, Message, unpack, validate
+from protocol.codec import Count, Message, Name, unpack, validate
 from protocol.errors import BlobLength, EventOutsideSensor, InvalidField, TimeBackwards, UnknownFormat
-from protocol.keys import check_name
 
 EVENT_DTYPE = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1")])
 """One event as a record, for files and tables: t sensor clock [us], x and y [px], p polarity (1 ON, 0 OFF)."""
@@ -149,12 +147,12 @@ DEFAULT_LIMITS = Limits()
 class _Header(Message):
     what: ClassVar[str] = "event packet"
 
-    stream: str
-    seq: Annotated[int, Field(ge=0, lt=1 << 63)]
+    stream: Name
+    seq: Count
     width: Annotated[int, Field(ge=1)]
     height: Annotated[int, Field(ge=1)]
     t0_us: Annotated[int, Field(ge=-(1 << 62), lt=1 << 62)]
-    n: Annotated[int, Field(ge=0)]
+    n: Count
     format: str
     data: bytes
 
@@ -169,26 +167,25 @@ def encode_packet(packet: EventPacket, blob_format: str | None = None) -> bytes:
     Raises:
         EventOutsideSensor, TimeBackwards, InvalidField: the packet is not what it must be.
     """
-    check_name("stream", packet.stream)
     check_events(packet.events, packet.sensor, packet.t0_us)
-    offset = packet.events.t - packet.t0_us
-    span_us = int(offset[-1]) if offset.size else 0
+    if (packet.events.p > 1).any():  # -1 for OFF, say, would turn into ON
+        raise InvalidField(_Header.what, "p", int(packet.events.p.max()), "the polarity is 1 (ON) or 0 (OFF)")
+    span_us = int(packet.events.t[-1]) - packet.t0_us if packet.events.n else 0
     blob_format = blob_format or ("soa6" if span_us < 1 << 16 else "soa8")
     if blob_format not in FORMATS:
         raise UnknownFormat(blob_format, FORMATS)
     offset_type, limit_us = ("<u2", 1 << 16) if blob_format == "soa6" else ("<u4", 1 << 32)
     if span_us >= limit_us:
-        raise InvalidField("event packet", "t", span_us, f"{blob_format} holds offsets below {limit_us} us")
+        raise InvalidField(_Header.what, "t", span_us, f"{blob_format} holds offsets below {limit_us} us")
     y_and_p = packet.events.y | (packet.events.p.astype(np.uint16) << np.uint16(15))
     blob = b"".join(
         (
-            offset.astype(offset_type).tobytes(),
+            (packet.events.t - packet.t0_us).astype(offset_type).tobytes(),
             packet.events.x.astype("<u2", copy=False).tobytes(),
             y_and_p.astype("<u2", copy=False).tobytes(),
         )
     )
     header = {
-        "v": PROTOCOL_VERSION,
         "stream": packet.stream,
         "seq": packet.seq,
         "width": packet.sensor.width,
@@ -198,7 +195,7 @@ def encode_packet(packet: EventPacket, blob_format: str | None = None) -> bytes:
         "format": blob_format,
         "data": blob,
     }
-    return cast(bytes, msgpack.packb(header))
+    return validate(_Header, header).encode()
 
 
 def decode_packet(data: bytes, limits: Limits = DEFAULT_LIMITS) -> EventPacket:
@@ -209,7 +206,6 @@ def decode_packet(data: bytes, limits: Limits = DEFAULT_LIMITS) -> EventPacket:
             TimeBackwards; never any other exception.
     """
     header = validate(_Header, unpack(data, _Header.what, limits.max_bytes))
-    check_name("stream", header.stream)
     for name, value, bound in (
         ("n", header.n, limits.max_events),
         ("width", header.width, limits.max_side_px),

@@ -14,13 +14,18 @@ _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 _PREFIX = re.compile(r"[A-Za-z0-9_.-]{1,64}(/[A-Za-z0-9_.-]{1,64}){0,7}")
 
 
+def is_name(name: str) -> bool:
+    """Whether the name is fit to be one chunk of a key."""
+    return _NAME.fullmatch(name) is not None
+
+
 def check_name(what: str, name: str) -> str:
     """The name, if it is fit to be one chunk of a key.
 
     >>> check_name("stream", "cam0")
     'cam0'
     """
-    if not _NAME.fullmatch(name):
+    if not is_name(name):
         raise InvalidField("key", what, name, NAME_RULE)
     return name
 

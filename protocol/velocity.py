@@ -5,8 +5,8 @@ from typing import Annotated, ClassVar, NamedTuple, Self
 
 from pydantic import Field, model_validator
 
-from protocol.codec import Message, Part
-from protocol.keys import check_name
+from protocol.codec import Count, Int64, Message, Name, Part
+from protocol.errors import InvalidField
 
 SCHEMA = "application/msgpack;neurove.velocity.1"
 """Zenoh Encoding of a TwistEstimate."""
@@ -44,10 +44,10 @@ class Twist(NamedTuple):
 class Trace(Part):
     """When one estimate passed where, on the service's monotonic clock [ns]; only differences have a meaning."""
 
-    received_ns: int  # the packet that completed the window came in from the network
-    queued_ns: int  # the stream's worker took it out of its queue
-    computed_ns: int  # the network had answered
-    published_ns: int  # handed over to Zenoh
+    received_ns: Int64  # the packet that completed the window came in from the network
+    queued_ns: Int64  # the stream's worker took it out of its queue
+    computed_ns: Int64  # the network had answered
+    published_ns: Int64  # handed over to Zenoh
 
     @property
     def latency_ms(self) -> float:
@@ -60,27 +60,26 @@ class TwistEstimate(Message):
 
     what: ClassVar[str] = "twist estimate"
 
-    stream: str
-    seq: Annotated[int, Field(ge=0)]  # counts estimates of this stream from 0, without holes
-    start_us: int  # window [start_us, end_us), sensor clock
-    end_us: int
-    bin_end_us: Annotated[tuple[int, ...], Field(strict=False, min_length=1)]
+    stream: Name
+    seq: Count  # counts estimates of this stream from 0, without holes
+    start_us: Int64  # window [start_us, end_us), sensor clock
+    end_us: Int64
+    bin_end_us: Annotated[tuple[Int64, ...], Field(strict=False, min_length=1)]
     twists: Annotated[tuple[Twist, ...], Field(strict=False, min_length=1)]
     frame_id: str = "camera_optical"
     model: str  # name of the model
     digest: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]  # sha256 of its bundle
-    epoch: Annotated[int, Field(ge=0)]  # counts model changes of the node
-    events: Annotated[int, Field(ge=0)]  # events of this window, all of the sensor
+    epoch: Count  # counts model changes of the node
+    events: Count  # events of this window, all of the sensor
     flags: Annotated[tuple[str, ...], Field(strict=False)] = ()
     trace: Trace
 
     @model_validator(mode="after")
     def _one_twist_per_bin(self) -> Self:
-        check_name("stream", self.stream)
         if len(self.twists) != len(self.bin_end_us):
-            raise ValueError(f"{len(self.twists)} twists for {len(self.bin_end_us)} bins")
+            raise InvalidField(self.what, "twists", len(self.twists), f"one for each of {len(self.bin_end_us)} bins")
         if self.end_us <= self.start_us:
-            raise ValueError(f"end_us={self.end_us} is not after start_us={self.start_us}")
+            raise InvalidField(self.what, "end_us", self.end_us, f"must be after start_us={self.start_us}")
         return self
 
     @property

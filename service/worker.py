@@ -19,7 +19,9 @@ _IDLE_BEAT_S = 0.5
 _SAMPLE_BYTES = 256
 
 
-class _Sample(NamedTuple):
+class Sample(NamedTuple):
+    """One message as it came from the network."""
+
     payload: bytes
     received_ns: int
     is_camera: bool
@@ -42,12 +44,12 @@ class Inbox:
     """
 
     def __init__(self, max_age_s: float, max_bytes: int) -> None:
-        self._samples: deque[_Sample] = deque()
+        self._samples: deque[Sample] = deque()
         self._max_age_ns, self._max_bytes = max_age_s * 1e9, max_bytes
         self._bytes = self._dropped = 0
         self._changed = threading.Condition()
 
-    def put(self, sample: _Sample) -> None:
+    def put(self, sample: Sample) -> None:
         """Append; never blocks for longer than an append takes."""
         with self._changed:
             self._samples.append(sample)
@@ -65,7 +67,7 @@ class Inbox:
         with self._changed:
             self._changed.notify_all()
 
-    def take(self, timeout_s: float) -> tuple[_Sample | None, int]:
+    def take(self, timeout_s: float) -> tuple[Sample | None, int]:
         """The oldest sample, or None after the time out; and how many were dropped since the last call."""
         with self._changed:
             if not self._samples:
@@ -105,11 +107,11 @@ class StreamWorker:
 
     def put_packet(self, payload: bytes, received_ns: int) -> None:
         """Queue an event packet."""
-        self._inbox.put(_Sample(payload, received_ns, is_camera=False))
+        self._inbox.put(Sample(payload, received_ns, is_camera=False))
 
     def put_camera(self, payload: bytes, received_ns: int) -> None:
         """Queue a CameraInfo."""
-        self._inbox.put(_Sample(payload, received_ns, is_camera=True))
+        self._inbox.put(Sample(payload, received_ns, is_camera=True))
 
     def stop(self) -> None:
         """Ask the thread to end; what is queued is not worked on any more."""
@@ -134,7 +136,7 @@ class StreamWorker:
         finally:
             outlet.close()
 
-    def _work(self, sample: _Sample, outlet: Outlet) -> None:
+    def _work(self, sample: Sample, outlet: Outlet) -> None:
         if sample.is_camera:
             self._see_through(lambda: CameraInfo.decode(sample.payload))
             return

@@ -6,12 +6,12 @@ from protocol import CameraInfo, TwistEstimate
 from protocol.errors import Malformed
 from protocol.events import Limits, encode_packet
 from service.stream import Stream
-from service.worker import Inbox, Outlet, StreamWorker, _Sample
+from service.worker import Inbox, Outlet, StreamWorker, Sample
 from tests.builders import make_packets
 
 
 def sample(number, received_ns=0, size=0):
-    return _Sample(bytes([number]) + bytes(size), received_ns, is_camera=False)
+    return Sample(bytes([number]) + bytes(size), received_ns, is_camera=False)
 
 
 def drain(inbox):

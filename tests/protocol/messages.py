@@ -1,0 +1,390 @@
+"""One valid example and one strategy of every message on the wire, as plain values: what the generic laws run over."""
+
+import math
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import msgpack
+from hypothesis import settings
+from hypothesis import strategies as st
+
+from protocol import CameraInfo, EventPacket, Events, Sensor, TwistEstimate
+from protocol.codec import Message
+from protocol.control import (
+    ActivateReply,
+    ActivateRequest,
+    ErrorReply,
+    HealthReply,
+    HealthRequest,
+    ModelsReply,
+    ModelsRequest,
+    Request,
+    StreamStatus,
+)
+from protocol.events import decode_packet, encode_packet
+
+Fields = dict[str, Any]
+Path = tuple[str | int, ...]
+
+bounded = settings(max_examples=60, deadline=None, derandomize=True, database=None)
+"""Every run draws the same examples, and not more of them than a gate can wait for."""
+
+
+def soa(events: list[tuple[int, int, int, int]], *, wide: bool = False) -> bytes:
+    """The blob soa6 (or `wide`, soa8) of (offset, x, y, p), written from the contract and not with our encoder."""
+    n = len(events)
+    offsets = struct.pack(f"<{n}{'I' if wide else 'H'}", *(event[0] for event in events))
+    x = struct.pack(f"<{n}H", *(event[1] for event in events))
+    return offsets + x + struct.pack(f"<{n}H", *(y | p << 15 for _, _, y, p in events))
+
+
+EVENTS = [(0, 0, 0, 1), (3, 345, 0, 0), (3, 17, 259, 1), (65535, 345, 259, 0)]
+MODEL: Fields = {
+    "name": "spire-7",
+    "digest": "5e" * 32,
+    "trained": True,
+    "provenance": "simulated corridors, seed 7",
+    "parameters": 381_446,
+}
+STATUS: Fields = {
+    "v": 1,
+    "node": "rover-1",
+    "stream": "cam0",
+    "verdict": "lossy",
+    "why": "3 of 1000 packets were lost on the way",
+    "width": 346,
+    "height": 260,
+    "calibrated": True,
+    "packets_received": 997,
+    "events_received": 199_400,
+    "windows": 79,
+    "estimates": 79,
+    "resets": 1,
+    "outside_events": 12,
+    "lost": {
+        "gap_packets": 3,
+        "overload_packets": 0,
+        "duplicate_packets": 0,
+        "out_of_order_packets": 0,
+        "malformed_packets": 0,
+        "failed_packets": 0,
+        "late_events": 41,
+        "skipped_windows": 0,
+    },
+    "latency_ms": {"p50": 3.25, "p95": 5.5, "p99": 9.75},
+    "last_packet_age_s": 0.004,
+}
+EXAMPLES: dict[str, Fields] = {
+    "EventPacket": {
+        "v": 1,
+        "stream": "cam0",
+        "seq": 7,
+        "width": 346,
+        "height": 260,
+        "t0_us": -1_000,
+        "n": len(EVENTS),
+        "format": "soa6",
+        "data": soa(EVENTS),
+    },
+    "CameraInfo": {
+        "v": 1,
+        "stream": "cam0",
+        "width": 346,
+        "height": 260,
+        "lens": "pinhole",
+        "fx": 226.4,
+        "fy": 226.1,
+        "cx": 173.6,
+        "cy": 133.7,
+        "distortion": [-0.048, 0.011, -0.0005, 0.0002],
+        "height_m": 0.31,
+    },
+    "TwistEstimate": {
+        "v": 1,
+        "stream": "cam0",
+        "seq": 41,
+        "start_us": -50_000,
+        "end_us": 0,
+        "bin_end_us": [-25_000, 0],
+        "twists": [[0.25, 0.0, 1.5, 0.0, -0.125, 0.0], [0.5, 0.0, 1.5, 0.0, -0.25, 0.0]],
+        "frame_id": "camera_optical",
+        "model": "spire-7",
+        "digest": "5e" * 32,
+        "epoch": 2,
+        "events": 9_214,
+        "flags": ["settling", "uncalibrated"],
+        "trace": {"received_ns": 1_000, "queued_ns": 2_000, "computed_ns": 3_000, "published_ns": 4_000},
+    },
+    "StreamStatus": STATUS,
+    "HealthRequest": {"v": 1},
+    "HealthReply": {
+        "v": 1,
+        "node": "rover-1",
+        "ok": False,
+        "why": "stream cam0 is lossy",
+        "uptime_s": 3_600.5,
+        "version": "0.1.0",
+        "model": MODEL,
+        "epoch": 2,
+        "refused_streams": 0,
+        "streams": [STATUS],
+    },
+    "ModelsRequest": {"v": 1},
+    "ModelsReply": {
+        "v": 1,
+        "node": "rover-1",
+        "active": MODEL,
+        "previous": MODEL,
+        "epoch": 2,
+        "available": [MODEL],
+        "unreadable": {"old.safetensors": "the header names no model"},
+    },
+    "ActivateRequest": {"v": 1, "model": "spire-7"},
+    "ActivateReply": {"v": 1, "node": "rover-1", "active": MODEL, "previous": MODEL, "epoch": 3},
+    "ErrorReply": {
+        "v": 1,
+        "code": "unknown_model",
+        "message": "model='spire-9': not on this node; available: spire-7",
+        "details": {"value": "spire-9", "tried": 3, "seconds": 0.5, "remote": True, "hint": None},
+    },
+}
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One message of the contract: how its bytes are read and written, and a valid example of its fields."""
+
+    name: str
+    decode: Callable[[bytes], Any]
+    encode: Callable[[Any], bytes]
+    strict: bool  # a request: refuses fields that it does not know
+    optional: frozenset[str]  # fields that may be left out
+
+    def fields(self) -> Fields:
+        """A fresh copy of the example, to be spoilt."""
+        return unshared(EXAMPLES[self.name])
+
+    def bytes(self) -> bytes:
+        """The example on the wire."""
+        return pack(EXAMPLES[self.name])
+
+    def __str__(self) -> str:
+        return self.name
+
+
+def _kind(model: type[Message]) -> Kind:
+    optional = frozenset(name for name, field in model.model_fields.items() if not field.is_required()) - {"v"}
+    return Kind(model.__name__, model.decode, model.encode, issubclass(model, Request), optional)
+
+
+MODELS: tuple[type[Message], ...] = (
+    CameraInfo,
+    TwistEstimate,
+    StreamStatus,
+    HealthRequest,
+    HealthReply,
+    ModelsRequest,
+    ModelsReply,
+    ActivateRequest,
+    ActivateReply,
+    ErrorReply,
+)
+EVENT_PACKET = Kind("EventPacket", decode_packet, encode_packet, strict=False, optional=frozenset())
+KINDS = (EVENT_PACKET, *map(_kind, MODELS))
+BY_NAME = {kind.name: kind for kind in KINDS}
+
+
+def pack(fields: object) -> bytes:
+    """The fields on the wire, by a packer that is not ours."""
+    data = msgpack.packb(fields)
+    assert isinstance(data, bytes)
+    return data
+
+
+def paths(value: object, path: Path = ()) -> Iterator[tuple[Path, Any]]:
+    """Every value inside a message with the way to it, parents before children; without the version."""
+    if path and path[-1] != "v":
+        yield path, value
+    for key, child in value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ():
+        yield from paths(child, (*path, key))
+
+
+def unshared(fields: Fields) -> Fields:
+    """A copy in which no part stands twice, unlike what copy.deepcopy makes of an example."""
+    copy = msgpack.unpackb(pack(fields))
+    assert isinstance(copy, dict)
+    return copy
+
+
+def replaced(fields: Fields, path: Path, value: object) -> Fields:
+    """A copy of the fields with another value at the end of the path."""
+    fields = unshared(fields)
+    *way, last = path
+    place: Any = fields
+    for key in way:
+        place = place[key]
+    place[last] = value
+    return fields
+
+
+def dotted(path: Path) -> str:
+    """The path as an error names it."""
+    return ".".join(map(str, path))
+
+
+# --- strategies: any valid message
+
+counts = st.integers(0, 2**63 - 1)
+int64s = st.integers(-(2**63), 2**63 - 1)
+floats = st.floats(allow_nan=False, allow_infinity=False)
+positives = floats.filter(lambda value: value > 0)
+sentences = st.text(st.characters(exclude_categories=["Cs"]), max_size=40)
+names = st.from_regex(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}", fullmatch=True)
+digests = st.from_regex(r"[0-9a-f]{64}", fullmatch=True)
+models = st.fixed_dictionaries(
+    {"name": sentences, "digest": sentences, "trained": st.booleans(), "provenance": sentences, "parameters": counts}
+)
+statuses = st.fixed_dictionaries(
+    {
+        "node": names,
+        "stream": names,
+        "verdict": st.sampled_from(["ok", "lossy", "stalled", "idle"]),
+        "why": sentences,
+        "calibrated": st.booleans(),
+        "lost": st.fixed_dictionaries(dict.fromkeys(STATUS["lost"], counts)),
+        "latency_ms": st.none() | st.fixed_dictionaries(dict.fromkeys(("p50", "p95", "p99"), floats)),
+        "last_packet_age_s": floats,
+        **{name: counts for name, value in STATUS.items() if type(value) is int and name != "v"},
+    }
+)
+
+
+@st.composite
+def cameras(draw: st.DrawFn) -> Fields:
+    lens = draw(st.sampled_from(["pinhole", "equidistant"]))
+    terms = draw(st.sampled_from([0, 4, 5] if lens == "pinhole" else [0, 4]))
+    return {
+        "stream": draw(names),
+        "width": draw(st.integers(1, 1 << 15)),
+        "height": draw(st.integers(1, 1 << 15)),
+        "lens": lens,
+        "fx": draw(positives),
+        "fy": draw(positives),
+        "cx": draw(floats),
+        "cy": draw(floats),
+        "distortion": draw(st.lists(floats, min_size=terms, max_size=terms)),
+        "height_m": draw(st.none() | positives),
+    }
+
+
+@st.composite
+def estimates(draw: st.DrawFn) -> Fields:
+    bins = draw(st.integers(1, 6))
+    start_us = draw(st.integers(-(2**63), 2**63 - 2))
+    return {
+        "stream": draw(names),
+        "seq": draw(counts),
+        "start_us": start_us,
+        "end_us": draw(st.integers(start_us + 1, 2**63 - 1)),
+        "bin_end_us": draw(st.lists(int64s, min_size=bins, max_size=bins)),
+        "twists": draw(st.lists(st.lists(floats, min_size=6, max_size=6), min_size=bins, max_size=bins)),
+        "frame_id": draw(sentences),
+        "model": draw(sentences),
+        "digest": draw(digests),
+        "epoch": draw(counts),
+        "events": draw(counts),
+        "flags": draw(st.lists(sentences, max_size=4)),
+        "trace": draw(st.fixed_dictionaries(dict.fromkeys(EXAMPLES["TwistEstimate"]["trace"], int64s))),
+    }
+
+
+ANY: dict[str, st.SearchStrategy[Fields]] = {
+    "CameraInfo": cameras(),
+    "TwistEstimate": estimates(),
+    "StreamStatus": statuses,
+    "HealthRequest": st.just({}),
+    "HealthReply": st.fixed_dictionaries(
+        {
+            "node": names,
+            "ok": st.booleans(),
+            "why": sentences,
+            "uptime_s": floats,
+            "version": sentences,
+            "model": models,
+            "epoch": counts,
+            "refused_streams": counts,
+            "streams": st.lists(statuses.map(lambda status: {"v": 1, **status}), max_size=2),
+        }
+    ),
+    "ModelsRequest": st.just({}),
+    "ModelsReply": st.fixed_dictionaries(
+        {
+            "node": names,
+            "active": models,
+            "previous": st.none() | models,
+            "epoch": counts,
+            "available": st.lists(models, max_size=3),
+            "unreadable": st.dictionaries(sentences, sentences, max_size=3),
+        }
+    ),
+    "ActivateRequest": st.fixed_dictionaries({"model": sentences.filter(bool)}),
+    "ActivateReply": st.fixed_dictionaries({"node": names, "active": models, "previous": models, "epoch": counts}),
+    "ErrorReply": st.fixed_dictionaries(
+        {
+            "code": sentences,
+            "message": sentences,
+            "details": st.dictionaries(sentences, sentences | int64s | floats | st.booleans() | st.none(), max_size=4),
+        }
+    ),
+}
+
+
+@st.composite
+def packets(draw: st.DrawFn, max_events: int = 40, max_span_us: int = 2**32 - 1) -> EventPacket:
+    """Any valid packet, its events in the corners of the sensor too."""
+    sensor = Sensor(draw(st.integers(1, 4096)), draw(st.integers(1, 4096)))
+    t0_us = draw(st.integers(-(2**62), 2**62 - 1))
+    rows = draw(
+        st.lists(
+            st.tuples(
+                st.integers(0, min(max_span_us, 2**63 - 1 - t0_us)),
+                st.integers(0, sensor.width - 1),
+                st.integers(0, sensor.height - 1),
+                st.integers(0, 1),
+            ),
+            max_size=max_events,
+        )
+    )
+    t, x, y, p = zip(*sorted(rows), strict=True) if rows else ((), (), (), ())
+    return EventPacket(
+        draw(names), draw(counts), sensor, t0_us, Events.from_columns([t0_us + offset for offset in t], x, y, p)
+    )
+
+
+def same(left: object, right: object) -> bool:
+    """Equal in type and value all the way down, -0.0 apart from 0.0: nothing was rounded or turned on the way."""
+    if type(left) is not type(right):
+        return False
+    if isinstance(left, dict) and isinstance(right, dict):
+        return left.keys() == right.keys() and all(same(left[key], right[key]) for key in left)
+    if isinstance(left, list) and isinstance(right, list):
+        return len(left) == len(right) and all(map(same, left, right))
+    if isinstance(left, float) and isinstance(right, float):
+        return left == right and math.copysign(1, left) == math.copysign(1, right)
+    return left == right
+
+
+def assert_same_packet(left: EventPacket, right: EventPacket) -> None:
+    """Bit for bit: all columns, their types, and everything in the header."""
+    assert (left.stream, left.seq, left.sensor, left.t0_us) == (right.stream, right.seq, right.sensor, right.t0_us)
+    assert_same_events(left.events, right.events)
+
+
+def assert_same_events(left: Events, right: Events) -> None:
+    """Bit for bit: the columns and their types."""
+    for name in Events._fields:
+        a, b = getattr(left, name), getattr(right, name)
+        assert a.dtype == b.dtype, name
+        assert a.tobytes() == b.tobytes(), name
