@@ -24,7 +24,7 @@ class Flag(StrEnum):
     SETTLING = "settling"  # the recurrent state is younger than the model's settling time
     RESET = "reset"  # the state began anew in this window
     SENSOR_CHANGED = "sensor_changed"  # and it did because the stream's geometry or CameraInfo changed
-    GAP = "gap"  # packets of this window, or windows just before it, were lost
+    GAP = "gap"  # packets of this window were lost
     OVERLOAD = "overload"  # and they were dropped here, because this node could not keep up
     LOW_ACTIVITY = "low_activity"  # fewer events than the model needs to see motion
     SATURATED = "saturated"  # some cell counted more events than it can hold

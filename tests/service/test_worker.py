@@ -6,7 +6,7 @@ from protocol import CameraInfo, TwistEstimate
 from protocol.errors import Malformed
 from protocol.events import Limits, encode_packet
 from service.stream import Stream
-from service.worker import Inbox, Outlet, StreamWorker, Sample
+from service.worker import Inbox, Outlet, Sample, StreamWorker
 from tests.builders import make_packets
 
 
