@@ -16,12 +16,12 @@ import safetensors.torch
 import torch
 from pydantic import Field, ValidationError
 from safetensors import SafetensorError
-from torch import Tensor
+from torch import Tensor, nn
 
 from neurove_core.config import Config, ModelConfig
 from neurove_core.network import NeuroVE
 from protocol.control import ModelInfo
-from protocol.errors import BadModel
+from protocol.errors import BadModel, shown
 
 BUNDLE_VERSION: Final = 1
 SUFFIX = ".safetensors"
@@ -80,13 +80,16 @@ class Bundle:
 
 
 def save(bundle: Bundle, path: Path) -> None:
-    """Write a bundle's file; it is whole or it is not there."""
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as file:
-        file.write(bundle.to_bytes())
-        file.flush()
-        os.fsync(file.fileno())
-    part.replace(path)
+    """Write a bundle's file; it is whole or it is not there, and what was there before stays until it is."""
+    data, part = bundle.to_bytes(), path.with_name(path.name + ".part")
+    try:
+        with part.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)  # it is there only where writing failed
 
 
 def load(path: Path) -> Bundle:
@@ -114,11 +117,13 @@ def from_bytes(data: bytes, name: str) -> Bundle:
     header = read_header(data, name)
     try:
         tensors = safetensors.torch.load(data)
-    except (SafetensorError, ValueError, KeyError) as error:
+    except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:
+        # the last two: a tensor without elements may claim sides that torch has no integer for
         raise BadModel(name, f"not a whole safetensors file: {error}") from None
-    network = NeuroVE(header.config)
-    wanted = {**_stored(network), _OFFSET: torch.zeros(6), _SCALE: torch.ones(6)}
+    with torch.device("meta"):  # shapes alone: a header of a few bytes may declare terabytes of weights
+        wanted = {**_stored(NeuroVE(header.config)), _OFFSET: torch.zeros(6), _SCALE: torch.ones(6)}
     _check_tensors(tensors, wanted, name)
+    network = NeuroVE(header.config)
     offset, scale = tensors.pop(_OFFSET), tensors.pop(_SCALE)
     network.load_state_dict(tensors, strict=False)  # names are checked; only the norms' batch counters are not stored
     return Bundle(
@@ -160,29 +165,28 @@ def read_header(data: bytes, name: str) -> Header:
         raise BadModel(name, f"{len(entries) - 1} tensors: at most {MAX_TENSORS}")
     version = fields.get("bundle_version") if isinstance(fields, dict) else None
     if version != BUNDLE_VERSION:
-        raise BadModel(name, f"bundle_version={version!r}: this program reads version {BUNDLE_VERSION}")
+        raise BadModel(name, f"bundle_version={shown(version)}: this program reads version {BUNDLE_VERSION}")
     try:
         return Header.model_validate(fields)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise BadModel(name, f"header field {where}={first['input']!r}: {first['msg']}") from None
+        where = ".".join(str(part) for part in first["loc"])[:80]  # an unknown one is the file's, of any length
+        value = "missing" if first["type"] == "missing" else shown(first["input"])
+        raise BadModel(name, f"header field {where}={value}: {first['msg']}") from None
 
 
 def untrained(seed: int = 0, config: ModelConfig | None = None, name: str = "untrained") -> Bundle:
     """A model with random weights drawn from a seed: it runs as a trained one would, its numbers mean nothing.
 
-    The norms' statistics are taken from random input, so that neurons fire. The same seed gives the same model on one
+    The norms' statistics are those of random input, so that neurons fire. The same seed gives the same model on one
     machine and torch version.
     """
     config = config or ModelConfig()
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = NeuroVE(config)
-        shape = (16, 4, 2 * config.window.bins, config.canonical.height, config.canonical.width)
-        with torch.no_grad():
-            for _ in range(3):
-                network.train()(torch.poisson(torch.full(shape, 0.3)).log1p(), network.initial_state(4))
+        shape = (8, 4, 2 * config.window.bins, config.canonical.height, config.canonical.width)
+        _take_statistics(network, torch.poisson(torch.full(shape, 0.3)).log1p())
     return Bundle(
         name=name,
         trained=False,
@@ -192,6 +196,18 @@ def untrained(seed: int = 0, config: ModelConfig | None = None, name: str = "unt
         offset=torch.zeros(6),
         scale=torch.ones(6),
     ).with_digest()
+
+
+def _take_statistics(network: NeuroVE, spikes: Tensor) -> None:
+    momenta = {
+        layer: layer.momentum for layer in network.modules() if isinstance(layer, nn.BatchNorm1d | nn.BatchNorm2d)
+    }
+    for norm in momenta:
+        norm.momentum = 1.0  # a running mean over few batches keeps most of its start, and then nothing fires
+    with torch.no_grad():
+        network.train()(spikes, network.initial_state(spikes.shape[1]))
+    for norm, momentum in momenta.items():
+        norm.momentum = momentum
 
 
 def _stored(network: NeuroVE) -> dict[str, Tensor]:

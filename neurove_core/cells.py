@@ -35,8 +35,8 @@ def aslstm_step(x: Tensor, state: ASLSTMState, params: ASLSTMParams) -> ASLSTMSt
     Source: NeuroVE, Eq. (7) and (9):
         c = sigmoid(f) c' + sigmoid(i) tanh(g);  h = sigmoid(o) tanh(c)
         v = alpha (1 - s') h + f(x + J(t-1, t));  s = [v >= v_th]
-    Differs: J(t-1, t) = d_time v' is added beside f, for x and v differ in width (decision 4); the gradient through
-    the reset (1 - s') is cut.
+    Differs: gates and f have a bias; J(t-1, t) = d_time v' is added beside f, for x and v differ in width (decision
+    4); the gradient through the reset (1 - s') is cut.
 
     Args:
         x: input (B, I); for a layer above another, diffuse(s, v, D) of the one below.

@@ -38,7 +38,7 @@ def count_events_reference(
     return int((~seen).sum())
 
 
-@numba.njit(nogil=True, cache=True)
+@numba.njit(nogil=True, cache=True)  # pragma: no cover  # compiled: tests hold it against the reference instead
 def _count(t, x, y, p, start_us, bin_us, lut, cells, flat):  # type: ignore[no-untyped-def]  # compiled for its arguments
     outside = 0
     for i in range(t.size):

@@ -19,6 +19,8 @@ from protocol.errors import BadModel
 class StreamState(NamedTuple):
     """All that one camera stream carries from packet to packet."""
 
+    sensor: Sensor
+    camera: CameraInfo | None
     lut: NDArray[np.int32]  # sensor pixel -> canonical cell
     windows: WindowsState
     network: NetworkState
@@ -73,7 +75,7 @@ class Estimator:
             InvalidField: the camera info is of another sensor.
         """
         lut = lookup_table(self.config.canonical, sensor, camera)
-        return StreamState(lut, WindowsState(), self.network.initial_state(), 0, ())
+        return StreamState(sensor, camera, lut, WindowsState(), self.network.initial_state(), 0, ())
 
     def push(self, events: Events, state: StreamState, horizon_us: int) -> Answer:
         """Take a packet's events and answer every window that they complete.
@@ -93,12 +95,12 @@ class Estimator:
             twists, network = self._step(window.counts, network)
             estimates.append(self._estimate(window, twists, age))
             age += 1
-            recent = (*recent, window.counts)[-self.config.settle_windows :]
+            recent = (*recent, window.counts)[max(0, len(recent) + 1 - self.config.settle_windows) :]
             end_us = window.start_us + self.config.window.duration_us
         if end_us is not None and pushed.state.start_us != end_us:
             network, age, recent = self.network.initial_state(), 0, ()
         outside = sum(window.outside for window in pushed.windows)
-        following = StreamState(state.lut, pushed.state, network, age, recent)
+        following = state._replace(windows=pushed.state, network=network, age=age, recent=recent)
         return Answer(estimates, following, pushed.late_events, outside, pushed.skipped_windows)
 
     def primed(self, state: StreamState, before: "Estimator") -> StreamState:
@@ -107,7 +109,7 @@ class Estimator:
         Windows and their counts go over unchanged where both models cut and see alike; else the stream starts anew.
         """
         if (before.config.window, before.config.canonical) != (self.config.window, self.config.canonical):
-            return StreamState(state.lut, WindowsState(), self.network.initial_state(), 0, ())
+            return self.initial_state(state.sensor, state.camera)
         network = self.network.initial_state()
         for counts in state.recent:
             _, network = self._step(counts, network)
@@ -117,7 +119,7 @@ class Estimator:
         """Compile and touch all that the first packet would otherwise wait for.
 
         Raises:
-            BadModel: the model answers numbers that are not finite.
+            BadModel: the model computes numbers that are not finite.
         """
         sensor = Sensor(self.config.canonical.width, self.config.canonical.height)
         duration = self.config.window.duration_us
@@ -130,8 +132,9 @@ class Estimator:
         for half in (events, from_wire):
             answer = self.push(half, state._replace(windows=WindowsState()), 0)
             state = answer.state
-            if not all(np.isfinite(estimate.twists).all() for estimate in answer.estimates):
-                raise BadModel(self.bundle.name, "it answers numbers that are not finite")
+            finite = all(np.isfinite(estimate.twists).all() for estimate in answer.estimates)
+            if not (finite and state.network.finite()):  # a membrane of nan never fires: the answer would not show it
+                raise BadModel(self.bundle.name, "it computes numbers that are not finite")
 
     @torch.inference_mode()
     def _step(self, counts: NDArray[np.uint8], state: NetworkState) -> tuple[NDArray[np.float64], NetworkState]:

@@ -110,10 +110,10 @@ def _undistort_pinhole(
         for _ in range(_ITERATIONS):
             radial, dx, dy = _radial_tangential(x, y, distortion)
             error = np.hypot(x * radial + dx - xd, y * radial + dy - yd)
-            if np.nanmax(error) < _TOLERANCE:
-                return x, y
+            if not (error >= _TOLERANCE).any():
+                break
             x, y = (xd - dx) / radial, (yd - dy) / radial
-        lost = ~(error < 1e-3)
+        lost = ~(error < 1e-3) | (radial <= 0)  # below 0 the ray is on the other side of the axis
     x[lost] = y[lost] = np.nan
     return x, y
 
@@ -136,7 +136,7 @@ def _undistort_equidistant(
             slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
             step = (_angle_polynomial(theta, distortion) - rd) / slope
             theta = theta - step
-            if np.nanmax(np.abs(step)) < _TOLERANCE:
+            if not (np.abs(step) >= _TOLERANCE).any():
                 break
         lost = ~(np.abs(_angle_polynomial(theta, distortion) - rd) < 1e-3) | (theta >= math.pi / 2) | (theta < 0)
         scale = np.where(rd > 0, np.tan(theta) / rd, 1.0)

@@ -18,6 +18,11 @@ class NetworkState(NamedTuple):
     cells: tuple[ASLSTMState, ...]  # one per ASLSTM layer, (B, N)
     readout: Tensor  # potential of the output neurons (B, 6n)
 
+    def finite(self) -> bool:
+        """Whether no number of it is nan or infinite."""
+        tensors = (*itertools.chain(*self.membranes, *self.cells), self.readout)
+        return all(bool(torch.isfinite(tensor).all()) for tensor in tensors)
+
 
 class SpikingBlock(nn.Module):
     """Convolution of stride 2, threshold-dependent batch norm (tdBN, Zheng 2021), LIF.

@@ -28,7 +28,7 @@ class WindowsState(NamedTuple):
     """What a stream carries between packets: the open window. Its counts go into the next state, not into a copy."""
 
     start_us: int | None = None  # none before the first packet
-    horizon_us: int = 0  # sensor time up to which all events are known
+    horizon_us: int = 0  # sensor time up to which all events are known; without a meaning before the first packet
     counts: NDArray[np.uint8] | None = None  # none while the open window is empty
     events: int = 0
     outside: int = 0
@@ -65,9 +65,13 @@ def push(
         the windows that ended at or before the newest time known, oldest first, and the next state.
     """
     duration = config.duration_us
-    newest_us = max(horizon_us, int(events.t[-1]) if events.n else horizon_us, state.horizon_us)
-    first_us = min(horizon_us, int(events.t[0])) if events.n else horizon_us
-    start_us = first_us // duration * duration if state.start_us is None else state.start_us
+    first_us, newest_us = horizon_us, horizon_us
+    if events.n:
+        first_us, newest_us = min(first_us, int(events.t[0])), max(newest_us, int(events.t[-1]))
+    if state.start_us is None:
+        start_us = first_us // duration * duration
+    else:
+        start_us, newest_us = state.start_us, max(newest_us, state.horizon_us)
     late = int(np.searchsorted(events.t, start_us))
     events = events.span(late, events.n)
     windows: list[Window] = []

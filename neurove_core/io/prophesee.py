@@ -1,0 +1,156 @@
+"""Prophesee .raw files: a text header, then EVT2 or EVT3 words as the camera wrote them."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurove_core import kernels
+from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
+from neurove_core.io.recording import BLOCK_BYTES, CHUNK_EVENTS, SUPPORTED
+from protocol.camera import CameraInfo
+from protocol.errors import InvalidField
+from protocol.events import Events, Sensor
+
+HEADER_BYTES = 64 << 10  # a header is some 500 bytes; more than this is none
+
+Decode = Callable[[NDArray[Any], Any, int, int, Events], tuple[Any, int, int, int]]
+
+
+class Words(NamedTuple):
+    """One word format: how wide a word is and what reads it."""
+
+    dtype: np.dtype[Any]
+    decode: Decode
+    start: NamedTuple
+
+
+FORMATS = {
+    "EVT2": Words(np.dtype("<u4"), kernels.evt2_decode, kernels.Evt2State()),
+    "EVT3": Words(np.dtype("<u2"), kernels.evt3_decode, kernels.Evt3State()),
+}
+_FORMAT_OF_EVT = {"2.0": "EVT2", "2.1": "EVT21", "3.0": "EVT3"}
+
+
+class Header(NamedTuple):
+    """What the text in front of the words says."""
+
+    format: str | None
+    sensor: Sensor | None  # None where it says nothing that a sensor could have
+    size: int  # [bytes]
+
+
+def parse_header(path: Path, head: bytes) -> Header:
+    r"""Read the lines that begin with `% `, up to the first that does not or to `% end`.
+
+    Both ways of writing the geometry occur: a line of its own (or one each for width and height), and as fields of the
+    format. Of two that speak of the same, the later one counts.
+
+    >>> parse_header(Path("a.raw"), b"% evt 3.0\n% format EVT3;height=720;width=1280\n% end\n\x00\x80")
+    Header(format='EVT3', sensor=Sensor(width=1280, height=720), size=52)
+
+    Raises:
+        BrokenRecording: a header line has no end.
+    """
+    fields: dict[str, str] = {}
+    at = 0
+    while head.startswith(b"% ", at):  # the blank too: a first word may well begin with the byte of a '%'
+        end = head.find(b"\n", at)
+        if end < 0:
+            raise BrokenRecording(path, f"byte {at}", "the file ends within its header")
+        key, _, value = head[at + 2 : end].decode("latin-1").strip().partition(" ")
+        at = end + 1
+        if key.lower() == "end":
+            break
+        if key.lower() == "format":
+            value, *parts = value.split(";")
+            fields.update((name.strip().lower(), text) for name, _, text in (part.partition("=") for part in parts))
+        elif key.lower() == "evt":
+            key, value = "format", _FORMAT_OF_EVT.get(value.strip(), f"EVT {value}")
+        elif key.lower() == "geometry":
+            fields["width"], _, fields["height"] = value.partition("x")
+        fields[key.lower()] = value.strip()
+    try:
+        sensor = Sensor(int(fields.get("width", "")), int(fields.get("height", "")))
+    except (ValueError, InvalidField):
+        sensor = None
+    return Header(fields.get("format"), sensor, at)
+
+
+@dataclass(frozen=True, slots=True)
+class PropheseeRecording:
+    """A .raw file of EVT2 or EVT3 words; see `Recording`."""
+
+    path: Path
+    sensor: Sensor
+    words: Words
+    header_bytes: int
+    endless: bool = False
+
+    @classmethod
+    def open(cls, path: Path, sensor: Sensor | None = None) -> Self:
+        """The recording in this file.
+
+        Args:
+            path: the .raw file.
+            sensor: its pixel array; overrides the header.
+
+        Raises:
+            UnknownSource: the header names no format that can be read.
+            MissingGeometry: the header does not tell the sensor's size and `sensor` does not either.
+            BrokenRecording: the file ends within its header.
+        """
+        with path.open("rb") as file:
+            header = parse_header(path, file.read(HEADER_BYTES))
+        if header.format not in FORMATS:
+            why = f"its words are {header.format}" if header.format else "its header names no word format"
+            raise UnknownSource(path, SUPPORTED, why)
+        sensor = sensor or header.sensor
+        if sensor is None:
+            raise MissingGeometry(path)
+        return cls(path, sensor, FORMATS[header.format], header.size)
+
+    @property
+    def name(self) -> str:
+        """The file's name."""
+        return self.path.name
+
+    def camera(self, stream: str) -> CameraInfo | None:
+        """None: a .raw file does not know its lens."""
+        return None
+
+    def chunks(self) -> Iterator[Events]:
+        """All events from the beginning; see `Recording`. Triggers and monitoring words are skipped.
+
+        Raises:
+            BrokenRecording: a word is cut, of no known type, or holds an event outside the sensor; it names the byte.
+        """
+        dtype, decode, state = self.words
+        at = self.header_bytes
+        with self.path.open("rb") as file:
+            file.seek(at)
+            while block := file.read(BLOCK_BYTES):
+                words = np.frombuffer(block, dtype, len(block) // dtype.itemsize)
+                while words.size:
+                    out = _room(CHUNK_EVENTS)
+                    state, read, n, verdict = decode(words, state, self.sensor.width, self.sensor.height, out)
+                    if n:
+                        yield out.span(0, n)
+                    at += read * dtype.itemsize
+                    if verdict != kernels.OK:
+                        raise BrokenRecording(self.path, f"byte {at}", self._why(verdict, int(words[read]), out, n))
+                    words = words[read:]
+                if len(block) % dtype.itemsize:
+                    raise BrokenRecording(self.path, f"byte {at}", "the file ends within a word")
+
+    def _why(self, verdict: int, word: int, out: Events, n: int) -> str:
+        if verdict == kernels.OUTSIDE:
+            return f"an event at x={out.x[n]} y={out.y[n]} lies outside the sensor {self.sensor}"
+        return f"0x{word:0{2 * self.words.dtype.itemsize}x} is of no known word type"
+
+
+def _room(n: int) -> Events:
+    return Events(np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8))

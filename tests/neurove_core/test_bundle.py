@@ -1,0 +1,401 @@
+"""Bundles: what is loaded is what was saved, and a file that is anything else is refused with a reason."""
+
+import errno
+import hashlib
+import json
+import os
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import safetensors.torch
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from neurove_core import bundle
+from neurove_core.bundle import Bundle
+from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
+from neurove_core.estimator import Estimator
+from protocol.errors import BadModel
+from tests.builders import SENSOR, make_events
+
+CONFIG = ModelConfig(
+    window=WindowConfig(duration_us=10_000, bins=2),
+    canonical=CanonicalConfig(width=10, height=8),
+    network=NetworkConfig(channels=(3,), features=4, hidden=4, cells=1),
+)
+
+
+def make_bundle(seed: int = 0, **config: Any) -> Bundle:
+    return bundle.untrained(seed, CONFIG.model_copy(update=config))
+
+
+ORIGINAL = make_bundle()
+DATA = ORIGINAL.to_bytes()
+
+
+def answers_of(model: Bundle) -> list[list[list[float]]]:
+    estimator = Estimator(model)
+    answer = estimator.push(make_events(2_000, duration_us=50_000), estimator.initial_state(SENSOR), 0)
+    return [estimate.twists.tolist() for estimate in answer.estimates]
+
+
+def packed(header: bytes, data: bytes = b"") -> bytes:
+    return struct.pack("<Q", len(header)) + header + data
+
+
+def unpacked(data: bytes = DATA) -> tuple[dict[str, Any], bytes]:
+    (length,) = struct.unpack("<Q", data[:8])
+    return json.loads(data[8 : 8 + length]), data[8 + length :]
+
+
+def with_entries(edit: Callable[[dict[str, Any]], object]) -> bytes:
+    """The bundle's bytes with its safetensors header edited."""
+    entries, tensors = unpacked()
+    edit(entries)
+    return packed(json.dumps(entries).encode(), tensors)
+
+
+def with_fields(edit: Callable[[dict[str, Any]], object]) -> bytes:
+    """The bundle's bytes with its own header, inside that of safetensors, edited."""
+    entries, tensors = unpacked()
+    fields = json.loads(entries["__metadata__"]["neurove"])
+    edit(fields)
+    entries["__metadata__"]["neurove"] = json.dumps(fields)
+    return packed(json.dumps(entries).encode(), tensors)
+
+
+def with_tensors(edit: Callable[[dict[str, torch.Tensor]], object]) -> bytes:
+    """The bundle's bytes with its tensors edited."""
+    tensors = safetensors.torch.load(DATA)
+    edit(tensors)
+    return safetensors.torch.save(tensors, unpacked()[0]["__metadata__"])
+
+
+def refusal(data: bytes) -> str:
+    """The sentence that refuses these bytes."""
+    with pytest.raises(BadModel) as refused:
+        bundle.from_bytes(data, "some.safetensors")
+    assert refused.value.code == "bad_model"
+    assert refused.value.message.startswith("model some.safetensors: ")
+    return refused.value.message
+
+
+def assert_refused_or_another_model(data: bytes) -> None:
+    try:
+        loaded = bundle.from_bytes(data, "x")
+    except BadModel:
+        return
+    assert loaded.digest != ORIGINAL.digest
+
+
+def test_a_saved_model_is_loaded_with_the_same_digest_config_and_answers(tmp_path):
+    path = tmp_path / "model.safetensors"
+    saved = replace(
+        make_bundle(3), trained=True, name="night", scale=torch.arange(1.0, 7.0), offset=torch.full((6,), 0.5)
+    ).with_digest()
+    bundle.save(saved, path)
+    loaded = bundle.load(path)
+    for field in ("name", "trained", "provenance", "config", "digest", "info"):
+        assert getattr(loaded, field) == getattr(saved, field)
+    assert not loaded.network.training
+    assert len(answers_of(saved)) == 4
+    assert answers_of(loaded) == answers_of(saved)
+    assert loaded.digest == hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        NetworkConfig(channels=(2, 3), features=3, hidden=5, cells=3, diffusion=False, encoding="binary"),
+        NetworkConfig(channels=(2,), features=2, hidden=2, surrogate="arctan", surrogate_width=0.1, v_th=0.3),
+    ],
+)
+def test_saving_what_was_loaded_gives_the_same_bytes_for_every_architecture(network):
+    data = make_bundle(network=network).to_bytes()
+    assert bundle.from_bytes(data, "x").to_bytes() == data
+
+
+def test_the_same_seed_gives_the_same_model_and_another_seed_or_name_or_config_another():
+    again = make_bundle()
+    assert again.digest == ORIGINAL.digest
+    assert answers_of(again) == answers_of(ORIGINAL)
+    others = [make_bundle(1), bundle.untrained(0, CONFIG, "other"), make_bundle(settle_windows=3)]
+    assert len({ORIGINAL.digest, *(other.digest for other in others)}) == 4
+    assert answers_of(others[0]) != answers_of(ORIGINAL)
+
+
+def test_drawing_a_model_leaves_the_callers_random_numbers_alone():
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    torch.manual_seed(5)
+    make_bundle(9)
+    assert torch.equal(torch.rand(3), expected)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_untrained_model_fires_and_sees_its_input(seed):
+    estimator = Estimator(bundle.untrained(seed))
+    busy, quiet = make_events(30_000, duration_us=160_000), make_events(4, duration_us=160_000)
+    twists = [
+        estimator.push(events, estimator.initial_state(SENSOR), 160_000).estimates[-1].twists
+        for events in (busy, quiet)
+    ]
+    assert abs(twists[0] - twists[1]).max() > 0.05
+
+
+def test_info_tells_how_many_parameters_a_model_has_and_whether_it_was_trained():
+    info = ORIGINAL.info
+    assert (info.name, info.digest, info.trained) == ("untrained", ORIGINAL.digest, False)
+    stored = safetensors.torch.load(DATA)
+    buffers = sum(t.numel() for name, t in stored.items() if "running" in name or name.startswith("output."))
+    assert info.parameters == sum(t.numel() for t in stored.values()) - buffers
+    assert "seed=0" in info.provenance
+
+
+@pytest.mark.parametrize("length", [*range(64), *range(64, len(DATA), 97), len(DATA) - 1])
+def test_every_truncation_is_refused(length):
+    refusal(DATA[:length])
+
+
+@given(where=st.integers(0, len(DATA) - 1), bit=st.integers(0, 7))
+def test_a_flipped_bit_is_refused_or_makes_another_model(where, bit):
+    flipped = bytearray(DATA)
+    flipped[where] ^= 1 << bit
+    assert_refused_or_another_model(bytes(flipped))
+
+
+@pytest.mark.parametrize("bit", range(8))
+def test_a_flipped_bit_of_the_header_is_refused_or_makes_another_model(bit):
+    for where in range(0, len(DATA) - len(unpacked()[1]), 7):
+        flipped = bytearray(DATA)
+        flipped[where] ^= 1 << bit
+        assert_refused_or_another_model(bytes(flipped))
+
+
+@given(where=st.integers(0, len(DATA)), junk=st.binary(max_size=40), cut=st.integers(0, 40))
+def test_bytes_put_in_or_overwritten_anywhere_are_refused_or_make_another_model(where, junk, cut):
+    data = DATA[:where] + junk + DATA[where + cut :]
+    if data != DATA:
+        assert_refused_or_another_model(data)
+
+
+@given(st.binary(max_size=300))
+def test_any_bytes_are_refused(data):
+    refusal(data)
+    refusal(packed(data))
+
+
+@pytest.mark.parametrize(
+    ("data", "word"),
+    [
+        (b"", "size=0"),
+        (b"\x00" * 7, "size=7"),
+        (b"# a text file, not a model\n" * 40, "not a safetensors file"),
+        (packed(b"not json"), "can not be read"),
+        (packed(b""), "can not be read"),
+        (packed(b"\xff\xfe\xfd"), "can not be read"),
+        (packed(b"[" * 100_000), "can not be read"),
+        (packed(b"[]"), "no 'neurove' entry"),
+        (packed(b"{}"), "no 'neurove' entry"),
+        (packed(b'{"__metadata__": 3}'), "no 'neurove' entry"),
+        (packed(b'{"__metadata__": {"neurove": 3}}'), "no 'neurove' entry"),
+        (packed(b'{"__metadata__": {"neurove": "{"}}'), "can not be read"),
+        (packed(b'{"__metadata__": {"neurove": "[1]"}}'), "bundle_version=None"),
+        (safetensors.torch.save({"weight": torch.zeros(3)}), "no 'neurove' entry"),
+        (safetensors.torch.save({"weight": torch.zeros(3)}, {"format": "pt"}), "no 'neurove' entry"),
+    ],
+    ids=range(15),
+)
+def test_a_foreign_file_is_refused_and_says_what_it_is_not(data, word):
+    assert word in refusal(data)
+
+
+@pytest.mark.parametrize(
+    "length", [0, 1, 7, len(DATA) - 8, len(DATA) - 7, 1 << 20, (1 << 20) + 1, 1 << 40, (1 << 64) - 1]
+)
+def test_a_header_length_that_lies_is_refused(length):
+    assert "header" in refusal(struct.pack("<Q", length) + DATA[8:])
+
+
+def test_a_header_over_its_cap_is_refused_even_if_it_is_whole():
+    padding = " " * bundle.MAX_HEADER_BYTES
+    entries, tensors = unpacked()
+    assert str(bundle.MAX_HEADER_BYTES) in refusal(packed((json.dumps(entries) + padding).encode(), tensors))
+
+
+@pytest.mark.parametrize("version", [0, 2, None, "1", [1], {"a": [[[[[[[1]]]]]]]}])
+def test_another_bundle_version_is_refused_and_both_are_named(version):
+    message = refusal(with_fields(lambda fields: fields.update(bundle_version=version)))
+    assert "bundle_version=" in message
+    assert "reads version 1" in message
+
+
+def test_a_header_without_a_version_is_refused():
+    assert "bundle_version=None" in refusal(with_fields(lambda fields: fields.pop("bundle_version")))
+
+
+@pytest.mark.parametrize(
+    ("edit", "words"),
+    [
+        (lambda f: f.update(extra=1), ("extra=1", "not permitted")),
+        (lambda f: f.update({"x" * 2_000: "y" * 2_000}), ("xxxx", "yyyy", "not permitted")),
+        (lambda f: f["config"].update(speed=2), ("config.speed=2", "not permitted")),
+        (lambda f: f["config"]["window"].update(bins=0), ("config.window.bins=0", "greater than or equal to 1")),
+        (lambda f: f["config"]["window"].update(bins=3), ("duration_us=10000", "3 equal bins")),
+        (lambda f: f["config"]["network"].update(v_th=float("nan")), ("config.network.v_th=nan", "finite")),
+        (lambda f: f["config"]["network"].update(channels=[]), ("config.network.channels=", "at least 1")),
+        (lambda f: f.pop("name"), ("name=missing", "required")),
+        (lambda f: f.update(name="../up"), ("name='../up'", "pattern")),
+        (lambda f: f.update(trained="perhaps"), ("trained='perhaps'", "boolean")),
+        (lambda f: f.update(provenance="x" * 1001), ("provenance=", "at most 1000")),
+        (lambda f: f.update(config=None), ("config=None", "ModelConfig")),
+    ],
+    ids=range(12),
+)
+def test_a_wrong_header_field_is_named_with_its_value_and_bound(edit, words):
+    message = refusal(with_fields(edit))
+    for word in words:
+        assert word in message
+
+
+@pytest.mark.parametrize("depth", [100, 900, 5_000])
+@pytest.mark.parametrize("field", ["config", "name", "bundle_version"])
+def test_a_header_nested_deep_is_refused_in_a_short_sentence(field, depth):
+    entries, tensors = unpacked()
+    fields = json.loads(entries["__metadata__"]["neurove"])
+    text = json.dumps({**fields, field: "HERE"}).replace('"HERE"', "[" * depth + "]" * depth)
+    entries["__metadata__"]["neurove"] = text
+    assert len(refusal(packed(json.dumps(entries).encode(), tensors))) < 500
+
+
+@pytest.mark.parametrize("level", ["tensors", "metadata", "own"])
+def test_a_key_that_stands_twice_is_refused(level):
+    header = DATA[8 : len(DATA) - len(unpacked()[1])].decode()
+    twice = {
+        "tensors": header.replace(',"kappa_logit"', ',"kappa_logit":1,"kappa_logit"', 1),
+        "metadata": header.replace('{"neurove":', '{"neurove":"{}","neurove":', 1),
+        "own": header.replace('{\\"bundle_version\\":1', '{\\"trained\\":true,\\"bundle_version\\":1', 1),
+    }[level]
+    assert twice != header
+    assert "twice" in refusal(packed(twice.encode(), unpacked()[1]))
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("name", ["readout.bias", "output.scale", "blocks.0.norm.running_var", "kappa_logit"])
+def test_a_tensor_with_a_value_that_is_not_finite_is_refused_and_named(name, value):
+    message = refusal(with_tensors(lambda tensors: tensors[name].view(-1)[-1:].fill_(value)))
+    assert name in message
+    assert "not finite" in message
+
+
+@pytest.mark.parametrize("name", sorted(safetensors.torch.load(DATA)))
+def test_a_missing_tensor_is_refused_and_named(name):
+    message = refusal(with_tensors(lambda tensors: tensors.pop(name)))
+    assert f"{name!r} is missing" in message
+
+
+def test_a_tensor_that_does_not_belong_is_refused_and_named():
+    message = refusal(with_tensors(lambda tensors: tensors.update({"cells.1.w_x": torch.zeros(2)})))
+    assert "'cells.1.w_x' is not one of this architecture" in message
+
+
+def test_more_tensors_than_the_cap_are_refused_before_they_are_read():
+    def crowd(entries: dict[str, Any]) -> None:
+        entries.update({f"t{i}": 0 for i in range(bundle.MAX_TENSORS)})
+
+    assert f"at most {bundle.MAX_TENSORS}" in refusal(with_entries(crowd))
+
+
+@pytest.mark.parametrize(
+    ("tensor", "word"),
+    [
+        (torch.zeros(11), "(11,)"),
+        (torch.zeros(13), "(13,)"),
+        (torch.zeros(1, 12), "(1, 12)"),
+        (torch.zeros(0), "(0,)"),
+        (torch.zeros(12, dtype=torch.float64), "float64"),
+        (torch.zeros(12, dtype=torch.float16), "float16"),
+        (torch.zeros(12, dtype=torch.int32), "int32"),
+        (torch.zeros(12, dtype=torch.float8_e5m2), "float8"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_a_tensor_of_another_shape_or_type_is_refused_and_both_are_named(tensor, word):
+    message = refusal(with_tensors(lambda tensors: tensors.update({"readout.bias": tensor})))
+    assert "'readout.bias'" in message
+    assert word in message
+    assert "needs torch.float32 (12,)" in message
+
+
+@pytest.mark.parametrize("shape", [[0, 1 << 40, 1 << 40], [0, 1 << 63], [(1 << 64) - 1, 0], [0] * 2_000])
+@pytest.mark.parametrize("dtype", ["F32", "F4", "C64"])
+def test_a_tensor_without_elements_and_with_absurd_sides_is_refused(shape, dtype):
+    refusal(with_entries(lambda entries: entries.update(t={"dtype": dtype, "shape": shape, "data_offsets": [0, 0]})))
+
+
+def test_an_architecture_that_needs_terabytes_is_refused_by_its_tensors_before_any_memory_is_taken():
+    def inflate(fields: dict[str, Any]) -> None:
+        fields["config"]["canonical"].update(width=1024, height=1024)
+        fields["config"]["network"].update(channels=[1024], features=4096)
+
+    message = refusal(with_fields(inflate))
+    assert "its header's architecture needs" in message
+
+
+def test_a_missing_file_and_a_directory_are_refused_with_the_systems_reason(tmp_path):
+    with pytest.raises(BadModel, match=r"gone\.safetensors: No such file"):
+        bundle.load(tmp_path / "gone.safetensors")
+    (tmp_path / "folder.safetensors").mkdir()
+    with pytest.raises(BadModel, match=r"folder\.safetensors: Is a directory"):
+        bundle.load(tmp_path / "folder.safetensors")
+
+
+def test_a_file_over_the_cap_is_refused_by_its_size_without_being_read(tmp_path):
+    path = tmp_path / "huge.safetensors"
+    with path.open("wb") as file:
+        file.truncate(bundle.MAX_BYTES + 1)  # a hole: takes no space
+    with pytest.raises(BadModel, match=rf"size={bundle.MAX_BYTES + 1}.*{bundle.MAX_BYTES} bytes"):
+        bundle.load(path)
+
+
+def test_a_file_is_named_in_errors_by_its_name_alone_not_by_where_it_lies(tmp_path):
+    path = tmp_path / "broken.safetensors"
+    path.write_bytes(DATA[:100])
+    with pytest.raises(BadModel) as refused:
+        bundle.load(path)
+    assert str(tmp_path) not in refused.value.message
+
+
+def test_saving_replaces_the_file_whole_and_leaves_nothing_else(tmp_path):
+    path = tmp_path / "model.safetensors"
+    bundle.save(make_bundle(1), path)
+    bundle.save(ORIGINAL, path)
+    assert path.read_bytes() == DATA
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_when_the_disk_is_full_the_old_file_stays_whole_and_nothing_else_is_left(tmp_path, monkeypatch):
+    path = tmp_path / "model.safetensors"
+    bundle.save(ORIGINAL, path)
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        bundle.save(make_bundle(1), path)
+    assert path.read_bytes() == DATA
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_file_that_can_not_be_put_in_its_place_leaves_nothing(tmp_path: Path):
+    path = tmp_path / "model.safetensors"
+    path.mkdir()
+    with pytest.raises(IsADirectoryError):
+        bundle.save(ORIGINAL, path)
+    assert list(tmp_path.iterdir()) == [path]

@@ -1,0 +1,26 @@
+"""What the network sees of a window's counts."""
+
+import numpy as np
+import pytest
+import torch
+
+from neurove_core.encoding import to_spikes
+
+ALL_COUNTS = torch.arange(256, dtype=torch.uint8)
+
+
+def test_binary_is_the_papers_spike_one_where_there_was_an_event_and_zero_elsewhere():
+    assert to_spikes(ALL_COUNTS, "binary").tolist() == [0.0] + [1.0] * 255
+
+
+def test_log1p_keeps_how_many_events_a_cell_saw():
+    np.testing.assert_allclose(to_spikes(ALL_COUNTS, "log1p").numpy(), np.log1p(np.arange(256)), rtol=1e-6)
+
+
+@pytest.mark.parametrize("encoding", ["binary", "log1p"])
+def test_every_cell_is_encoded_by_itself_in_place_as_float32(encoding):
+    counts = torch.randint(0, 256, (3, 2, 4, 5, 6), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    spikes = to_spikes(counts, encoding)
+    assert spikes.dtype == torch.float32
+    assert torch.equal(spikes, to_spikes(ALL_COUNTS, encoding)[counts.long()])
+    assert not spikes[counts == 0].any()

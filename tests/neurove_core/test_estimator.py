@@ -1,0 +1,325 @@
+"""Estimator.push: the same answers however packets are cut, for each stream alone, and honest flags."""
+
+import doctest
+import importlib
+import re
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from itertools import chain, pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import neurove_core
+from neurove_core import bundle
+from neurove_core.bundle import Bundle
+from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
+from neurove_core.estimator import Answer, Estimator, StreamState, WindowEstimate
+from protocol import CameraInfo, Events, Sensor
+from protocol.errors import BadModel, InvalidField
+from tests.builders import SENSOR, make_events
+
+README = Path(neurove_core.__file__).with_name("README.md")
+DURATION_US, SETTLE, LOW = 10_000, 4, 50
+CONFIG = ModelConfig(
+    window=WindowConfig(duration_us=DURATION_US, bins=2, max_hole_windows=3),
+    canonical=CanonicalConfig(width=16, height=12),
+    network=NetworkConfig(channels=(4, 6), features=8, hidden=8),
+    settle_windows=SETTLE,
+    low_activity_events=LOW,
+)
+LENS = CameraInfo(
+    stream="cam0",
+    width=SENSOR.width,
+    height=SENSOR.height,
+    lens="pinhole",
+    fx=30.0,
+    fy=30.0,
+    cx=33.0,
+    cy=22.0,
+    distortion=(-0.3, 0.1, 0.0, 0.0),
+)
+
+
+def make_bundle(seed: int = 0, **config) -> Bundle:
+    return bundle.untrained(seed, CONFIG.model_copy(update=config))
+
+
+@pytest.fixture(scope="module")
+def estimator() -> Estimator:
+    return Estimator(make_bundle())
+
+
+def feed(estimator: Estimator, packets: list[Events], state: StreamState | None = None) -> Answer:
+    """All that comes of packets, each pushed with the time of its first event."""
+    state = state or estimator.initial_state(SENSOR)
+    estimates, late, outside, skipped = [], 0, 0, 0
+    for events in packets:
+        answer = estimator.push(events, state, int(events.t[0]))
+        state = answer.state
+        estimates += answer.estimates
+        late, outside = late + answer.late_events, outside + answer.outside_events
+        skipped += answer.skipped_windows
+    return Answer(estimates, state, late, outside, skipped)
+
+
+def cut_at_random(events: Events, seed: int, cuts: int = 25) -> list[Events]:
+    edges = [0, *np.unique(np.random.default_rng(seed).integers(1, events.n, cuts)).tolist(), events.n]
+    return [events.span(a, b) for a, b in pairwise(edges)]
+
+
+def windows_of_events(count: int, *, first: int = 0, seed: int = 0, each: int = 150) -> list[Events]:
+    """`count` packets, one for each window from number `first` on."""
+    return [
+        make_events(each, seed=seed + k, start_us=k * DURATION_US, duration_us=DURATION_US)
+        for k in range(first, first + count)
+    ]
+
+
+def tick(window: int) -> Events:
+    """One event at the start of a window: it completes the one before."""
+    return Events.from_columns([window * DURATION_US], [0], [0], [0])
+
+
+def assert_same_estimates(got: list[WindowEstimate], want: list[WindowEstimate]) -> None:
+    assert [(*one[:2], *one[3:]) for one in got] == [(*one[:2], *one[3:]) for one in want]  # all but the twists
+    for one, other in zip(got, want, strict=True):
+        np.testing.assert_array_equal(one.twists, other.twists)
+
+
+def assert_same_state(got: StreamState, want: StreamState) -> None:
+    assert got.age == want.age
+    np.testing.assert_array_equal(got.lut, want.lut)
+    for one, other in zip(got.recent, want.recent, strict=True):
+        np.testing.assert_array_equal(one, other)
+    for field in ("membranes", "cells"):
+        for one, other in zip(chain(*getattr(got.network, field)), chain(*getattr(want.network, field)), strict=True):
+            assert torch.equal(one, other)
+    assert torch.equal(got.network.readout, want.network.readout)
+
+
+def differ(one: WindowEstimate, other: WindowEstimate) -> bool:
+    return bool(np.abs(one.twists - other.twists).max() > 1e-5)
+
+
+@pytest.mark.parametrize("camera", [None, LENS], ids=["scaled", "lens"])
+@pytest.mark.parametrize("seed", range(8))
+def test_answers_do_not_depend_on_how_the_driver_cuts_packets(estimator, seed, camera):
+    events = make_events(3_000, seed=seed, start_us=-42_000, duration_us=120_000)
+    one = feed(estimator, [events], estimator.initial_state(SENSOR, camera))
+    cut = feed(estimator, cut_at_random(events, seed), estimator.initial_state(SENSOR, camera))
+    assert len(one.estimates) == 12
+    assert_same_estimates(cut.estimates, one.estimates)
+    assert_same_state(cut.state, one.state)
+    assert cut[2:] == one[2:]
+
+
+def test_every_window_is_answered_once_in_order_with_one_twist_for_each_bin(estimator):
+    estimates = feed(estimator, windows_of_events(6, first=-3, seed=3)).estimates
+    assert [(one.start_us, one.end_us) for one in estimates] == [(k * 10_000, (k + 1) * 10_000) for k in range(-3, 2)]
+    assert all(one.twists.shape == (2, 6) and one.events == 150 for one in estimates)
+
+
+def test_what_the_camera_saw_before_changes_the_answer_to_the_same_window(estimator):
+    one, other = windows_of_events(1), windows_of_events(1, seed=50)
+    same = [*windows_of_events(1, first=1), tick(2)]
+    assert differ(feed(estimator, one + same).estimates[1], feed(estimator, other + same).estimates[1])
+
+
+def test_two_streams_pushed_in_turn_are_answered_as_each_alone(estimator):
+    streams = [windows_of_events(8, seed=seed) for seed in (0, 100)]
+    alone = [feed(estimator, packets) for packets in streams]
+    states = [estimator.initial_state(SENSOR) for _ in streams]
+    estimates: list[list[WindowEstimate]] = [[], []]
+    for packets in zip(*streams, strict=True):
+        for i, events in enumerate(packets):
+            answer = estimator.push(events, states[i], int(events.t[0]))
+            states[i] = answer.state
+            estimates[i] += answer.estimates
+    for i in (0, 1):
+        assert_same_estimates(estimates[i], alone[i].estimates)
+        assert_same_state(states[i], alone[i].state)
+    assert differ(alone[0].estimates[3], alone[1].estimates[3])
+
+
+def test_streams_of_several_threads_share_an_estimator_and_are_answered_as_each_alone(estimator):
+    streams = [windows_of_events(10, seed=100 * i) for i in range(4)]
+    alone = [feed(estimator, packets).estimates for packets in streams]
+    with ThreadPoolExecutor(4) as threads:
+        together = list(threads.map(lambda packets: feed(estimator, packets).estimates, streams))
+    for one, other in zip(together, alone, strict=True):
+        assert_same_estimates(one, other)
+
+
+@pytest.mark.parametrize("as_one_packet", [True, False])
+def test_after_a_hole_too_long_to_bridge_a_stream_answers_as_a_fresh_one(estimator, as_one_packet):
+    before, after = windows_of_events(5), [*windows_of_events(3, first=9), tick(12)]
+    packets = [Events.join(before + after)] if as_one_packet else before + after
+    result, fresh = feed(estimator, packets), feed(estimator, after)
+    assert result.skipped_windows == 4
+    assert_same_estimates(result.estimates[5:], fresh.estimates)
+    assert_same_state(result.state, fresh.state)
+    assert [one.first for one in result.estimates] == [k in (0, 5) for k in range(8)]
+
+
+def test_a_hole_that_is_bridged_is_answered_and_keeps_the_state(estimator):
+    after = [*windows_of_events(1, first=8), tick(9)]
+    result, fresh = feed(estimator, windows_of_events(5) + after), feed(estimator, after)
+    assert [one.events for one in result.estimates] == [150] * 5 + [0] * 3 + [150]
+    assert [one.first for one in result.estimates] == [True] + [False] * 8
+    assert differ(result.estimates[-1], fresh.estimates[0])
+
+
+def test_settled_is_true_once_a_stream_is_as_old_as_the_model_says_and_first_only_at_its_birth(estimator):
+    estimates = feed(estimator, windows_of_events(SETTLE + 4)).estimates
+    assert [one.settled for one in estimates] == [False] * SETTLE + [True] * 3
+    assert [one.first for one in estimates] == [True] + [False] * (SETTLE + 2)
+
+
+def test_low_activity_counts_only_events_that_the_model_sees():
+    estimator = Estimator(make_bundle(low_activity_events=LOW))
+    state = estimator.initial_state(SENSOR, LENS)
+    seen, unseen = ((int(x), int(y)) for y, x in (np.argwhere(state.lut >= 0)[0], np.argwhere(state.lut < 0)[0]))
+
+    def window(inside: int, outside: int) -> WindowEstimate:
+        x, y = np.array([seen] * inside + [unseen] * outside).T
+        events = Events.from_columns(np.arange(x.size), x, y, np.ones_like(x))
+        (estimate,) = feed(estimator, [events, tick(1)], estimator.initial_state(SENSOR, LENS)).estimates
+        return estimate
+
+    assert [window(n, 10).low_activity for n in (LOW - 1, LOW)] == [True, False]
+    assert window(LOW, 10).events == LOW + 10
+
+
+@pytest.mark.parametrize(("n", "saturated"), [(254, False), (255, True), (600, True)])
+def test_a_window_with_a_full_cell_is_flagged_saturated(estimator, n, saturated):
+    burst = Events.from_columns(np.arange(n), [30] * n, [20] * n, [1] * n)
+    (estimate,) = feed(estimator, [burst, tick(1)]).estimates
+    assert estimate.saturated is saturated
+
+
+def test_late_outside_and_skipped_are_told(estimator):
+    state = estimator.initial_state(SENSOR, LENS)
+    blind = int((state.lut < 0).sum())
+    assert blind > 0
+    every_pixel = np.indices((SENSOR.height, SENSOR.width)).reshape(2, -1)
+    n = every_pixel.shape[1]
+    events = Events.from_columns(np.full(n, 5), every_pixel[1], every_pixel[0], np.ones(n))
+    answer = feed(estimator, [events, tick(20), tick(3)], state)
+    assert (answer.late_events, answer.outside_events, answer.skipped_windows) == (1, blind, 19)
+
+
+def test_twists_are_the_networks_answers_times_scale_plus_offset():
+    plain = make_bundle()
+    scale, offset = torch.tensor([2.0, 3.0, 0.5, 1.0, -1.0, 10.0]), torch.tensor([0.0, 1.0, -2.0, 0.1, 0.2, 0.3])
+    packets = windows_of_events(4)
+    raw = feed(Estimator(plain), packets).estimates
+    scaled = feed(Estimator(replace(plain, scale=scale, offset=offset)), packets).estimates
+    for one, other in zip(scaled, raw, strict=True):
+        np.testing.assert_allclose(one.twists, other.twists * scale.numpy() + offset.numpy(), rtol=1e-6)
+
+
+@pytest.mark.parametrize("age", range(SETTLE + 1))
+def test_priming_the_same_model_gives_exactly_the_state_a_young_stream_has(estimator, age):
+    state = feed(estimator, windows_of_events(age + 1)).state
+    assert state.age == age
+    primed = Estimator(make_bundle()).primed(state, estimator)
+    assert_same_state(primed, state)
+    following = [*windows_of_events(2, first=age + 1), tick(age + 3)]
+    again = feed(estimator, windows_of_events(age + 1)).state
+    assert_same_estimates(feed(estimator, following, primed).estimates, feed(estimator, following, again).estimates)
+
+
+def test_priming_an_old_stream_gives_the_state_of_one_that_saw_its_newest_windows_only(estimator):
+    packets = windows_of_events(SETTLE + 4)
+    primed = estimator.primed(feed(estimator, packets).state, estimator)
+    assert_same_state(primed, feed(estimator, packets[-SETTLE - 1 :]).state)
+    assert primed.age == SETTLE
+
+
+def test_priming_another_model_gives_what_it_would_have_come_to_itself_and_loses_no_event(estimator):
+    other = Estimator(make_bundle(seed=7, network=CONFIG.network.model_copy(update={"hidden": 5, "diffusion": False})))
+    packets = windows_of_events(3)
+    half = make_events(80, seed=40, start_us=3 * DURATION_US, duration_us=DURATION_US // 2)
+    rest = [make_events(80, seed=41, start_us=3 * DURATION_US + 6_000, duration_us=4_000), tick(4)]
+    swapped = other.primed(feed(estimator, [*packets, half]).state, estimator)
+    own = feed(other, [*packets, half]).state
+    assert_same_state(swapped, own)
+    assert_same_estimates(feed(other, rest, swapped).estimates, feed(other, rest, own).estimates)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"window": WindowConfig(duration_us=DURATION_US, bins=5, max_hole_windows=3)},
+        {"window": WindowConfig(duration_us=20_000, bins=2, max_hole_windows=3)},
+        {"canonical": CanonicalConfig(width=9, height=8)},
+        {"canonical": CanonicalConfig(width=16, height=12, hfov_deg=40.0)},
+    ],
+    ids=["bins", "duration", "grid", "field_of_view"],
+)
+@pytest.mark.parametrize("camera", [None, LENS], ids=["scaled", "lens"])
+def test_priming_a_model_that_cuts_or_sees_otherwise_starts_the_stream_anew(estimator, change, camera):
+    other = Estimator(make_bundle(seed=3, **change))
+    before = feed(estimator, windows_of_events(6), estimator.initial_state(SENSOR, camera)).state
+    primed = other.primed(before, estimator)
+    assert_same_state(primed, other.initial_state(SENSOR, camera))
+    packets = [*windows_of_events(4, first=6), tick(10)]
+    fresh = feed(other, packets, other.initial_state(SENSOR, camera))
+    assert_same_estimates(feed(other, packets, primed).estimates, fresh.estimates)
+
+
+@pytest.mark.parametrize("settle", [0, 1, SETTLE])
+def test_a_stream_keeps_as_many_windows_to_prime_with_as_its_model_needs_and_no_more(settle):
+    estimator = Estimator(make_bundle(settle_windows=settle))
+    state = feed(estimator, windows_of_events(12)).state
+    assert (len(state.recent), state.age) == (settle, 11)
+
+
+def test_a_model_that_is_fit_warms_up_and_answers_as_before():
+    cold, warm = Estimator(make_bundle()), Estimator(make_bundle())
+    warm.warm_up()
+    packets = windows_of_events(4)
+    assert_same_estimates(feed(warm, packets).estimates, feed(cold, packets).estimates)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize("part", ["scale", "offset"])
+def test_warm_up_refuses_a_model_whose_answers_are_not_finite(part, value):
+    broken, six = make_bundle(), torch.full((6,), value)
+    broken = replace(broken, scale=six) if part == "scale" else replace(broken, offset=six)
+    with pytest.raises(BadModel, match=r"untrained.*not finite"):
+        Estimator(broken).warm_up()
+
+
+def test_warm_up_refuses_a_model_whose_neurons_compute_nan_even_if_its_answers_do_not_show_it():
+    broken = make_bundle()
+    next(norm for name, norm in broken.network.named_modules() if name == "blocks.0.norm").running_var.fill_(-1)
+    assert all(np.isfinite(one.twists).all() for one in feed(Estimator(broken), windows_of_events(4)).estimates)
+    with pytest.raises(BadModel, match="not finite"):
+        Estimator(broken).warm_up()
+
+
+def test_camera_info_of_another_sensor_is_refused(estimator):
+    with pytest.raises(InvalidField, match="64x48"):
+        estimator.initial_state(Sensor(64, 47), LENS)
+
+
+def test_the_example_of_the_readme_runs_as_written():
+    result = doctest.testfile(str(README), module_relative=False, optionflags=doctest.ELLIPSIS)
+    assert result.attempted >= 9
+    assert result.failed == 0
+
+
+def test_the_paper_map_of_the_readme_names_only_what_exists():
+    rows = [line for line in README.read_text().splitlines() if line.startswith("|")]
+    names = {name for row in rows for name in re.findall(r"`([a-z]+\.[\w.]+)`", row)}
+    assert len(names) > 15
+    for name in names:
+        module, *attributes = name.split(".")
+        found: object = importlib.import_module(f"neurove_core.{module}")
+        for attribute in attributes:
+            found = getattr(found, attribute, None) or getattr(found, "model_fields", {}).get(attribute)
+        assert found is not None, name

@@ -1,0 +1,81 @@
+"""Recordings for tests: real ones where this machine has them, and small ones written here."""
+
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from protocol import Events, Sensor
+
+SHARED = Path(__file__).resolve().parents[1].parent / "shared/data"
+
+
+def shared(path: str) -> Path:
+    """A real recording beside the project; the test is skipped where it is absent."""
+    if not (SHARED / path).exists():
+        pytest.skip(f"the recording shared/data/{path} is not on this machine")
+    return SHARED / path
+
+
+def ecd_text(events: Events) -> bytes:
+    """Lines `t[s] x y p` with nine decimals, as the Event Camera Dataset has them."""
+    rows = zip(*(column.tolist() for column in events), strict=True)
+    return "".join(f"{t // 1_000_000}.{t % 1_000_000:06d}000 {x} {y} {p}\n" for t, x, y, p in rows).encode()
+
+
+class Aedat4(NamedTuple):
+    data: bytes
+    starts: list[int]  # byte where each packet of events begins
+    stops: list[int]  # byte after each packet of events
+    end: int  # byte after the last packet of any stream
+
+
+def aedat4(packets: Sequence[Events], sensor: Sensor, *, finished: bool = True) -> Aedat4:
+    """An uncompressed .aedat4 file with a packet of triggers after each packet of events.
+
+    A finished one says in its header where the packets end and has a table after them; that of a recorder which was
+    killed does neither.
+    """
+    streams = _stream(0, "EVTS", sensor) + _stream(1, "TRIG")
+    xml = f'<dv version="2.0"><node name="outInfo" path="/o/">{streams}</node></dv>'.encode()
+    at = start = 14 + 4 + 40 + 4 + len(xml) + 1
+    body, starts, stops = b"", [], []
+    for packet in packets:
+        events, triggers = _packet(0, b"EVTS", _rows(packet)), _packet(1, b"TRIG", struct.pack("<qB7x", 0, 1))
+        body += events + triggers
+        starts.append(at)
+        stops.append(at + len(events))
+        at += len(events) + len(triggers)
+    # a flatbuffer by hand: root, identifier, table of offsets, the table itself, the string
+    table = struct.pack("<iiqI", 12, 0, at if finished else -1, 4)
+    header = struct.pack("<I4sHHHHHxx", 20, b"IOHE", 10, 20, 4, 8, 16) + table + struct.pack("<I", len(xml)) + xml
+    data = b"#!AER-DAT4.0\r\n" + struct.pack("<I", len(header) + 1) + header + b"\0"
+    assert len(data) == start
+    return Aedat4(data + body + (b"a table of packets, unread" if finished else b""), starts, stops, at)
+
+
+def _stream(number: int, kind: str, sensor: Sensor | None = None) -> str:
+    size = (
+        f'<attr key="sizeX" type="int">{sensor.width}</attr><attr key="sizeY" type="int">{sensor.height}</attr>'
+        if sensor
+        else ""
+    )
+    return (
+        f'<node name="{number}" path="/o/{number}/"><attr key="typeIdentifier" type="string">{kind}</attr>'
+        f'<node name="info" path="/o/{number}/info/">{size}</node></node>'
+    )
+
+
+def _rows(events: Events) -> bytes:
+    rows = np.zeros(events.n, np.dtype([("t", "<i8"), ("x", "<i2"), ("y", "<i2"), ("p", "u1"), ("_", "V3")]))
+    for name in ("t", "x", "y", "p"):
+        rows[name] = getattr(events, name)
+    return rows.tobytes()
+
+
+def _packet(stream: int, identifier: bytes, rows: bytes) -> bytes:
+    buffer = struct.pack("<I4sHHHxxiI", 16, identifier, 6, 8, 4, 8, 4) + struct.pack("<I", len(rows) // 16) + rows
+    return struct.pack("<iiI", stream, len(buffer) + 4, len(buffer)) + buffer
