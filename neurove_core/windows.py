@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.config import CanonicalConfig, WindowConfig
-from neurove_core.counting import count_events
+from neurove_core.kernels import count_events
 from protocol import Events
 
 

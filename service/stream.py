@@ -232,7 +232,10 @@ class Stream:
             state = None
         active = self._slot.active
         if state is not None and active.epoch != self._serving.epoch:
+            open_events = state.windows.events
             state = active.estimator.primed(state, self._serving.estimator)
+            if open_events and not state.windows.events:  # the models cut differently: the open window is given up
+                self._count("skipped_windows", 1)
         self._serving = active
         return state or active.estimator.initial_state(packet.sensor, self._camera_of(packet.sensor))
 

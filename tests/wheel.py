@@ -1,6 +1,7 @@
 """Build the wheel, and run `neurove --help` from it and not from this checkout."""
 
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -8,6 +9,7 @@ from pathlib import Path
 
 
 def main() -> None:
+    shutil.rmtree("build", ignore_errors=True)  # a module that is gone would come back from it
     with tempfile.TemporaryDirectory() as folder:
         built, unpacked = Path(folder, "built"), Path(folder, "unpacked")
         pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]

@@ -11,8 +11,8 @@ class UnknownSource(NeuroVEError):
     code = "unknown_source"
 
     def __init__(self, source: str | Path, supported: tuple[str, ...], why: str) -> None:
-        known = "".join(f"\n  {line}" for line in supported)
-        super().__init__(f"source {str(source)!r}: {why}; supported are:{known}", value=str(source), why=why)
+        known = "; ".join(supported)
+        super().__init__(f"source {str(source)!r}: {why}; supported are {known}", value=str(source), why=why)
 
 
 class MissingGeometry(NeuroVEError):

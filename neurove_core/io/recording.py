@@ -13,12 +13,12 @@ BLOCK_BYTES: Final = 4 << 20
 """How much of a file is read at once [bytes]."""
 
 SUPPORTED: Final = (
-    "FILE.aedat4                  DV recording (DAVIS, DVXplorer)",
-    "FILE.raw                     Prophesee recording, EVT2 or EVT3",
-    "FOLDER or FILE.txt           Event Camera Dataset: events.txt with lines `t[s] x y p`, and calib.txt",
-    "pattern:// or pattern://?seed=3   built-in moving pattern, endless",
+    "FILE.aedat4 (DV)",
+    "FILE.raw (Prophesee EVT2, EVT3)",
+    "a folder with events.txt, or FILE.txt (Event Camera Dataset)",
+    "pattern:// (built-in)",
 )
-"""The sources that `open_source` knows, one line each."""
+"""The sources that `open_source` knows."""
 
 
 class Recording(Protocol):

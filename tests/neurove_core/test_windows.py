@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from neurove_core.config import CanonicalConfig, WindowConfig
-from neurove_core.counting import count_events_reference
 from neurove_core.geometry import OUTSIDE, lookup_table
+from neurove_core.kernels import count_events_reference
 from neurove_core.windows import Window, WindowsState, push
 from protocol import Events
 from tests.builders import SENSOR, make_events

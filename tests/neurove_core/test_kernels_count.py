@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neurove_core.counting import count_events, count_events_reference
 from neurove_core.geometry import OUTSIDE
+from neurove_core.kernels import count_events, count_events_reference
 from protocol import Events
 from tests.builders import SENSOR, make_events
 

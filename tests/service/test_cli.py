@@ -1,0 +1,104 @@
+"""Commands that need no network: what they print, where, and with which exit code."""
+
+import json
+import logging
+
+import pytest
+import structlog
+
+from neurove_core import bundle
+from service import cli
+
+
+@pytest.fixture
+def logging_as_before():
+    root = logging.getLogger()
+    handlers, level = root.handlers[:], root.level
+    yield
+    root.handlers[:] = handlers
+    root.setLevel(level)
+    structlog.reset_defaults()
+
+
+@pytest.fixture
+def run(capsys, logging_as_before):
+    def call(*arguments):
+        code = cli.main(arguments)
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return call
+
+
+def test_config_show_is_toml_that_serve_reads_back(run, tmp_path, monkeypatch):
+    monkeypatch.setenv("NEUROVE_QUEUE_S", "2.5")
+    code, out, _ = run("config", "show", "--node", "robot7", "--connect", "tcp/127.0.0.1:1,tcp/127.0.0.1:2")
+    file = tmp_path / "neurove.toml"
+    file.write_text(out)
+    monkeypatch.delenv("NEUROVE_QUEUE_S")
+    assert code == 0
+    assert run("config", "show", "--config", str(file)) == (0, out, "")
+
+
+def test_config_show_tells_origins(run):
+    assert 'node = "x"  # flag' in run("config", "show", "--origin", "--node", "x")[1]
+    told = json.loads(run("config", "show", "--json", "--node", "x")[1])
+    assert told["node"] == {"value": "x", "origin": "flag"}
+    assert told["queue_s"]["origin"] == "default"
+
+
+def test_a_new_model_can_be_inspected(run, tmp_path):
+    file = tmp_path / "fresh.safetensors"
+    code, out, _ = run("model", "new", str(file), "--seed", "3")
+    assert code == 0
+    assert "untrained" in out
+    told = json.loads(run("model", "inspect", str(file), "--json")[1])
+    assert (told["name"], told["trained"], told["digest"]) == ("fresh", False, bundle.load(file).digest)
+    assert told["config"]["window"]["bins"] == 5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "telling"),
+    [
+        (("model", "inspect", "nowhere.safetensors"), "No such file"),
+        (("model", "new", "model.pt"), "must end in .safetensors"),
+        (("model", "new", "no/such/folder/m.safetensors"), "No such file"),
+        (("drive", "nowhere.xyz"), "supported are"),
+        (("drive", "gopher://x"), "unknown scheme"),
+        (("config", "show", "--queue-s", "-1"), "queue_s='-1' (from flag): Input should be greater than 0"),
+        (("health", "--connect", "nonsense"), "connect=nonsense"),
+    ],
+)
+def test_wrong_usage_is_one_line_and_exit_code_2(run, tmp_path, monkeypatch, arguments, telling):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run(*arguments)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert err.startswith("neurove: ")
+    assert telling in err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "telling"),
+    [
+        (("drive", "pattern://", "--speed", "0"), "give a factor above 0"),
+        (("drive", "pattern://", "--speed", "fast"), "or max"),
+        (("drive", "pattern://", "--sensor", "640"), "WIDTHxHEIGHT"),
+        (("demo", "--duration", "-3"), "give seconds above 0"),
+        (("demo", "--duration", "soon"), "give seconds above 0"),
+        ((), "COMMAND"),
+        (("fly",), "invalid choice"),
+    ],
+)
+def test_a_wrong_flag_is_explained_with_exit_code_2(capsys, arguments, telling):
+    with pytest.raises(SystemExit) as raised:
+        cli.main(arguments)
+    assert raised.value.code == 2
+    assert telling in capsys.readouterr().err
+
+
+def test_control_c_before_a_command_took_over_is_no_traceback(run, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "load", interrupted)
+    assert run("config", "show") == (130, "", "")
