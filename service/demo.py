@@ -80,6 +80,8 @@ def run(
         ask.listen(transport, config, board.on_estimate, board.on_status)
         with _process(*drive, stdout=subprocess.PIPE) as driver:
             _show(board, console, lambda: driver.poll() is None and service.poll() is None, stop)
+            if service.poll() is not None:
+                raise DemoFailed(f"the service ended with exit code {service.returncode}")
             sent = _sent(driver, stop)
         status = _drained(transport, config, sent, stop)
     if screenshot:

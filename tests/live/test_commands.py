@@ -1,4 +1,5 @@
 import json
+import os
 import signal
 from pathlib import Path
 
@@ -185,3 +186,16 @@ def test_a_service_that_waits_for_a_router_ends_in_order_when_told():
                 break
         code, _, errors = waiting.end(signal.SIGTERM)
     assert (code, "Traceback" in errors) == (0, False)
+
+
+@pytest.mark.parametrize(("victim", "telling"), [("serve", "the service ended"), ("drive", "the driver ended")])
+def test_a_demo_that_loses_one_of_its_processes_says_which(victim, telling):
+    demo = Process("demo", "--duration", "60", "--json")
+    wait_until(lambda: len(children(demo.child.pid)) == 2, timeout_s=90)
+    for pid in children(demo.child.pid):
+        if victim in Path(f"/proc/{pid}/cmdline").read_text():
+            os.kill(pid, signal.SIGKILL)
+    out, errors = demo.child.communicate(timeout=60)
+    assert (demo.child.returncode, out) == (1, "")
+    assert errors.startswith(f"neurove: {telling}")
+    assert errors.count("\n") == 1
