@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from protocol import Sensor, TwistEstimate
+from protocol.codec import MessageT
 from protocol.control import PeerError, StreamStatus
 from protocol.errors import InvalidField, NeuroVEError
 from service import logs
@@ -156,34 +157,38 @@ def _watch_table(config: ClientConfig, transport: Any, stop: threading.Event) ->
 
 def health(args: argparse.Namespace) -> int:
     """How every node is."""
-    from service import ask
+    from service import ask, views
 
-    config = _client(args)
-    with ask.connect(config) as transport:
-        replies = ask.health(transport, config, args.node)
-    if args.json:
-        print(json.dumps([reply.model_dump() for reply in replies]))
-    else:
-        from service.views import health_table
-
-        _console().print(health_table(replies))
+    replies = _asked(args, ask.health, views.health_table)
     return 0 if all(reply.ok for reply in replies) else BAD_NEWS
 
 
 def models(args: argparse.Namespace) -> int:
     """Which models every node has."""
+    from service import ask, views
+
+    _asked(args, ask.models, views.models_table)
+    return 0
+
+
+def _asked(
+    args: argparse.Namespace,
+    question: Callable[[Any, ClientConfig, str], list[MessageT]],
+    table: Callable[[list[MessageT]], Any],
+) -> list[MessageT]:
+    """Every node's reply to a question, printed."""
     from service import ask
 
     config = _client(args)
     with ask.connect(config) as transport:
-        replies = ask.models(transport, config, args.node)
+        replies = question(transport, config, args.node)
     if args.json:
         print(json.dumps([reply.model_dump() for reply in replies]))
     else:
-        from service.views import models_table
+        from rich.console import Console
 
-        _console().print(models_table(replies))
-    return 0
+        Console().print(table(replies))
+    return replies
 
 
 def activate(args: argparse.Namespace) -> int:
@@ -288,12 +293,6 @@ def inspect_model(args: argparse.Namespace) -> int:
     about = found.info.model_dump() | {"config": found.config.model_dump(mode="json")}
     print(json.dumps(about, indent=None if args.json else 2))
     return 0
-
-
-def _console() -> Any:
-    from rich.console import Console
-
-    return Console()
 
 
 def _client(args: argparse.Namespace) -> ClientConfig:

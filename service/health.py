@@ -58,7 +58,8 @@ def node_verdict(streams: list[StreamStatus], refused_streams: int = 0) -> tuple
     bad += [f"{refused_streams} streams refused, for it serves as many as it may"] if refused_streams else []
     if bad:
         return False, "; ".join(bad)
-    return True, f"{len(streams)} streams" if streams else "no stream yet"
+    count = len(streams)
+    return True, f"{count} stream{'s' * (count > 1)}" if count else "no stream yet"
 
 
 _BAD = ("lossy", "stalled")

@@ -5,6 +5,7 @@ direct callbacks that only append, every query answered, sessions always closed.
 """
 
 import json
+import re
 import threading
 import time
 from collections.abc import Callable
@@ -28,6 +29,7 @@ _SETTINGS = {
     "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 20_000,  # us: ride out a stall of the receiver
 }
 _RETRY_S = 0.5
+_SYSTEM_ERROR = re.compile(r"([^:\[\]]+) \(os error \d+\)")
 
 OnSample = Callable[[str, bytes, int], None]
 """key, payload, and when it was received (monotonic ns). Runs on Zenoh's thread: it may only append and return."""
@@ -217,9 +219,10 @@ def open_transport(
         try:
             return Transport(zenoh.open(config))
         except zenoh.ZError as error:
-            reason = _reason(error)
-            if not reason.startswith("Unable to connect"):
-                raise EndpointError(f"can not open a Zenoh session ({_where(listen, connect)}): {reason}") from None
+            if not str(error).startswith("Unable to connect"):
+                raise EndpointError(
+                    f"can not open a Zenoh session: {_where(listen, connect)}: {_reason(error)}"
+                ) from None
         if time.monotonic() >= deadline or stop.is_set():
             raise EndpointError(f"nobody listens at {', '.join(connect)}")
         if not waiting:
@@ -242,7 +245,7 @@ def _session_config(
             config.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
         where = f"zenoh_config={config_file}" if config_file else _where(listen, connect)
-        raise EndpointError(f"can not configure Zenoh ({where}): {_reason(error)}") from None
+        raise EndpointError(f"can not configure Zenoh: {where}: {_reason(error)}") from None
     return config
 
 
@@ -252,5 +255,6 @@ def _where(listen: tuple[str, ...], connect: tuple[str, ...]) -> str:
 
 
 def _reason(error: zenoh.ZError) -> str:
-    """What Zenoh says, without the places in its own source."""
-    return str(error).split(" at /", maxsplit=1)[0].removesuffix(".")
+    """What Zenoh says, without the places in its own source, or the system's own word where that is the reason."""
+    system = _SYSTEM_ERROR.search(str(error))
+    return system[1].strip() if system else str(error).split(" at /", maxsplit=1)[0].removesuffix(".")

@@ -4,6 +4,7 @@ import threading
 import time
 from collections import deque
 from dataclasses import dataclass, field
+from typing import Any
 
 from rich.console import Group, RenderableType
 from rich.panel import Panel
@@ -18,6 +19,7 @@ from service.latency import latency
 _VERDICT_STYLE = {"ok": "green", "lossy": "yellow", "stalled": "bold red", "idle": "dim"}
 _RATE_ESTIMATES = 40
 _BLOCKS = "▁▂▃▄▅▆▇█"
+_PLAIN: dict[str, Any] = {"box": None, "padding": (0, 2, 0, 0), "header_style": "dim"}
 _HISTORY = 26
 _WIDTH = 98
 
@@ -159,21 +161,23 @@ def health_table(replies: list[HealthReply]) -> RenderableType:
 
 
 def _streams_table(streams: tuple[StreamStatus, ...]) -> Table:
-    table = Table("stream", "verdict", "sensor", "packets", "events", "estimates", "p50 ms", "p99 ms", "lost")
+    table = Table("stream", "verdict", "sensor", "packets", "events", "estimates", "p50/p99 ms", "lost", **_PLAIN)
     for status in streams:
         numbers = status.latency_ms
         lost = ", ".join(f"{name} {count}" for name, count in status.lost.nonzero().items())
         table.add_row(
             status.stream,
             Text(status.verdict, style=_VERDICT_STYLE[status.verdict]),
-            f"{status.width}x{status.height}{'' if status.calibrated else ' uncalibrated'}",
+            f"{status.width}x{status.height}{'' if status.calibrated else ' *'}",
             f"{status.packets_received:,}",
             f"{status.events_received:,}",
             f"{status.estimates:,}",
-            f"{numbers.p50:.1f}" if numbers else "-",
-            f"{numbers.p99:.1f}" if numbers else "-",
+            f"{numbers.p50:.1f}/{numbers.p99:.1f}" if numbers else "-",
             lost or "nothing",
         )
+    if not all(status.calibrated for status in streams):
+        table.caption = "* uncalibrated: no CameraInfo of this sensor"
+        table.caption_justify = "left"
     return table
 
 
@@ -181,9 +185,8 @@ def models_table(replies: list[ModelsReply]) -> RenderableType:
     """Models of every node, the active one marked."""
     parts: list[RenderableType] = []
     for reply in replies:
-        table = Table(
-            "", "model", "digest", "trained", "parameters", "made by", title=f"{reply.node}, epoch {reply.epoch}"
-        )
+        table = Table("", "model", "digest", "trained", "parameters", "made by", **_PLAIN)
+        table.title, table.title_justify = f"{reply.node}, epoch {reply.epoch}", "left"
         previous = reply.previous.digest if reply.previous else ""
         for info in reply.available:
             mark = "active" if info.digest == reply.active.digest else "previous" if info.digest == previous else ""
