@@ -1,1 +1,37 @@
-"""The paper (NeuroVE) and its models: no network, no clocks, no threads."""
+"""The paper (NeuroVE) and its models: no network, no clocks, no threads.
+
+Its neurons and cells are here by name, `from neurove_core import ALIF, ASLSTM`, and loaded only when asked for: reading
+recordings does without torch.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from neurove_core.cells import ASLSTM, SLSTM, Readout
+    from neurove_core.neurons import ALIF, LIF, LTC
+
+__all__ = ["ALIF", "ASLSTM", "LIF", "LTC", "SLSTM", "Readout"]
+
+_MODULE_OF = {
+    "ALIF": "neurons",
+    "LIF": "neurons",
+    "LTC": "neurons",
+    "ASLSTM": "cells",
+    "SLSTM": "cells",
+    "Readout": "cells",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """A neuron or cell, loaded at its first use (PEP 562)."""
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = getattr(importlib.import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
+    globals()[name] = found  # the next use finds it without this function
+    return found
+
+
+def __dir__() -> list[str]:
+    """The names of the package, those not yet loaded too."""
+    return sorted({*globals(), *__all__})

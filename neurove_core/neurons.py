@@ -1,16 +1,19 @@
-"""LIF and ALIF: parameters, state, one step. State goes in and comes out.
+"""LIF, ALIF and LTC: parameters, state, one step, and a module that scans a sequence. State goes in and comes out.
 
-Conventions of both: V_rest = 0; a spike is V >= v_th; the reset is hard (to 0) and is applied when the state is
+Conventions of all: V_rest = 0; a spike is V >= v_th; the reset is hard (to 0) and is applied when the state is
 stored, which is the same as the factor (1 - S) of the paper's next step. The gradient through the reset is cut.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn.functional import linear
 
-from neurove_core.surrogate import Surrogate, spike
+from neurove_core.surrogate import SURROGATES, Surrogate, spike
+from protocol.errors import InvalidField
 
 
 class LIFParams(NamedTuple):
@@ -26,6 +29,13 @@ class LIFState(NamedTuple):
     """What a population of neurons carries to the next step."""
 
     v: Tensor  # membrane potential after the reset, dimensionless, any shape
+
+
+class NeuronSteps(NamedTuple):
+    """What a population did in each step of a sequence."""
+
+    s: Tensor  # spikes of 0 and 1 (T, B, N)
+    v: Tensor  # membrane potential before the reset (T, B, N): what may diffuse into the layer above
 
 
 def fire(v: Tensor, params: LIFParams) -> tuple[Tensor, LIFState]:
@@ -82,7 +92,12 @@ def alif_step(
         spikes (B, N) and the next state.
     """
     current = f(diffuse(spikes_before, v_before, params.d_space))
-    return fire(params.lif.decay * state.v + current + params.d_time * state.v, params.lif)
+    return fire(alif_potential(current, state, params), params.lif)
+
+
+def alif_potential(current: Tensor, state: LIFState, params: ALIFParams) -> Tensor:
+    """The membrane potential V of an ALIF population before it fires; current is f(X + D V_i) (Eq. 6a)."""
+    return params.lif.decay * state.v + current + params.d_time * state.v
 
 
 def diffuse(spikes: Tensor, v: Tensor, d: Tensor | float) -> Tensor:
@@ -97,3 +112,285 @@ def lif_scan(currents: Tensor, state: LIFState, params: LIFParams) -> tuple[Tens
         out, state = lif_step(current, state, params)
         spikes.append(out)
     return torch.stack(spikes), state
+
+
+class LTCParams(NamedTuple):
+    """Weights of a population of N liquid time-constant spiking neurons (Yin 2023)."""
+
+    w_x: Tensor  # (N, I)
+    w_s: Tensor  # (N, N): the population's own spikes of the step before
+    b: Tensor  # (N)
+    w_a: Tensor  # (N, 2N): of the time constant, first N columns for d, then N for m
+    b_a: Tensor  # (N)
+    v_th: float = 0.5
+    surrogate: Surrogate = "rectangular"
+    surrogate_width: float = 1.0
+
+
+class LTCState(NamedTuple):
+    """What a population of liquid time-constant neurons carries to the next step."""
+
+    m: Tensor  # membrane potential after the reset (B, N)
+    s: Tensor  # spikes (B, N)
+
+
+def ltc_step(x: Tensor, state: LTCState, params: LTCParams) -> LTCState:
+    """One time step of an LTC population; the state that comes out holds its spikes s.
+
+    Source: Yin 2023, the baseline LTC of NeuroVE, section IV-B:
+        d = W [x, s'] + b;  a = sigmoid(W_a [d, m'] + b_a);  u = m' + (d - m') a
+        s = [u >= v_th];  m = u (1 - s)
+    Differs: fires at u >= v_th, as all neurons here (Yin: u > v_th); the gradient through the reset is cut.
+
+    Args:
+        x: input (B, I).
+        state: of the step before; zeros at the start.
+        params: of the whole population.
+
+    Raises:
+        InvalidField: x is not I wide.
+    """
+    require_width("LTC", x, params.w_x.shape[1])
+    d = linear(x, params.w_x, params.b) + linear(state.s, params.w_s)
+    a = torch.sigmoid(linear(torch.cat((d, state.m), dim=-1), params.w_a, params.b_a))
+    u = state.m + (d - state.m) * a
+    s = spike(u - params.v_th, params.surrogate, params.surrogate_width)
+    return LTCState(u * (1 - s.detach()), s)
+
+
+class LIF(nn.Module):
+    """A population of N LIF neurons without weights, state in and out: its input is the current of each neuron.
+
+    Source: NeuroVE, Eq. (1) and (4), as lif_step.
+
+    Args:
+        hidden: N, number of neurons.
+        decay: 1 - dt/tau per step, 0 (no memory) to below 1.
+        v_th: firing threshold.
+        surrogate: of the spike's gradient.
+        surrogate_width: of the same, in units of the potential.
+
+    Raises:
+        InvalidField: a value is out of its bound.
+
+    >>> neurons = LIF(1, decay=0.5)
+    >>> steps, last = neurons(torch.full((4, 1, 1), 0.6), neurons.initial_state(batch=1))
+    >>> steps.s.flatten()
+    tensor([0., 0., 1., 0.])
+    """
+
+    _origin: Tensor
+
+    def __init__(
+        self,
+        hidden: int,
+        *,
+        decay: float = 0.5,
+        v_th: float = 1.0,
+        surrogate: Surrogate = "rectangular",
+        surrogate_width: float = 1.0,
+    ) -> None:
+        super().__init__()
+        require_shape_of_layer("LIF", hidden=hidden)
+        self.hidden = hidden
+        self._params = lif_params("LIF", decay, v_th, surrogate, surrogate_width)
+        self.register_buffer("_origin", torch.zeros(()), persistent=False)  # knows the module's dtype and device
+
+    def params(self) -> LIFParams:
+        """The population's constants, for lif_step."""
+        return self._params
+
+    def initial_state(self, batch: int) -> LIFState:
+        """Everything at rest."""
+        return LIFState(self._origin.new_zeros(batch, self.hidden))
+
+    def forward(self, x: Tensor, state: LIFState) -> tuple[NeuronSteps, LIFState]:
+        """Scan a sequence: currents (T, B, N) to spikes and potentials of all steps, and the last state.
+
+        Raises:
+            InvalidField: x is no sequence of this width, or the state is not of its batch.
+        """
+        require_sequence("LIF", x, self.hidden, state, self.hidden)
+        spikes, potentials = [], []
+        for current in x:
+            v = self._params.decay * state.v + current
+            s, state = fire(v, self._params)
+            spikes.append(s)
+            potentials.append(v)
+        return NeuronSteps(torch.stack(spikes), torch.stack(potentials)), state
+
+
+class ALIF(nn.Module):
+    """A layer of N ALIF neurons, f a linear map, both diffusions learnable, state in and out.
+
+    Source: NeuroVE, Eq. (6), as alif_step; across time J(t-1, t) of Eq. (9).
+
+    Args:
+        inputs: I, width of the layer before.
+        hidden: N, number of neurons.
+        decay: 1 - dt/tau per step, 0 to below 1; the literal leakless Eq. (6a) is the limit 1.
+        v_th: firing threshold.
+        d_space: initial D of J = D V_i, one per neuron of the layer before.
+        d_time: initial D of J(t-1, t) = D V(t-1) of the same neuron, one per neuron.
+        surrogate: of the spike's gradient.
+        surrogate_width: of the same, in units of the potential.
+
+    Raises:
+        InvalidField: a value is out of its bound.
+    """
+
+    def __init__(
+        self,
+        inputs: int,
+        hidden: int,
+        *,
+        decay: float = 0.5,
+        v_th: float = 1.0,
+        d_space: float = 0.5,
+        d_time: float = 0.2,
+        surrogate: Surrogate = "rectangular",
+        surrogate_width: float = 1.0,
+    ) -> None:
+        super().__init__()
+        require_shape_of_layer("ALIF", inputs=inputs, hidden=hidden)
+        require(0 <= d_space < math.inf, "ALIF", "d_space", d_space, "must be at least 0 and finite")
+        require(0 <= d_time < 1, "ALIF", "d_time", d_time, "must be at least 0 and below 1, for it acts as a leak")
+        self.hidden = hidden
+        self.lif = lif_params("ALIF", decay, v_th, surrogate, surrogate_width)
+        self.f = nn.Linear(inputs, hidden)
+        self.d_space = nn.Parameter(torch.full((inputs,), float(d_space)))
+        self.d_time = nn.Parameter(torch.full((hidden,), float(d_time)))
+
+    def params(self) -> ALIFParams:
+        """The layer's constants and diffusions, for alif_step; f is the layer's `f`."""
+        return ALIFParams(self.lif, self.d_space, self.d_time)
+
+    def initial_state(self, batch: int) -> LIFState:
+        """Everything at rest."""
+        return LIFState(self.f.weight.new_zeros(batch, self.hidden))
+
+    def forward(self, x: Tensor, state: LIFState, v_before: Tensor | None = None) -> tuple[NeuronSteps, LIFState]:
+        """Scan a sequence to spikes and potentials of all steps, and the last state.
+
+        Args:
+            x: X, spikes of the layer before, or plain input (T, B, I).
+            state: from initial_state or the call before.
+            v_before: V_i, potentials of the layer before (T, B, I), NeuronSteps.v; None where there is no such layer.
+
+        Raises:
+            InvalidField: x or v_before is no sequence of this width, or the state is not of its batch.
+        """
+        require_sequence("ALIF", x, self.f.in_features, state, self.hidden)
+        if v_before is not None:
+            bound = f"must have the shape of x, {tuple(x.shape)}"
+            require(v_before.shape == x.shape, "ALIF", "v_before.shape", tuple(v_before.shape), bound)
+            x = diffuse(x, v_before, self.d_space)
+        params, spikes, potentials = self.params(), [], []
+        for current in self.f(x):
+            v = alif_potential(current, state, params)
+            s, state = fire(v, self.lif)
+            spikes.append(s)
+            potentials.append(v)
+        return NeuronSteps(torch.stack(spikes), torch.stack(potentials)), state
+
+
+class LTC(nn.Module):
+    """A layer of N liquid time-constant spiking neurons, recurrent through its spikes, state in and out.
+
+    Source: Yin 2023, as ltc_step.
+
+    Args:
+        inputs: I, width of the input.
+        hidden: N, number of neurons.
+        v_th: firing threshold; 0.5 is Yin's.
+        surrogate: of the spike's gradient.
+        surrogate_width: of the same, in units of the potential.
+
+    Raises:
+        InvalidField: a value is out of its bound.
+    """
+
+    def __init__(
+        self,
+        inputs: int,
+        hidden: int,
+        *,
+        v_th: float = 0.5,
+        surrogate: Surrogate = "rectangular",
+        surrogate_width: float = 1.0,
+    ) -> None:
+        super().__init__()
+        require_shape_of_layer("LTC", inputs=inputs, hidden=hidden)
+        require_threshold("LTC", v_th, surrogate, surrogate_width)
+        self.hidden = hidden
+        bound = hidden**-0.5
+        self.w_x = nn.Parameter(torch.empty(hidden, inputs).uniform_(-bound, bound))
+        self.w_s = nn.Parameter(torch.empty(hidden, hidden).uniform_(-bound, bound))
+        self.b = nn.Parameter(torch.empty(hidden).uniform_(-bound, bound))
+        self.w_a = nn.Parameter(torch.empty(hidden, 2 * hidden).uniform_(-bound, bound))
+        self.b_a = nn.Parameter(torch.empty(hidden).uniform_(-bound, bound))
+        self._constants = (v_th, surrogate, surrogate_width)
+
+    def params(self) -> LTCParams:
+        """The layer's weights, for ltc_step."""
+        return LTCParams(self.w_x, self.w_s, self.b, self.w_a, self.b_a, *self._constants)
+
+    def initial_state(self, batch: int) -> LTCState:
+        """Everything at rest."""
+        zeros = self.w_x.new_zeros(batch, self.hidden)
+        return LTCState(zeros, zeros)
+
+    def forward(self, x: Tensor, state: LTCState) -> tuple[LTCState, LTCState]:
+        """Scan a sequence: x (T, B, I) to the states of all steps, each field (T, B, N), and the last one.
+
+        Raises:
+            InvalidField: x is no sequence of this width, or the state is not of its batch.
+        """
+        params, steps = self.params(), []
+        require_sequence("LTC", x, params.w_x.shape[1], state, self.hidden)
+        for x_t in x:
+            state = ltc_step(x_t, state, params)
+            steps.append(state)
+        return LTCState(*(torch.stack(field) for field in zip(*steps, strict=True))), state
+
+
+def lif_params(what: str, decay: float, v_th: float, surrogate: Surrogate, surrogate_width: float) -> LIFParams:
+    """Checked parameters of the LIF part of a neuron called `what`."""
+    require(0 <= decay < 1, what, "decay", decay, "must be at least 0 and below 1")
+    require_threshold(what, v_th, surrogate, surrogate_width)
+    return LIFParams(decay, v_th, surrogate, surrogate_width)
+
+
+def require(ok: bool, what: str, field: str, value: object, bound: str) -> None:
+    """Raise InvalidField, with what, field, value and bound, unless ok."""
+    if not ok:
+        raise InvalidField(what, field, value, bound)
+
+
+def require_threshold(what: str, v_th: float, surrogate: str, surrogate_width: float) -> None:
+    """A finite threshold above 0, a known surrogate and a finite width above 0, or InvalidField."""
+    require(0 < v_th < math.inf, what, "v_th", v_th, "must be above 0 and finite")
+    known = SURROGATES
+    require(surrogate in known, what, "surrogate", surrogate, f"must be one of {', '.join(known)}")
+    require(0 < surrogate_width < math.inf, what, "surrogate_width", surrogate_width, "must be above 0 and finite")
+
+
+def require_shape_of_layer(what: str, **widths: int) -> None:
+    """Numbers of inputs and neurons of at least 1, or InvalidField."""
+    for name, width in widths.items():
+        require(width >= 1, what, name, width, "must be at least 1")
+
+
+def require_width(what: str, x: Tensor, inputs: int) -> None:
+    """An input (..., I) of the layer's width, or InvalidField."""
+    if x.shape[-1:] != (inputs,):  # no call, no text, in the usual case: this runs once per step
+        raise InvalidField(what, "x.shape", tuple(x.shape), f"its last axis must be {inputs} wide")
+
+
+def require_sequence(what: str, x: Tensor, inputs: int, state: Sequence[Tensor], hidden: int) -> None:
+    """A sequence (T, B, I) of at least one step, and a state (B, N) that goes with it, or InvalidField."""
+    bound = f"must be (T, B, {inputs}), T at least 1"
+    require(x.dim() == 3 and x.shape[0] >= 1 and x.shape[2] == inputs, what, "x.shape", tuple(x.shape), bound)
+    want = (x.shape[1], hidden)
+    for tensor in state:
+        require(tuple(tensor.shape) == want, what, "state.shape", tuple(tensor.shape), f"must be (B, N) = {want}")

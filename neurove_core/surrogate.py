@@ -1,12 +1,15 @@
 """spike: Heaviside step forward, a surrogate gradient backward (paper Eq. 6c and the sentence below it; Wu 2018)."""
 
 import math
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor
 
+from protocol.errors import InvalidField
+
 Surrogate = Literal["rectangular", "arctan", "triangle"]
+SURROGATES: tuple[str, ...] = get_args(Surrogate)
 
 
 class _Spike(torch.autograd.Function):
@@ -40,7 +43,12 @@ def spike(u: Tensor, kind: Surrogate = "rectangular", width: float = 1.0) -> Ten
 
     Source: NeuroVE, Eq. (6b, 6c), with u = V - V_th.
 
+    Raises:
+        InvalidField: the surrogate is unknown.
+
     >>> spike(torch.tensor([-0.1, 0.0, 0.1]))
     tensor([0., 1., 1.])
     """
+    if kind not in SURROGATES:
+        raise InvalidField("spike", "surrogate", kind, f"known are {', '.join(SURROGATES)}")
     return _Spike.apply(u, kind, width)  # type: ignore[no-any-return, no-untyped-call]  # torch types apply as Any

@@ -10,6 +10,7 @@ import gc
 import json
 import math
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -295,6 +296,60 @@ def inspect_model(args: argparse.Namespace) -> int:
     return 0
 
 
+def reproduce_firing(args: argparse.Namespace) -> int:
+    """How often ALIF, LIF and LTC fire under one random current."""
+    from neurove_core.experiments import firing
+
+    report = firing.run(args.seed)
+    files = firing.save(report, args.out) if args.out else []
+    print(firing.to_json(report) if args.json else firing.to_markdown(report), end="")
+    for file in files:
+        print(f"wrote {file}", file=sys.stderr)
+    return 0
+
+
+def reproduce_sine(args: argparse.Namespace) -> int:
+    """Tables I and II: regression and forecast of a sine by ASLSTM, ASLSTM-w/o, SLSTM and LTC."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    from neurove_core.experiments import sine_report
+
+    models, seeds = args.models.split(","), range(args.seed, args.seed + args.seeds)
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
+        tasks: dict[tuple[str, int], Any] = {}
+
+        def progress(model: str, seed: int, update: int, updates: int, mse: float) -> None:
+            if (model, seed) not in tasks:
+                tasks[model, seed] = bar.add_task("", total=updates)
+            rmse = f"{model} seed {seed}: update {update}, RMSE {mse**0.5:.2e}"
+            bar.update(tasks[model, seed], completed=update, description=rmse)
+
+        runs = sine_report.reproduce(models, seeds, quick=args.quick, progress=progress)
+    command = shlex.join(["neurove", *sys.argv[1:]])
+    files = sine_report.save(runs, args.out, command=command, commit=_commit()) if args.out else []
+    if args.json:
+        print(json.dumps([run.figures for run in runs]))
+    else:
+        print("\n".join(sine_report.markdown(rows, number) for number, rows in sine_report.tables(runs).items()))
+    for file in files:
+        print(f"wrote {file}", file=sys.stderr)
+    return 0
+
+
+def _commit() -> str:
+    """The commit of the code that runs, with a + where it was changed since; or the version of the package."""
+    import importlib.metadata
+    import subprocess
+
+    git = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"]
+    try:
+        return subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return importlib.metadata.version("neurove")
+
+
 def _client(args: argparse.Namespace) -> ClientConfig:
     config, _ = load(ClientConfig, _flags(args, ClientConfig))
     logs.configure(config.log_level if "NEUROVE_LOG_LEVEL" in os.environ else "warning")
@@ -346,6 +401,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_clients(commands)
     _add_config(commands)
     _add_model(commands)
+    _add_reproduce(commands)
     return parser
 
 
@@ -431,6 +487,19 @@ def _add_model(commands: Any) -> None:
     new.add_argument("--seed", type=int, default=0, help="of the weights")
     inspect = _command(parser, "inspect", inspect_model)
     inspect.add_argument("file", type=Path, metavar="FILE", help="bundle to read")
+
+
+def _add_reproduce(commands: Any) -> None:
+    parser = commands.add_parser("reproduce", help="The paper's experiments.").add_subparsers(required=True)
+    firing = _command(parser, "firing", reproduce_firing)
+    firing.add_argument("--seed", type=int, default=0, help="of the first of ten runs; default 0")
+    firing.add_argument("--out", type=Path, metavar="DIR", help="write table and figure (PNG, SVG) into this folder")
+    sine = _command(parser, "sine", reproduce_sine)
+    sine.add_argument("--models", default="aslstm,aslstm-spiking,aslstm-wo,slstm,ltc", help="which, joined by commas")
+    sine.add_argument("--seed", type=int, default=0, help="the first seed; default 0")
+    sine.add_argument("--seeds", type=int, default=1, metavar="N", help="so many seeds, one after the other; default 1")
+    sine.add_argument("--quick", action="store_true", help="a few updates, to see that it runs: figures mean nothing")
+    sine.add_argument("--out", type=Path, metavar="DIR", help="write figures, tables, pictures and networks there")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""ASLSTM against the paper's equations written out by hand, and the laws of its state."""
+"""ASLSTM, SLSTM and readout against their equations written out by hand, and the laws of their state."""
 
 import math
 
@@ -6,7 +6,19 @@ import pytest
 import torch
 from torch import Tensor
 
-from neurove_core.cells import ASLSTM, ASLSTMParams, ASLSTMState, aslstm_step, readout_step
+from neurove_core.cells import (
+    ASLSTM,
+    SLSTM,
+    ASLSTMParams,
+    ASLSTMState,
+    Readout,
+    SLSTMParams,
+    SLSTMState,
+    aslstm_step,
+    readout_step,
+    slstm_step,
+)
+from protocol.errors import InvalidField
 
 each_form = pytest.mark.parametrize("diffusion", [True, False], ids=["aslstm", "without_diffusion"])
 each_width = pytest.mark.parametrize(("inputs", "hidden"), [(1, 8), (8, 8), (5, 3)])
@@ -136,10 +148,10 @@ def test_gradients_flow_to_every_parameter_and_back_to_the_first_input(diffusion
 
 @pytest.mark.parametrize("v_th", [-1e6, 1e6], ids=["always_fires", "never_fires"])
 def test_where_no_spike_changes_the_gradient_is_the_derivative(v_th):
-    layer, x = make_layer(3, 2, v_th=v_th), make_input(3, steps=3, batch=2)
+    layer, x = make_layer(3, 2), make_input(3, steps=3, batch=2)
     state = ASLSTMState(*make_input(2, steps=3, batch=2, seed=3))
     state = state._replace(s=torch.full_like(state.s, float(v_th < 0)))
-    constants = layer.params()[4:]
+    constants = layer.params()._replace(v_th=v_th)[4:]
 
     def run(x: Tensor, c: Tensor, v: Tensor, w_x: Tensor, w_v: Tensor, b: Tensor, d_time: Tensor) -> tuple[Tensor, ...]:
         params, now = ASLSTMParams(w_x, w_v, b, d_time, *constants), state._replace(c=c, v=v)
@@ -186,3 +198,160 @@ def test_output_neurons_driven_by_a_constant_sum_it_up_geometrically(kappa):
     for t in range(1, 8):
         y = readout_step(z, y, weight, bias, kappa)
         torch.testing.assert_close(y, drive * (1 - kappa**t) / (1 - kappa))
+
+
+# SLSTM
+
+
+def make_slstm(inputs: int = 5, hidden: int = 7, **options) -> SLSTM:
+    """A layer whose cells fire now and then."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        return SLSTM(inputs, hidden, **options).double()
+
+
+@pytest.mark.parametrize("v_th", [0.05, 0.2])
+def test_one_slstm_cell_computes_its_equations_as_written_out_by_hand(v_th):
+    w = {"i": (0.7, -0.3, 0.1), "f": (-0.4, 0.6, 0.5), "g": (1.1, 0.9, -0.2), "o": (0.3, -0.8, 0.4)}
+    params = SLSTMParams(
+        w_x=torch.tensor([[w[name][0]] for name in "ifgo"], dtype=torch.float64),
+        w_v=torch.tensor([[w[name][1]] for name in "ifgo"], dtype=torch.float64),
+        b=torch.tensor([w[name][2] for name in "ifgo"], dtype=torch.float64),
+        v_th=v_th,
+    )
+    zero = torch.zeros(1, 1, dtype=torch.float64)
+    state, c, v, s, fired = SLSTMState(zero, zero, zero), 0.0, 0.0, 0.0, set()
+    for x in [0.9, -0.4, 1.5, 1.2, -2.0, 0.3, 0.8, 0.0]:
+        gate_i, gate_f, gate_g, gate_o = (w[name][0] * x + w[name][1] * v + w[name][2] for name in "ifgo")
+        c = sigmoid(gate_f) * c + sigmoid(gate_i) * math.tanh(gate_g)
+        v = sigmoid(gate_o) * math.tanh(c) - v_th * s
+        s = 1.0 if v >= v_th else 0.0
+        fired.add(s)
+        state = slstm_step(torch.full((1, 1), x, dtype=torch.float64), state, params)
+        assert [field.item() for field in state] == pytest.approx((c, v, s), abs=1e-12)
+    assert fired == {0.0, 1.0}
+
+
+@each_width
+@pytest.mark.parametrize("cut", [1, 5, 11])
+def test_slstm_steps_equal_its_scan_and_it_may_be_cut_anywhere(inputs, hidden, cut):
+    layer, x = make_slstm(inputs, hidden), make_input(inputs)
+    states, last = layer(x, layer.initial_state(4))
+    state = layer.initial_state(4)
+    for t, x_t in enumerate(x):
+        state = slstm_step(x_t, state, layer.params())
+        for one, field in zip(state, states, strict=True):
+            assert torch.equal(one, field[t])
+    _, middle = layer(x[:cut], layer.initial_state(4))
+    for one, other in zip(layer(x[cut:], middle)[1], last, strict=True):
+        assert torch.equal(one, other)
+    assert 0 < states.s.mean() < 1
+
+
+@each_width
+def test_slstm_does_not_forget_under_a_constant_input_whatever_the_widths(inputs, hidden):
+    layer = make_slstm(inputs, hidden, v_th=0.9)  # snnTorch 1.0.0 repeats its first step with 1 input and 8 cells
+    states, _ = layer(torch.ones(4, 3, inputs, dtype=torch.float64), layer.initial_state(3))
+    for field in (states.c, states.v):
+        assert (field.diff(dim=0).abs().amax(dim=(1, 2)) > 1e-4).all()
+
+
+@pytest.mark.parametrize("s", [0.0, 1.0])
+def test_where_no_spike_changes_the_gradient_of_slstm_is_the_derivative(s):
+    layer, x = make_slstm(3, 2, v_th=0.99), make_input(3, steps=3, batch=2)
+    start = SLSTMState(*make_input(2, steps=3, batch=2, seed=3))._replace(s=torch.full((2, 2), s).double())
+
+    def run(x: Tensor, c: Tensor, v: Tensor, w_x: Tensor, w_v: Tensor, b: Tensor, v_th: Tensor) -> tuple[Tensor, ...]:
+        state = start._replace(c=c, v=v)
+        for x_t in x:
+            state = slstm_step(x_t, state, SLSTMParams(w_x, w_v, b, v_th))
+            assert not state.s.any()
+        return state.c, state.v
+
+    v_th = torch.full((2,), 0.99, dtype=torch.float64)  # one per neuron
+    inputs = [t.detach().clone().requires_grad_() for t in (x, start.c, start.v, *layer.params()[:3], v_th)]
+    assert torch.autograd.gradcheck(run, inputs)
+
+
+def test_no_gradient_goes_through_the_reset_of_slstm():
+    layer = make_slstm(3, 2)
+    state = SLSTMState(*(t.requires_grad_() for t in make_input(2, steps=3, batch=2, seed=3)))
+    after = slstm_step(make_input(3, steps=1, batch=2)[0], state, layer.params())
+    by_s, by_v = torch.autograd.grad(after.v.sum(), (state.s, state.v), allow_unused=True)
+    assert by_s is None
+    assert by_v.any()
+
+
+# Readout
+
+
+def test_the_readout_scans_as_its_steps_do_and_goes_on_from_its_state():
+    readout, z = Readout(5, 2).double(), make_input(5)
+    assert readout.kappa.item() == pytest.approx(0.2)
+    answers, last = readout(z, readout.initial_state(4))
+    y = readout.initial_state(4)
+    for z_t, answer in zip(z, answers, strict=True):
+        y = readout_step(z_t, y, readout.f.weight, readout.f.bias, readout.kappa)
+        assert torch.equal(y, answer)
+    _, middle = readout(z[:5], readout.initial_state(4))
+    assert torch.equal(readout(z[5:], middle)[1], last)
+
+
+@pytest.mark.parametrize("logit", [-30.0, 30.0])
+def test_kappa_stays_a_leak_whatever_training_does(logit):
+    readout = Readout(5, 2).double()
+    torch.nn.init.constant_(readout.kappa_logit, logit)
+    assert 0 < readout.kappa < 1
+
+
+def test_the_gradient_of_the_readout_is_the_derivative():
+    readout, z = Readout(3, 2).double(), make_input(3, steps=3, batch=2)
+    names = [name for name, _ in readout.named_parameters()]
+    assert "kappa_logit" in names
+
+    def run(z: Tensor, *parameters: Tensor) -> Tensor:
+        values = dict(zip(names, parameters, strict=True))
+        answers, _ = torch.func.functional_call(readout, values, (z, readout.initial_state(2)))
+        return answers
+
+    assert torch.autograd.gradcheck(run, [t.detach().clone().requires_grad_() for t in (z, *readout.parameters())])
+
+
+# Errors
+
+
+@pytest.mark.parametrize(
+    ("call", "field", "bound"),
+    [
+        (lambda: ASLSTM(0, 3), "inputs", "at least 1"),
+        (lambda: SLSTM(3, 0), "hidden", "at least 1"),
+        (lambda: Readout(3, 0), "outputs", "at least 1"),
+        (lambda: ASLSTM(3, 3, alpha=1.5), "alpha", "0 to 1"),
+        (lambda: ASLSTM(3, 3, v_th=0.0), "v_th", "above 0"),
+        (lambda: SLSTM(3, 3, v_th=-0.1), "v_th", "above 0"),
+        (lambda: ASLSTM(3, 3, surrogate="step"), "surrogate", "rectangular, arctan, triangle"),
+        (lambda: SLSTM(3, 3, surrogate="step"), "surrogate", "rectangular, arctan, triangle"),
+        (lambda: SLSTM(3, 3, surrogate_width=-1.0), "surrogate_width", "above 0"),
+        (lambda: Readout(3, 3, kappa=0.0), "kappa", "above 0"),
+        (lambda: Readout(3, 3, kappa=1.0), "kappa", "below 1"),
+    ],
+)
+def test_a_wrong_parameter_is_named_with_its_value_and_bound(call, field, bound):
+    with pytest.raises(InvalidField, match=bound) as caught:
+        call()
+    assert caught.value.details["field"] == field
+
+
+@pytest.mark.parametrize("layer", [make_layer(), make_slstm(), Readout(5, 7).double()], ids=lambda x: type(x).__name__)
+@pytest.mark.parametrize("shape", [(3, 4, 6), (4, 5), (0, 4, 5)])
+def test_a_wrong_input_or_state_is_named_with_its_shape(layer, shape):
+    with pytest.raises(InvalidField, match=r"x.shape=.*must be \(T, B, 5\)"):
+        layer(torch.zeros(*shape, dtype=torch.float64), layer.initial_state(4))
+    with pytest.raises(InvalidField, match=r"state.shape=\(2, 7\): must be \(B, N\) = \(4, 7\)"):
+        layer(make_input(5), layer.initial_state(2))
+
+
+def test_a_step_of_another_width_is_refused():
+    layer = make_slstm()
+    with pytest.raises(InvalidField, match="5 wide"):
+        slstm_step(torch.zeros(4, 6).double(), layer.initial_state(4), layer.params())

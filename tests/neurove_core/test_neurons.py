@@ -1,6 +1,8 @@
-"""LIF and ALIF against their closed forms."""
+"""LIF, ALIF and LTC against their closed forms; their modules against their steps."""
 
 import math
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -8,8 +10,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from neurove_core.neurons import ALIFParams, LIFParams, LIFState, alif_step, diffuse, lif_scan, lif_step
+import neurove_core
+from neurove_core import neurons
+from neurove_core.neurons import (
+    ALIFParams,
+    LIFParams,
+    LIFState,
+    LTCParams,
+    LTCState,
+    alif_step,
+    diffuse,
+    lif_scan,
+    lif_step,
+    ltc_step,
+)
 from neurove_core.surrogate import surrogate_gradient
+from protocol.errors import InvalidField
 
 LIF = LIFParams(decay=0.9, v_th=1.0)
 
@@ -140,3 +156,246 @@ def test_diffusion_in_time_is_a_slower_leak():
     for _ in range(6):
         _, state = alif_step(silent, silent, state, ALIFParams(LIFParams(decay=0.5), 0.3, d_time=0.2), lambda z: z)
     assert state.v.item() == pytest.approx(0.8 * math.pow(0.7, 6))
+
+
+# LTC
+
+
+def ltc_by_hand(xs: list[float], w: LTCParams) -> list[tuple[float, float]]:
+    """Yin's equations for one neuron in plain floats: (m, s) of every step."""
+    m = s = 0.0
+    steps = []
+    for x in xs:
+        d = w.w_x.item() * x + w.w_s.item() * s + w.b.item()
+        a = 1 / (1 + math.exp(-(w.w_a[0, 0].item() * d + w.w_a[0, 1].item() * m + w.b_a.item())))
+        m = m + (d - m) * a
+        s = float(m >= w.v_th)
+        m = m * (1 - s)
+        steps.append((m, s))
+    return steps
+
+
+def one_ltc(w_x: float, w_s: float, b: float, w_a: tuple[float, float], b_a: float, v_th: float = 0.5) -> LTCParams:
+    def tensor(*values: float) -> Tensor:
+        return torch.tensor(values, dtype=torch.float64)
+
+    return LTCParams(tensor(w_x)[None], tensor(w_s)[None], tensor(b), tensor(*w_a)[None], tensor(b_a), v_th)
+
+
+def run_ltc(xs: list[float], params: LTCParams, m: float = 0.0) -> list[tuple[float, float]]:
+    state = LTCState(torch.full((1, 1), m, dtype=torch.float64), torch.zeros(1, 1, dtype=torch.float64))
+    steps = []
+    for x in xs:
+        state = ltc_step(torch.full((1, 1), x, dtype=torch.float64), state, params)
+        steps.append((state.m.item(), state.s.item()))
+    return steps
+
+
+def test_one_ltc_neuron_computes_its_equations_as_written_out_by_hand():
+    params = one_ltc(0.9, -0.7, 0.1, (0.8, -0.5), 0.3)
+    xs = [0.2, 0.9, 1.4, -0.3, 0.6, 0.7, 0.1, 1.2]
+    expected = ltc_by_hand(xs, params)
+    assert {s for _, s in expected} == {0.0, 1.0}
+    for got, want in zip(run_ltc(xs, params), expected, strict=True):
+        assert got == pytest.approx(want, abs=1e-12)
+
+
+@pytest.mark.parametrize("a", [0.1, 0.5, 0.9])
+def test_an_ltc_neuron_of_fixed_time_constant_leaks_geometrically(a):
+    params = one_ltc(1.0, 0.0, 0.0, (0.0, 0.0), math.log(a / (1 - a)))
+    m = [m for m, _ in run_ltc([0.0] * 6, params, m=0.4)]
+    assert m == pytest.approx([0.4 * (1 - a) ** t for t in range(1, 7)])
+
+
+def test_an_ltc_neuron_that_fires_is_reset_to_zero_and_no_gradient_goes_through_the_reset():
+    params = one_ltc(1.0, 0.0, 0.0, (0.0, 0.0), 0.0)  # a = 1/2: m = x / 2 at the first step
+    x = torch.tensor([[0.8], [1.0], [7.0]], dtype=torch.float64, requires_grad=True)
+    zeros = torch.zeros(3, 1, dtype=torch.float64)
+    after = ltc_step(x, LTCState(zeros, zeros), params)
+    assert after.s.flatten().tolist() == [0.0, 1.0, 1.0]
+    assert after.m.flatten().tolist() == [0.4, 0.0, 0.0]
+    (gradient,) = torch.autograd.grad(after.m.sum(), x)
+    assert gradient.flatten().tolist() == [0.5, 0.0, 0.0]
+
+
+# Modules
+
+
+def make(name: str, **options) -> neurons.LIF | neurons.ALIF | neurons.LTC:
+    """A population of 4 neurons with 4 inputs that fires now and then."""
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        if name == "LIF":
+            return neurons.LIF(4, **options).double()
+        if name == "ALIF":
+            return neurons.ALIF(4, 4, **{"v_th": 0.3, **options}).double()
+        ltc = neurons.LTC(4, 4, **options).double()
+        torch.nn.init.uniform_(ltc.w_x, 0.0, 1.0)
+        return ltc
+
+
+each_module = pytest.mark.parametrize("name", ["LIF", "ALIF", "LTC"])
+
+
+def step_of(module: torch.nn.Module, x: Tensor, state: tuple[Tensor, ...]) -> tuple[Tensor, tuple[Tensor, ...]]:
+    match module:
+        case neurons.LIF():
+            return lif_step(x, state, module.params())
+        case neurons.ALIF():
+            return alif_step(x, torch.zeros_like(x), state, module.params(), module.f)
+        case neurons.LTC():
+            state = ltc_step(x, state, module.params())
+            return state.s, state
+    raise AssertionError(module)
+
+
+@each_module
+def test_a_module_scans_as_its_steps_do(name):
+    module, x = make(name), random_currents(3)
+    steps, last = module(x, module.initial_state(3))
+    state = module.initial_state(3)
+    for t, x_t in enumerate(x):
+        spikes, state = step_of(module, x_t, state)
+        assert torch.equal(steps.s[t], spikes)
+    for one, other in zip(last, state, strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-14)  # ALIF's f sees all steps at once
+    assert 0 < steps.s.mean() < 1
+
+
+@each_module
+@pytest.mark.parametrize("cut", [1, 17, 49])
+def test_a_module_stopped_after_k_steps_goes_on_from_its_state(name, cut):
+    module, x = make(name), random_currents(4)
+    whole, last = module(x, module.initial_state(3))
+    first, middle = module(x[:cut], module.initial_state(3))
+    second, end = module(x[cut:], type(middle)(*(field.clone() for field in middle)))
+    assert torch.equal(torch.cat((first.s, second.s)), whole.s)
+    for one, other in zip(end, last, strict=True):
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("name", ["LIF", "ALIF"])
+def test_steps_tell_the_potential_before_the_reset(name):
+    module, x = make(name), random_currents(5)
+    steps, last = module(x, module.initial_state(3))
+    v_th = 1.0 if name == "LIF" else 0.3
+    assert torch.equal(steps.s, (steps.v >= v_th).double())
+    assert torch.equal(last.v, steps.v[-1] * (1 - steps.s[-1]))
+
+
+@each_module
+def test_a_constant_input_makes_no_neuron_forget(name):
+    module = make(name, v_th=50.0)
+    _, one = module(0.1 * torch.ones(1, 3, 4, dtype=torch.float64), module.initial_state(3))
+    _, two = module(0.1 * torch.ones(2, 3, 4, dtype=torch.float64), module.initial_state(3))
+    assert ((one[0] - two[0]).abs() > 1e-6).all()
+
+
+def test_two_alif_layers_exchange_potentials_by_diffusion_in_space():
+    below, above = make("ALIF", v_th=5.0), make("ALIF", d_space=0.4)
+    steps, _ = below(random_currents(6), below.initial_state(3))
+    assert not steps.s.any()
+    with_v, _ = above(steps.s, above.initial_state(3), steps.v)
+    by_hand, _ = above(0.4 * steps.v, above.initial_state(3))
+    torch.testing.assert_close(with_v.v, by_hand.v)
+    assert with_v.s.any()
+
+
+@pytest.mark.parametrize("d_time", [0.0, 0.3])
+def test_an_alif_neuron_of_the_module_leaks_with_decay_and_diffusion_in_time_together(d_time):
+    module = make("ALIF", v_th=50.0, d_time=d_time, decay=0.5)
+    torch.nn.init.zeros_(module.f.bias)
+    steps, _ = module(torch.zeros(5, 3, 4, dtype=torch.float64), LIFState(torch.ones(3, 4, dtype=torch.float64)))
+    torch.testing.assert_close(steps.v[-1], torch.full((3, 4), (0.5 + d_time) ** 5, dtype=torch.float64))
+
+
+def test_both_diffusions_of_alif_learn():
+    module, x = make("ALIF", surrogate="arctan"), random_currents(7)  # never zero, as the rectangle may be
+    steps, _ = module(x, module.initial_state(3), x)
+    gradients = torch.autograd.grad(steps.s.sum(), [module.d_space, module.d_time])
+    assert all(gradient.all() for gradient in gradients)
+
+
+@each_module
+def test_below_the_threshold_the_gradient_of_a_module_is_the_derivative(name):
+    module = make(name, v_th=50.0)
+    x = random_currents(8, steps=3).requires_grad_()
+    names = [name for name, _ in module.named_parameters()]
+
+    def run(x: Tensor, *parameters: Tensor) -> Tensor:
+        values = dict(zip(names, parameters, strict=True))
+        args = (x, module.initial_state(3)) + ((x,) if isinstance(module, neurons.ALIF) else ())
+        steps, last = torch.func.functional_call(module, values, args)
+        return steps[0].sum() + last[0]
+
+    assert torch.autograd.gradcheck(run, (x, *(p.detach().clone().requires_grad_() for p in module.parameters())))
+
+
+@pytest.mark.parametrize(
+    ("call", "field", "bound"),
+    [
+        (lambda: neurons.LIF(0), "hidden", "at least 1"),
+        (lambda: neurons.ALIF(0, 3), "inputs", "at least 1"),
+        (lambda: neurons.LTC(3, -2), "hidden", "at least 1"),
+        (lambda: neurons.LIF(3, decay=1.0), "decay", "below 1"),
+        (lambda: neurons.LIF(3, decay=-0.1), "decay", "at least 0"),
+        (lambda: neurons.ALIF(3, 3, decay=math.nan), "decay", "below 1"),
+        (lambda: neurons.LIF(3, v_th=0.0), "v_th", "above 0"),
+        (lambda: neurons.ALIF(3, 3, v_th=-1.0), "v_th", "above 0"),
+        (lambda: neurons.LTC(3, 3, v_th=math.inf), "v_th", "finite"),
+        (lambda: neurons.ALIF(3, 3, d_time=1.0), "d_time", "below 1"),
+        (lambda: neurons.ALIF(3, 3, d_space=-0.5), "d_space", "at least 0"),
+        (lambda: neurons.LIF(3, surrogate="gaussian"), "surrogate", "rectangular, arctan, triangle"),
+        (lambda: neurons.LTC(3, 3, surrogate="gaussian"), "surrogate", "rectangular, arctan, triangle"),
+        (lambda: neurons.ALIF(3, 3, surrogate_width=0.0), "surrogate_width", "above 0"),
+    ],
+)
+def test_a_wrong_parameter_is_named_with_its_value_and_bound(call, field, bound):
+    with pytest.raises(InvalidField, match=bound) as caught:
+        call()
+    assert caught.value.details["field"] == field
+
+
+@each_module
+@pytest.mark.parametrize("shape", [(5, 3, 6), (3, 4), (4,), (0, 3, 4), (2, 5, 3, 4)])
+def test_a_wrong_input_is_named_with_its_shape(name, shape):
+    module = make(name)
+    with pytest.raises(InvalidField, match=r"must be \(T, B, 4\)") as caught:
+        module(torch.zeros(*shape, dtype=torch.float64), module.initial_state(3))
+    assert caught.value.details["field"] == "x.shape"
+
+
+@each_module
+def test_a_state_of_another_batch_is_named_with_its_shape(name):
+    module = make(name)
+    with pytest.raises(InvalidField, match="state.shape") as caught:
+        module(random_currents(0), module.initial_state(2))
+    assert caught.value.details["bound"] == "must be (B, N) = (3, 4)"
+
+
+def test_potentials_of_another_shape_and_a_step_of_another_width_are_refused():
+    alif, x = make("ALIF"), random_currents(0)
+    with pytest.raises(InvalidField, match="v_before.shape"):
+        alif(x, alif.initial_state(3), x[:-1])
+    ltc = make("LTC")
+    with pytest.raises(InvalidField, match="4 wide"):
+        ltc_step(torch.zeros(3, 5, dtype=torch.float64), ltc.initial_state(3), ltc.params())
+
+
+# The package
+
+
+@pytest.mark.parametrize("module", ["neurove_core", "neurove_core.io"])
+def test_a_package_without_neurons_does_not_load_torch(module):
+    code = f"import sys, {module}; assert 'torch' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_package_gives_its_neurons_and_cells_by_name():
+    for name in ("LIF", "ALIF", "LTC", "SLSTM", "ASLSTM", "Readout"):
+        assert name in neurove_core.__all__
+        assert name in dir(neurove_core)
+        assert getattr(neurove_core, name).__name__ == name
+    assert neurove_core.LIF is neurons.LIF
+    with pytest.raises(AttributeError, match="no attribute 'GRU'"):
+        _ = neurove_core.GRU

@@ -7,6 +7,7 @@ import pytest
 import structlog
 
 from neurove_core import bundle
+from neurove_core.experiments import firing
 from service import cli
 
 
@@ -102,3 +103,25 @@ def test_control_c_before_a_command_took_over_is_no_traceback(run, monkeypatch):
 
     monkeypatch.setattr(cli, "load", interrupted)
     assert run("config", "show") == (130, "", "")
+
+
+def test_reproduce_firing_prints_its_table_and_writes_it_beside_the_figure(run, tmp_path):
+    pytest.importorskip("matplotlib")
+    code, out, err = run("reproduce", "firing", "--out", str(tmp_path))
+    assert code == 0
+    assert out == (tmp_path / "firing.md").read_text()
+    assert sorted(err.splitlines()) == sorted(f"wrote {file}" for file in tmp_path.iterdir())
+    assert {file.suffix for file in tmp_path.iterdir()} == {".md", ".json", ".png", ".svg"}
+
+
+def test_reproduce_firing_for_machines_is_one_json(run, monkeypatch):
+    measured = firing.Report(4, {"LIF": {"ou": firing.Rate(0.1, 0.01)}})
+    monkeypatch.setattr(firing, "run", lambda seed: measured._replace(seed=seed))
+    code, out, err = run("reproduce", "firing", "--json", "--seed", "4")
+    assert (code, out, err) == (0, firing.to_json(measured), "")
+    assert json.loads(out)["seeds"] == [4, 13]
+
+
+def test_reproduce_firing_refuses_a_negative_seed(run):
+    code, out, err = run("reproduce", "firing", "--seed", "-4")
+    assert (code, out, err) == (2, "", "neurove: reproduce firing: seed=-4: must be at least 0\n")

@@ -1,0 +1,81 @@
+"""The regression experiment: its data, its figures, and that a seed gives the same run."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from neurove_core.experiments import sine, sine_report
+from neurove_core.experiments.sine import LENGTH, Network, Recipe, evaluate, train, waves
+from protocol.errors import InvalidField
+
+pytest.importorskip("scipy", reason="scipy is not installed: pip install 'neurove[experiments]'")
+
+QUICK = Path(sine.__file__).parent / "results" / "sine-quick.json"
+TINY = Recipe(model="aslstm", hidden=8, updates=12, fine_updates=6)
+
+
+def test_waves_go_on_as_the_same_sine():
+    rows = waves()
+    assert rows.shape == (100, LENGTH)
+    truth = sine.continued(rows)
+    np.testing.assert_allclose(truth[:LENGTH].T, rows, atol=1e-6)
+    np.testing.assert_allclose(truth[2:] + truth[:-2], 2 * np.cos(0.05) * truth[1:-1], atol=1e-6)  # to its end
+
+
+@pytest.mark.parametrize("model", list(sine.KINDS))
+def test_training_lowers_the_error_and_keeps_what_is_not_learned(model):
+    recipe = Recipe(model=model, hidden=16, v_th=0.2, updates=80, fine_updates=0)
+    before = Network(recipe, np.random.default_rng(0))
+    trained = train(recipe, seed=0)
+    worst = [max(evaluate(network)[0].regression_rmse_x1000_from_100) for network in (before, trained.network)]
+    assert worst[1] < 0.6 * worst[0]
+    frozen = ~trained.network.learned
+    assert np.array_equal(trained.network.theta[frozen], before.theta[frozen])
+    diffuses = any(layer.d_space.any() for layer in trained.network.weights[:1])
+    assert diffuses == (model == "aslstm")
+
+
+def test_a_seed_is_the_run():
+    first, again, other = (train(TINY, seed).network.theta for seed in (3, 3, 4))
+    assert np.array_equal(first, again)
+    assert not np.allclose(first, other)
+
+
+def test_learned_thresholds_move_and_stay_above_their_bound():
+    recipe = Recipe(model="aslstm", hidden=8, v_th=0.05, learn_v_th=True, updates=30, fine_updates=0, lr=0.05)
+    thresholds = np.concatenate([layer.v_th for layer in train(recipe, 0).network.weights[:2]])
+    assert len(np.unique(thresholds)) > 4
+    assert (thresholds >= 0.02 - 1e-6).all()
+
+
+def test_a_network_that_diverges_is_reported_as_a_number():
+    network = Network(TINY, np.random.default_rng(0))
+    network.weights.first.d_time[:] = 50.0
+    result, _ = evaluate(network)
+    assert all(np.isfinite(result.forecast_rmse))
+    assert min(result.forecast_rmse) > 1
+
+
+def test_an_unknown_model_is_named():
+    with pytest.raises(InvalidField, match="models='gru': known are aslstm"):
+        sine_report.reproduce(["gru"], [0])
+
+
+def test_quick_reproduces_the_committed_figures(tmp_path):
+    committed = json.loads(QUICK.read_text())
+    runs = sine_report.reproduce([run["model"] for run in committed], [0], quick=True)
+    for run, wanted in zip(runs, committed, strict=True):
+        figures = run.figures
+        for key in ("regression_rmse_x1000_from_100", "regression_rmse_x1000"):
+            np.testing.assert_allclose(figures[key], wanted[key], rtol=0.1, err_msg=run.model)
+        assert (figures["updates"], figures["parameters"]) == (wanted["updates"], wanted["parameters"])
+    files = sine_report.save(runs, tmp_path, command="a test", commit="none")
+    assert {file.name for file in files} >= {"sine.json", "table1.md", "table2.md", "regression.png", "spikes.svg"}
+    table = (tmp_path / "table1.md").read_text()
+    assert "| ltc |" in table
+    assert "3.2 / 3.7 / 3.9" in table  # the paper's, beside ours
+    again = json.loads((tmp_path / "sine.json").read_text())
+    assert [run["model"] for run in again] == list(sine_report.RECIPES)
+    assert all({"v_th", "spike_rate", "cpu_s", "command", "commit"} <= run.keys() for run in again)
