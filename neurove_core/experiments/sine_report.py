@@ -1,0 +1,247 @@
+"""Tables I and II of the paper and its regression figure, from trained networks: `neurove reproduce sine`."""
+
+import importlib.util
+import json
+import math
+import statistics
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import safetensors.numpy
+
+from neurove_core.experiments import MissingExtra, blank_figure, save_figure, save_text
+from neurove_core.experiments.sine import LENGTH, SKIP, VALIDATION, Recipe, Trained, evaluate, train, waves
+from neurove_core.recurrence import Array
+from protocol.errors import InvalidField
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+RECIPES = {
+    "aslstm": Recipe(model="aslstm"),
+    "aslstm-spiking": Recipe(model="aslstm", low_v_th=0.2, low_units=3),
+    "aslstm-wo": Recipe(model="aslstm-wo", v_th=0.3, width=1.0),
+    "slstm": Recipe(model="slstm", v_th=0.1),
+    "ltc": Recipe(model="ltc", v_th=0.1, width=0.5),
+}
+"""One budget for all: updates, batches and learning rates of Recipe; threshold and surrogate are each model's own."""
+
+PAPER_REGRESSION_X1000 = {
+    "aslstm": (0.31, 0.30, 0.31),
+    "slstm": (0.86, 0.84, 0.87),
+    "ltc": (3.16, 3.67, 3.92),
+    "aslstm-wo": None,  # "failed"
+}
+"""Table I, three sequences."""
+
+PAPER_FORECAST = {
+    "aslstm": (0.02, 0.07, 0.11),
+    "slstm": (0.50, 0.88, 0.95),
+    "ltc": (0.53, 0.86, 1.04),
+    "aslstm-wo": None,
+}
+"""Table II, three sequences."""
+
+QUICK = {"updates": 60, "fine_updates": 10}
+
+Progress = Callable[[str, int, int, int, float], None]
+"""model, seed, update, updates, mean square error."""
+
+
+class Run(NamedTuple):
+    """One model trained from one seed."""
+
+    model: str
+    seed: int
+    recipe: Recipe
+    trained: Trained
+    answers: Array  # (1999, VALIDATION)
+    figures: dict[str, Any]
+
+
+def reproduce(
+    models: Sequence[str], seeds: Sequence[int], *, quick: bool = False, progress: Progress | None = None
+) -> list[Run]:
+    """Train and evaluate every model from every seed.
+
+    Args:
+        models: keys of RECIPES.
+        seeds: of weights and batches.
+        quick: a few updates only, to see that everything runs.
+        progress: called after each update.
+
+    Raises:
+        InvalidField: a model is unknown. MissingExtra: scipy is not installed.
+    """
+    if importlib.util.find_spec("scipy") is None:
+        raise MissingExtra("scipy")
+    for model in models:
+        if model not in RECIPES:
+            raise InvalidField("reproduce sine", "models", model, f"known are {', '.join(RECIPES)}")
+    runs: list[Run] = []
+    for model in models:
+        recipe = RECIPES[model].model_copy(update=QUICK) if quick else RECIPES[model]
+        runs.extend(_run(model, seed, recipe, progress) for seed in seeds)
+    return runs
+
+
+def _run(model: str, seed: int, recipe: Recipe, progress: Progress | None) -> Run:
+    updates = recipe.updates + recipe.fine_updates
+
+    def report(update: int, mse: float) -> None:
+        if progress is not None:
+            progress(model, seed, update + 1, updates, mse)
+
+    trained = train(recipe, seed, report)
+    result, answers = evaluate(trained.network)
+    thresholds = np.concatenate([layer.v_th for layer in trained.network.weights[:2]])
+    figures = {
+        "model": model,
+        "seed": seed,
+        "regression_rmse_x1000": result.regression_rmse_x1000,
+        "regression_rmse_x1000_from_100": result.regression_rmse_x1000_from_100,
+        "forecast_rmse": result.forecast_rmse,
+        "spike_rate": result.spike_rate,
+        "v_th": sorted({round(float(value), 4) for value in thresholds}),
+        "updates": trained.updates,
+        "skipped_updates": trained.skipped_updates,
+        "cpu_s": round(trained.cpu_s, 1),
+        "parameters": int(trained.network.learned.sum()),
+    }
+    return Run(model, seed, recipe, trained, answers, figures)
+
+
+def save(runs: list[Run], out: Path, *, command: str, commit: str) -> list[Path]:
+    """Write figures as JSON, the two tables, the pictures and the trained networks.
+
+    Args:
+        runs: of reproduce.
+        out: folder, made where it is missing.
+        command: that made them.
+        commit: of the code.
+
+    Raises:
+        InvalidField: something can not be written. MissingExtra: matplotlib is not installed.
+    """
+    told = [run.figures | {"command": command, "commit": commit} for run in runs]
+    files = [save_text(json.dumps(told, indent=1) + "\n", out / "sine.json")]
+    for number, rows in tables(runs).items():
+        files.append(save_text(json.dumps(rows, indent=1) + "\n", out / f"table{number}.json"))
+        files.append(save_text(markdown(rows, number), out / f"table{number}.md"))
+    files += save_figure(draw_regression(runs), out / "regression")
+    files += save_figure(draw_spikes(runs), out / "spikes")
+    for run in runs:
+        file = out / f"{run.model}-{run.seed}.safetensors"
+        header = {"recipe": run.recipe.model_dump_json(), "seed": str(run.seed), "command": command, "commit": commit}
+        safetensors.numpy.save_file({"theta": run.trained.network.theta}, file, header)
+        files.append(file)
+    return files
+
+
+def tables(runs: list[Run]) -> dict[int, list[dict[str, Any]]]:
+    """Rows of Table I and Table II."""
+    return {
+        1: table(runs, "regression_rmse_x1000_from_100", PAPER_REGRESSION_X1000),
+        2: table(runs, "forecast_rmse", PAPER_FORECAST),
+    }
+
+
+def table(runs: list[Run], key: str, paper: dict[str, Any]) -> list[dict[str, Any]]:
+    """One row per model: the median over seeds of each sequence's figure, beside the paper's."""
+    rows = []
+    for model in dict.fromkeys(run.model for run in runs):
+        own = [run.figures for run in runs if run.model == model]
+        rows.append(
+            {
+                "model": model,
+                "sequences": [statistics.median(one[key][row] for one in own) for row in range(VALIDATION)],
+                "all_steps": [
+                    statistics.median(one["regression_rmse_x1000"][row] for one in own) for row in range(VALIDATION)
+                ]
+                if key.startswith("regression")
+                else None,
+                "paper": paper.get(model.removesuffix("-spiking")),
+                "spike_rate": [statistics.median(one["spike_rate"][layer] for one in own) for layer in range(2)],
+                "v_th": own[0]["v_th"],
+                "seeds": len(own),
+            }
+        )
+    return rows
+
+
+def markdown(rows: list[dict[str, Any]], number: int) -> str:
+    """A table as Markdown."""
+    what = f"Table {'I' * number}: " + (
+        f"regression, RMSE x 1000, steps {SKIP} to 998 (in brackets: all steps)" if number == 1 else "forecast, RMSE"
+    )
+    lines = [
+        f"{what}; sequences 1 / 2 / 3, median of {rows[0]['seeds']} seeds" if rows else what,
+        "",
+        "| model | measured | paper | spike rate, layer 1 / 2 | V_th |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    for row in rows:
+        measured = _joined(row["sequences"])
+        if row["all_steps"]:
+            measured += f" ({_joined(row['all_steps'])})"
+        paper = _joined(row["paper"]) if row["paper"] else "failed"
+        rates = " / ".join(f"{100 * rate:.2g} %" for rate in row["spike_rate"])
+        thresholds = ", ".join(f"{value:g}" for value in row["v_th"][:4]) + (", ..." if len(row["v_th"]) > 4 else "")
+        lines.append(f"| {row['model']} | {measured} | {paper} | {rates} | {thresholds} |")
+    return "\n".join(lines) + "\n"
+
+
+def _joined(values: Sequence[float]) -> str:
+    return " / ".join(f"{value:.2g}" if math.isfinite(value) else "-" for value in values)
+
+
+def draw_regression(runs: list[Run]) -> "Figure":
+    """Truth and answers of the first validation wave over 2000 steps, and their error, one row per model."""
+    firsts = list({run.model: run for run in reversed(runs)}.values())[::-1]
+    figure = blank_figure(10, 1.9 * len(firsts) + 0.4)
+    axes = figure.subplots(len(firsts), 1, sharex=True, squeeze=False)[:, 0]
+    steps = np.arange(1, 2 * LENGTH)
+    for axis, run in zip(axes, firsts, strict=True):
+        truth = _truth()
+        axis.plot(steps, truth, color="0.6", linewidth=2.5, label="sin")
+        axis.plot(steps, np.clip(run.answers[:, 0], -1.6, 1.6), color="C3", linewidth=0.9, label=run.model)
+        axis.axvline(LENGTH, color="0.3", linestyle=":")
+        axis.set_ylim(-1.7, 1.7)
+        axis.set_ylabel(run.model)
+        forecast = run.figures["forecast_rmse"][0]
+        regression = run.figures["regression_rmse_x1000_from_100"][0]
+        axis.set_title(f"regression RMSE x 1000: {regression:.2g}      forecast RMSE: {forecast:.2g}", fontsize=9)
+    axes[-1].set_xlabel(f"step; from {LENGTH} on the network runs on its own answers")
+    return figure
+
+
+def _truth() -> Array:
+    """The first validation wave, continued; (1999)."""
+    row = waves()[0].astype(np.float64)
+    phase = math.atan2(row[0], (row[1] - row[0] * math.cos(0.05)) / math.sin(0.05))
+    truth: Array = np.sin(np.arange(1, 2 * LENGTH) / 20 + phase)
+    return truth
+
+
+def draw_spikes(runs: list[Run]) -> "Figure":
+    """Spikes of both layers over the first validation wave, one column per model."""
+    firsts = list({run.model: run for run in reversed(runs)}.values())[::-1]
+    figure = blank_figure(2.6 * len(firsts) + 1, 4.6)
+    axes = figure.subplots(2, len(firsts), sharex=True, squeeze=False)
+    x = np.zeros((2 * LENGTH - 1, 1), np.float32)
+    x[:LENGTH, 0] = waves()[0]
+    for column, run in enumerate(firsts):
+        network = run.trained.network
+        tape = network.run(x, network.initial_state(1), LENGTH)
+        for layer, taped in enumerate(tape[:2]):
+            axis = axes[layer, column]
+            steps, units = np.nonzero(taped.s[1:, 0])
+            axis.plot(steps, units, "|", color="C0", markersize=2)
+            axis.set_ylim(-1, taped.s.shape[2])
+            axis.set_title(f"{run.model}, layer {layer + 1}: {100 * taped.s[1:].mean():.2g} %", fontsize=9)
+            axis.axvline(LENGTH, color="0.3", linestyle=":")
+    axes[0, 0].set_ylabel("unit")
+    axes[1, 0].set_ylabel("unit")
+    return figure
