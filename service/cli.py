@@ -316,6 +316,7 @@ def reproduce_sine(args: argparse.Namespace) -> int:
     from neurove_core.experiments import sine_report
 
     models, seeds = args.models.split(","), range(args.seed, args.seed + args.seeds)
+    command, commit = shlex.join(["neurove", *sys.argv[1:]]), _commit()
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
         tasks: dict[tuple[str, int], Any] = {}
@@ -326,13 +327,17 @@ def reproduce_sine(args: argparse.Namespace) -> int:
             rmse = f"{model} seed {seed}: update {update}, RMSE {mse**0.5:.2e}"
             bar.update(tasks[model, seed], completed=update, description=rmse)
 
-        runs = sine_report.reproduce(models, seeds, quick=args.quick, progress=progress)
-    command = shlex.join(["neurove", *sys.argv[1:]])
-    files = sine_report.save(runs, args.out, command=command, commit=_commit()) if args.out else []
-    if args.json:
-        print(json.dumps([run.figures for run in runs]))
-    else:
-        print("\n".join(sine_report.markdown(rows, number) for number, rows in sine_report.tables(runs).items()))
+        runs: list[sine_report.Run] = []
+        files: dict[Path, None] = {}
+        for run in sine_report.reproduce(models, seeds, quick=args.quick, progress=progress):
+            runs.append(run)
+            if args.out:
+                files |= dict.fromkeys(sine_report.save_run(runs, args.out, command=command, commit=commit))
+    if args.out:
+        files |= dict.fromkeys(sine_report.save(runs, args.out))
+    figures = [run.figures for run in runs]
+    tables = sine_report.tables(figures)
+    print(json.dumps(figures) if args.json else "\n".join(sine_report.markdown(tables[n], n) for n in tables))
     for file in files:
         print(f"wrote {file}", file=sys.stderr)
     return 0

@@ -4,7 +4,7 @@ import importlib.util
 import json
 import math
 import statistics
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 RECIPES = {
     "aslstm": Recipe(model="aslstm"),
-    "aslstm-spiking": Recipe(model="aslstm", low_v_th=0.2, low_units=3),
+    "aslstm-spiking": Recipe(model="aslstm", low_v_th=0.2, low_units=8, alpha=0.1),
     "aslstm-wo": Recipe(model="aslstm-wo", v_th=0.3, width=1.0),
     "slstm": Recipe(model="slstm", v_th=0.1),
     "ltc": Recipe(model="ltc", v_th=0.1, width=0.5),
@@ -63,8 +63,8 @@ class Run(NamedTuple):
 
 def reproduce(
     models: Sequence[str], seeds: Sequence[int], *, quick: bool = False, progress: Progress | None = None
-) -> list[Run]:
-    """Train and evaluate every model from every seed.
+) -> Iterator[Run]:
+    """Train and evaluate every model from every seed, one after the other.
 
     Args:
         models: keys of RECIPES.
@@ -80,11 +80,10 @@ def reproduce(
     for model in models:
         if model not in RECIPES:
             raise InvalidField("reproduce sine", "models", model, f"known are {', '.join(RECIPES)}")
-    runs: list[Run] = []
     for model in models:
         recipe = RECIPES[model].model_copy(update=QUICK) if quick else RECIPES[model]
-        runs.extend(_run(model, seed, recipe, progress) for seed in seeds)
-    return runs
+        for seed in seeds:
+            yield _run(model, seed, recipe, progress)
 
 
 def _run(model: str, seed: int, recipe: Recipe, progress: Progress | None) -> Run:
@@ -113,46 +112,58 @@ def _run(model: str, seed: int, recipe: Recipe, progress: Progress | None) -> Ru
     return Run(model, seed, recipe, trained, answers, figures)
 
 
-def save(runs: list[Run], out: Path, *, command: str, commit: str) -> list[Path]:
-    """Write figures as JSON, the two tables, the pictures and the trained networks.
+def save_run(runs: list[Run], out: Path, *, command: str, commit: str) -> list[Path]:
+    """Write the newest run's network and the figures of all so far, so that a stopped command loses nothing.
 
     Args:
-        runs: of reproduce.
+        runs: done so far.
         out: folder, made where it is missing.
         command: that made them.
         commit: of the code.
 
     Raises:
-        InvalidField: something can not be written. MissingExtra: matplotlib is not installed.
+        InvalidField: a file can not be written.
     """
     told = [run.figures | {"command": command, "commit": commit} for run in runs]
-    files = [save_text(json.dumps(told, indent=1) + "\n", out / "sine.json")]
-    for number, rows in tables(runs).items():
+    figures = save_text(json.dumps(told, indent=1) + "\n", out / "sine.json")
+    run = runs[-1]
+    file = out / f"{run.model}-{run.seed}.safetensors"
+    header = {"recipe": run.recipe.model_dump_json(), "seed": str(run.seed), "command": command, "commit": commit}
+    safetensors.numpy.save_file({"theta": run.trained.network.theta}, file, header)
+    return [figures, file]
+
+
+def save(runs: list[Run], out: Path) -> list[Path]:
+    """Write the two tables and the pictures.
+
+    Args:
+        runs: all of them.
+        out: folder, made where it is missing.
+
+    Raises:
+        InvalidField: a file can not be written. MissingExtra: matplotlib is not installed.
+    """
+    files = []
+    for number, rows in tables([run.figures for run in runs]).items():
         files.append(save_text(json.dumps(rows, indent=1) + "\n", out / f"table{number}.json"))
         files.append(save_text(markdown(rows, number), out / f"table{number}.md"))
     files += save_figure(draw_regression(runs), out / "regression")
-    files += save_figure(draw_spikes(runs), out / "spikes")
-    for run in runs:
-        file = out / f"{run.model}-{run.seed}.safetensors"
-        header = {"recipe": run.recipe.model_dump_json(), "seed": str(run.seed), "command": command, "commit": commit}
-        safetensors.numpy.save_file({"theta": run.trained.network.theta}, file, header)
-        files.append(file)
-    return files
+    return files + save_figure(draw_spikes(runs), out / "spikes")
 
 
-def tables(runs: list[Run]) -> dict[int, list[dict[str, Any]]]:
-    """Rows of Table I and Table II."""
+def tables(figures: list[dict[str, Any]]) -> dict[int, list[dict[str, Any]]]:
+    """Rows of Table I and Table II, from the figures of some runs."""
     return {
-        1: table(runs, "regression_rmse_x1000_from_100", PAPER_REGRESSION_X1000),
-        2: table(runs, "forecast_rmse", PAPER_FORECAST),
+        1: table(figures, "regression_rmse_x1000_from_100", PAPER_REGRESSION_X1000),
+        2: table(figures, "forecast_rmse", PAPER_FORECAST),
     }
 
 
-def table(runs: list[Run], key: str, paper: dict[str, Any]) -> list[dict[str, Any]]:
+def table(figures: list[dict[str, Any]], key: str, paper: dict[str, Any]) -> list[dict[str, Any]]:
     """One row per model: the median over seeds of each sequence's figure, beside the paper's."""
     rows = []
-    for model in dict.fromkeys(run.model for run in runs):
-        own = [run.figures for run in runs if run.model == model]
+    for model in dict.fromkeys(one["model"] for one in figures):
+        own = [one for one in figures if one["model"] == model]
         rows.append(
             {
                 "model": model,

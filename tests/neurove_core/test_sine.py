@@ -60,22 +60,33 @@ def test_a_network_that_diverges_is_reported_as_a_number():
 
 def test_an_unknown_model_is_named():
     with pytest.raises(InvalidField, match="models='gru': known are aslstm"):
-        sine_report.reproduce(["gru"], [0])
+        next(sine_report.reproduce(["gru"], [0]))
 
 
 def test_quick_reproduces_the_committed_figures(tmp_path):
     committed = json.loads(QUICK.read_text())
-    runs = sine_report.reproduce([run["model"] for run in committed], [0], quick=True)
+    runs = []
+    for run in sine_report.reproduce([run["model"] for run in committed], [0], quick=True):
+        runs.append(run)
+        sine_report.save_run(runs, tmp_path, command="a test", commit="none")
     for run, wanted in zip(runs, committed, strict=True):
         figures = run.figures
         for key in ("regression_rmse_x1000_from_100", "regression_rmse_x1000"):
             np.testing.assert_allclose(figures[key], wanted[key], rtol=0.1, err_msg=run.model)
         assert (figures["updates"], figures["parameters"]) == (wanted["updates"], wanted["parameters"])
-    files = sine_report.save(runs, tmp_path, command="a test", commit="none")
-    assert {file.name for file in files} >= {"sine.json", "table1.md", "table2.md", "regression.png", "spikes.svg"}
+    sine_report.save(runs, tmp_path)
+    written = {file.name for file in tmp_path.iterdir()}
+    assert written >= {"table1.md", "table2.json", "regression.png", "spikes.svg", "aslstm-0.safetensors"}
     table = (tmp_path / "table1.md").read_text()
     assert "| ltc |" in table
     assert "3.2 / 3.7 / 3.9" in table  # the paper's, beside ours
     again = json.loads((tmp_path / "sine.json").read_text())
     assert [run["model"] for run in again] == list(sine_report.RECIPES)
     assert all({"v_th", "spike_rate", "cpu_s", "command", "commit"} <= run.keys() for run in again)
+
+
+def test_the_pages_tables_are_those_of_the_committed_results():
+    figures = json.loads((QUICK.parent / "sine.json").read_text())
+    page = (QUICK.parents[1] / "README.md").read_text()
+    for number, rows in sine_report.tables(figures).items():
+        assert sine_report.markdown(rows, number) in page
