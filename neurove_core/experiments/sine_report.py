@@ -187,8 +187,9 @@ def markdown(rows: list[dict[str, Any]], number: int) -> str:
     what = f"Table {'I' * number}: " + (
         f"regression, RMSE x 1000, steps {SKIP} to 998 (in brackets: all steps)" if number == 1 else "forecast, RMSE"
     )
+    seeds = rows[0]["seeds"] if rows else 0
     lines = [
-        f"{what}; sequences 1 / 2 / 3, median of {rows[0]['seeds']} seeds" if rows else what,
+        f"{what}; sequences 1 / 2 / 3, {f'median of {seeds} seeds' if seeds > 1 else 'one seed'}",
         "",
         "| model | measured | paper | spike rate, layer 1 / 2 | V_th |",
         "| --- | --- | --- | --- | --- |",
@@ -197,7 +198,7 @@ def markdown(rows: list[dict[str, Any]], number: int) -> str:
         measured = _joined(row["sequences"])
         if row["all_steps"]:
             measured += f" ({_joined(row['all_steps'])})"
-        paper = _joined(row["paper"]) if row["paper"] else "failed"
+        paper = " / ".join(f"{value:g}" for value in row["paper"]) if row["paper"] else "failed"
         rates = " / ".join(f"{100 * rate:.2g} %" for rate in row["spike_rate"])
         thresholds = ", ".join(f"{value:g}" for value in row["v_th"][:4]) + (", ..." if len(row["v_th"]) > 4 else "")
         lines.append(f"| {row['model']} | {measured} | {paper} | {rates} | {thresholds} |")
