@@ -125,3 +125,14 @@ def test_reproduce_firing_for_machines_is_one_json(run, monkeypatch):
 def test_reproduce_firing_refuses_a_negative_seed(run):
     code, out, err = run("reproduce", "firing", "--seed", "-4")
     assert (code, out, err) == (2, "", "neurove: reproduce firing: seed=-4: must be at least 0\n")
+
+
+def test_reproduce_sine_prints_both_tables_and_keeps_what_is_done(run, tmp_path):
+    pytest.importorskip("scipy")
+    pytest.importorskip("matplotlib")
+    code, out, err = run("reproduce", "sine", "--models", "ltc", "--quick", "--out", str(tmp_path))
+    assert code == 0
+    assert "Table I: " in out
+    assert "Table II: " in out
+    assert {f"wrote {file}" for file in tmp_path.iterdir()} == set(err.splitlines())
+    assert json.loads((tmp_path / "sine.json").read_text())[0]["commit"]
