@@ -34,7 +34,7 @@ $(VENV)/python:
 	@touch $@
 
 $(VENV)/installed: $(VENV)/python pyproject.toml constraints.txt
-	@$(PIP) -e .
+	@$(PIP) -e '.[experiments,recordings]'
 	@touch $@
 
 $(VENV)/installed-dev: $(VENV)/installed

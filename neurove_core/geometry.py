@@ -1,6 +1,7 @@
-"""Camera models and the canonical camera's look-up table: any sensor, one network."""
+"""Camera models and the canonical camera's look-up table: any sensor, one network. Poses and twists of a camera."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,22 @@ from protocol.errors import InvalidField
 
 OUTSIDE = -1
 """Entry of a look-up table for a pixel that looks past the canonical camera's field of view."""
+
+
+class Poses(NamedTuple):
+    """Where a camera was, ordered by time: its optical frame (x right, y down, z forward) in a world."""
+
+    t: NDArray[np.int64]  # (N,) sensor clock [us]
+    position_m: NDArray[np.float64]  # (N, 3) of the camera in the world
+    orientation: NDArray[np.float64]  # (N, 4) unit quaternion x y z w: turns camera axes into the world's
+
+
+class Twists(NamedTuple):
+    """How a camera moved, ordered by time, in its own optical frame (x right, y down, z forward)."""
+
+    t: NDArray[np.int64]  # (N,) sensor clock [us]
+    twist: NDArray[np.float64]  # (N, 6) vx vy vz [m/s] wx wy wz [rad/s]; nan where it is not known
+
 
 _ITERATIONS = 20
 _TOLERANCE = 1e-7

@@ -16,7 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neurove_core.experiments import blank_figure, save_figure, save_text
+from neurove_core.experiments import save_text
+from neurove_core.figures import blank_figure, save_figure
 from neurove_core.neurons import (
     LIF,
     ALIFParams,

@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import safetensors.numpy
 
-from neurove_core.experiments import MissingExtra, blank_figure, save_figure, save_text
+from neurove_core.experiments import save_text
 from neurove_core.experiments.sine import LENGTH, SKIP, VALIDATION, Recipe, Trained, evaluate, train, waves
+from neurove_core.extras import MissingExtra
+from neurove_core.figures import blank_figure, save_figure
 from neurove_core.recurrence import Array
 from protocol.errors import InvalidField
 

@@ -7,10 +7,21 @@ from neurove_core.io.ecd import EcdRecording
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
 from neurove_core.io.pattern import Pattern
 from neurove_core.io.prophesee import PropheseeRecording
-from neurove_core.io.recording import SUPPORTED, Recording
+from neurove_core.io.recording import SUPPORTED, EventsOnly, Frame, Imu, Recording, Triggers
 from protocol.events import Sensor
 
-__all__ = ["SUPPORTED", "BrokenRecording", "MissingGeometry", "Recording", "UnknownSource", "open_source"]
+__all__ = [
+    "SUPPORTED",
+    "BrokenRecording",
+    "EventsOnly",
+    "Frame",
+    "Imu",
+    "MissingGeometry",
+    "Recording",
+    "Triggers",
+    "UnknownSource",
+    "open_source",
+]
 
 
 def open_source(source: str, sensor: Sensor | None = None) -> Recording:

@@ -9,8 +9,7 @@ from typing import Any, BinaryIO, NamedTuple, Self, TypeVar
 import aedat
 
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
-from neurove_core.io.recording import SUPPORTED, in_chunks
-from protocol.camera import CameraInfo
+from neurove_core.io.recording import SUPPORTED, EventsOnly, in_chunks
 from protocol.errors import EventOutsideSensor, InvalidField, TimeBackwards
 from protocol.events import Events, Sensor, check_events
 
@@ -32,7 +31,7 @@ class _Packet(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Aedat4Recording:
+class Aedat4Recording(EventsOnly):
     """An .aedat4 file; see `Recording`. Of several event streams it is the one with the lowest number."""
 
     path: Path
@@ -71,10 +70,6 @@ class Aedat4Recording:
             raise MissingGeometry(path) from None
         name = path.name if len(ids) == 1 else f"{path.name} (stream {ids[0]}, the first of {len(ids)} event streams)"
         return cls(path, name, sensor, ids[0])
-
-    def camera(self, stream: str) -> CameraInfo | None:
-        """None: an .aedat4 file does not know its lens."""
-        return None
 
     def chunks(self) -> Iterator[Events]:
         """All events from the beginning; see `Recording`. Times are unix time [us]; other streams are skipped.

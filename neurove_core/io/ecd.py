@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 
 from neurove_core.io.errors import BrokenRecording
-from neurove_core.io.recording import BLOCK_BYTES, in_chunks
+from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, in_chunks
 from protocol.camera import CameraInfo
 from protocol.errors import EventOutsideSensor, InvalidField, TimeBackwards
 from protocol.events import Events, Sensor, check_events
@@ -24,7 +24,7 @@ _CALIB = "nine numbers are expected: fx fy cx cy k1 k2 p1 p2 k3, focal lengths a
 
 
 @dataclass(frozen=True, slots=True)
-class EcdRecording:
+class EcdRecording(EventsOnly):
     """A text file of events, with the calib.txt beside it where there is one; see `Recording`."""
 
     path: Path

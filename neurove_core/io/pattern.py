@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.io.errors import UnknownSource
-from neurove_core.io.recording import SUPPORTED, in_chunks
+from neurove_core.io.recording import SUPPORTED, EventsOnly, in_chunks
 from protocol.camera import CameraInfo
 from protocol.errors import InvalidField
 from protocol.events import Events, Sensor
@@ -27,7 +27,7 @@ SWING_S = 7.0  # period of the velocity; x and y a quarter of it apart, so that 
 
 
 @dataclass(frozen=True, slots=True)
-class Pattern:
+class Pattern(EventsOnly):
     """A smooth random texture that slides over the sensor for ever, now this way, now that; see `Recording`."""
 
     seed: int = 0

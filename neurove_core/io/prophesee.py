@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from neurove_core import kernels
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
-from neurove_core.io.recording import BLOCK_BYTES, CHUNK_EVENTS, SUPPORTED
-from protocol.camera import CameraInfo
+from neurove_core.io.recording import BLOCK_BYTES, CHUNK_EVENTS, SUPPORTED, EventsOnly
 from protocol.errors import InvalidField
 from protocol.events import Events, Sensor
 
@@ -81,7 +80,7 @@ def parse_header(path: Path, head: bytes) -> Header:
 
 
 @dataclass(frozen=True, slots=True)
-class PropheseeRecording:
+class PropheseeRecording(EventsOnly):
     """A .raw file of EVT2 or EVT3 words; see `Recording`."""
 
     path: Path
@@ -117,10 +116,6 @@ class PropheseeRecording:
     def name(self) -> str:
         """The file's name."""
         return self.path.name
-
-    def camera(self, stream: str) -> CameraInfo | None:
-        """None: a .raw file does not know its lens."""
-        return None
 
     def chunks(self) -> Iterator[Events]:
         """All events from the beginning; see `Recording`. Triggers and monitoring words are skipped.

@@ -1,8 +1,13 @@
 """Recording: what every source of events looks like to its reader."""
 
+from abc import abstractmethod
 from collections.abc import Iterator
-from typing import Final, Protocol
+from typing import Final, NamedTuple, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
+from neurove_core.geometry import Poses, Twists
 from protocol.camera import CameraInfo
 from protocol.events import Events, Sensor
 
@@ -21,8 +26,31 @@ SUPPORTED: Final = (
 """The sources that `open_source` knows."""
 
 
+class Imu(NamedTuple):
+    """Samples of an inertial unit, ordered by time, in SI."""
+
+    t: NDArray[np.int64]  # (N,) sensor clock [us]
+    accel_m_s2: NDArray[np.float64]  # (N, 3) specific force
+    gyro_rad_s: NDArray[np.float64]  # (N, 3)
+
+
+class Triggers(NamedTuple):
+    """Edges on a camera's trigger input, ordered by time."""
+
+    t: NDArray[np.int64]  # (N,) sensor clock [us]
+    channel: NDArray[np.uint8]  # (N,) which input
+    level: NDArray[np.uint8]  # (N,) 1 rising, 0 falling
+
+
+class Frame(NamedTuple):
+    """An image that the camera took beside its events."""
+
+    t_us: int  # sensor clock, start of exposure where the format tells it
+    image: NDArray[np.uint8]  # (H, W), or (H, W, 3) as RGB
+
+
 class Recording(Protocol):
-    """Events of one camera, in order, as often as one likes."""
+    """Events of one camera, in order, as often as one likes, and what was recorded beside them."""
 
     @property
     def name(self) -> str:
@@ -35,6 +63,10 @@ class Recording(Protocol):
     @property
     def endless(self) -> bool:
         """Whether `chunks` never ends."""
+
+    @property
+    def streams(self) -> tuple[str, ...]:
+        """What it holds, of events, imu, frames, triggers, poses and twists."""
 
     def camera(self, stream: str) -> CameraInfo | None:
         """The lens as it is to be told for this stream, or None where the recording does not know it."""
@@ -49,8 +81,81 @@ class Recording(Protocol):
             BrokenRecording: after everything whole was handed out.
         """
 
+    def since(self, t_us: int) -> Iterator[Events]:
+        """As `chunks`, from the first event at or after this time on; where the format allows, without reading on."""
+
+    def imu(self) -> Iterator[Imu]:
+        """All samples of the inertial unit, some at a time, none of them empty; in SI.
+
+        In the camera's optical frame (x right, y down, z forward) where the format tells how the unit is mounted, else
+        in its own; the reader's docstring says which.
+        """
+
+    def triggers(self) -> Iterator[Triggers]:
+        """All trigger edges, some at a time, none of them empty."""
+
+    def frames(self) -> Iterator[Frame]:
+        """All images, ordered by time."""
+
+    def poses(self) -> Poses | None:
+        """Where the camera truly was, or None where that was not recorded."""
+
+    def twists(self) -> Twists | None:
+        """How the camera truly moved: recorded as such, or from the poses; None where neither was recorded."""
+
+
+class EventsOnly:
+    """What a recording answers that holds events alone; the readers of richer formats override what theirs has."""
+
+    __slots__ = ()
+
+    @property
+    def streams(self) -> tuple[str, ...]:
+        """Events, and nothing else."""
+        return ("events",)
+
+    @abstractmethod
+    def chunks(self) -> Iterator[Events]:
+        """See `Recording`."""
+
+    def camera(self, stream: str) -> CameraInfo | None:
+        """None: the format does not tell the lens."""
+        return None
+
+    def since(self, t_us: int) -> Iterator[Events]:
+        """As `chunks`, from this time on; what is earlier is read and left out."""
+        return later(self.chunks(), t_us)
+
+    def imu(self) -> Iterator[Imu]:
+        """Nothing."""
+        return iter(())
+
+    def triggers(self) -> Iterator[Triggers]:
+        """Nothing."""
+        return iter(())
+
+    def frames(self) -> Iterator[Frame]:
+        """Nothing."""
+        return iter(())
+
+    def poses(self) -> Poses | None:
+        """None."""
+        return None
+
+    def twists(self) -> Twists | None:
+        """None."""
+        return None
+
 
 def in_chunks(events: Events) -> Iterator[Events]:
     """The same events in spans of at most CHUNK_EVENTS; no span where there are none."""
     for first in range(0, events.n, CHUNK_EVENTS):
         yield events.span(first, min(first + CHUNK_EVENTS, events.n))
+
+
+def later(chunks: Iterator[Events], t_us: int) -> Iterator[Events]:
+    """The same chunks without the events before this time."""
+    for chunk in chunks:
+        first = int(chunk.t.searchsorted(t_us))
+        if first < chunk.n:
+            yield chunk.span(first, chunk.n)

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from neurove_core import LIF
-from neurove_core.experiments import MissingExtra, firing
+from neurove_core.experiments import firing
+from neurove_core.extras import MissingExtra
 from protocol.errors import InvalidField
 
 
