@@ -5,6 +5,10 @@ from pathlib import Path
 from neurove_core.io.aedat4 import Aedat4Recording
 from neurove_core.io.ecd import EcdRecording
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
+from neurove_core.io.mcap_file import McapFile
+from neurove_core.io.mcap_layout import PROFILE
+from neurove_core.io.mcap_recording import McapRecording, RecordedPacket
+from neurove_core.io.mcap_write import PacketWriter, write_mcap
 from neurove_core.io.pattern import Pattern
 from neurove_core.io.prophesee import PropheseeRecording
 from neurove_core.io.recording import SUPPORTED, EventsOnly, Frame, Imu, Recording, Triggers
@@ -17,11 +21,15 @@ __all__ = [
     "EventsOnly",
     "Frame",
     "Imu",
+    "McapRecording",
     "MissingGeometry",
+    "PacketWriter",
+    "RecordedPacket",
     "Recording",
     "Triggers",
     "UnknownSource",
     "open_source",
+    "write_mcap",
 ]
 
 
@@ -65,6 +73,8 @@ def _open_path(path: Path, sensor: Sensor | None, topic: str | None) -> Recordin
             return Aedat4Recording.open(path, sensor)
         case ".raw":
             return PropheseeRecording.open(path, sensor)
+        case ".mcap" if McapFile.open(path).profile == PROFILE:
+            return McapRecording.open(path, sensor, topic)
         case ".bag" | ".db3" | ".mcap":
             return RosbagRecording.open(path, sensor, topic)
         case ".txt":
