@@ -63,11 +63,11 @@ def _open_path(path: Path, sensor: Sensor | None, topic: str | None) -> Recordin
     if not path.exists():
         raise UnknownSource(path, SUPPORTED, "no such file or folder")
     if path.is_dir():
+        if (path / "events.txt").is_file():
+            return EcdRecording.open(path / "events.txt", path.resolve().name, sensor)
         if _is_bag(path):
             return RosbagRecording.open(path, sensor, topic)
-        if not (path / "events.txt").is_file():
-            raise UnknownSource(path, SUPPORTED, "the folder has no events.txt")
-        return EcdRecording.open(path / "events.txt", path.resolve().name, sensor)
+        raise UnknownSource(path, SUPPORTED, "the folder has no events.txt")
     match path.suffix.lower():
         case ".aedat4":
             return Aedat4Recording.open(path, sensor)
