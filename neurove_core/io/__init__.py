@@ -6,6 +6,7 @@ from neurove_core.io.aedat4 import Aedat4Recording
 from neurove_core.io.ecd import EcdRecording
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
 from neurove_core.io.pattern import Pattern
+from neurove_core.io.poses import read_poses
 from neurove_core.io.prophesee import PropheseeRecording
 from neurove_core.io.recording import SUPPORTED, EventsOnly, Frame, Imu, Recording, Triggers
 from protocol.events import Sensor
@@ -21,6 +22,7 @@ __all__ = [
     "Triggers",
     "UnknownSource",
     "open_source",
+    "read_poses",
 ]
 
 
