@@ -1,7 +1,8 @@
 """DSEC's events.h5 (Gehrig 2021): a reader, and a writer for any recording.
 
 Layout: `events` with `p`, `x`, `y`, `t` [us], `ms_to_idx` (the first event at or after each millisecond of t) and
-`t_offset` [us], to be added to t; it may be missing. The pixel array is not in the file: DSEC's is 640x480.
+`t_offset` [us], to be added to t; it may be missing. The pixel array is not in the file: DSEC's is 640x480. Other data
+sets use the layout too (TUM-VIE, at 1280x720).
 
 What `write_dsec` adds, and other readers of DSEC pass over: the attributes `width` and `height` [px] of `events`; and
 where the source has them, `imu` (`t`, `accel` (N, 3) [m/s2], `gyro` (N, 3) [rad/s]), `poses` (`t`, `position` (N, 3)
@@ -41,6 +42,7 @@ class DsecRecording(TableRecording):
 
     offset_us: int = 0
     lens: CameraInfo | None = None
+    assumed: bool = False  # nobody told the sensor
 
     @classmethod
     def open(cls, path: Path, sensor: Sensor | None = None) -> Self:
@@ -64,7 +66,8 @@ class DsecRecording(TableRecording):
             sensor = sensor or (Sensor(int(stored["width"]), int(stored["height"])) if "width" in stored else None)
         except (KeyError, TypeError, ValueError) as error:
             raise BrokenRecording(path, "attributes of events", f"they are no sensor: {error}") from None
-        return cls(path, path.name, sensor or DSEC_SENSOR, "events", tuple(held), offset_us=offset_us, lens=lens)
+        which, assumed = sensor or DSEC_SENSOR, sensor is None
+        return cls(path, path.name, which, "events", tuple(held), offset_us=offset_us, lens=lens, assumed=assumed)
 
     def camera(self, stream: str) -> CameraInfo | None:
         """The lens that `write_dsec` stored; None in DSEC's own files, whose calibration is not in them."""
@@ -75,7 +78,8 @@ class DsecRecording(TableRecording):
     def event_table(self, file: Any) -> EventTable:
         """The columns t, x, y, p."""
         columns = tuple(dataset(self.path, file, f"events/{name}") for name in "txyp")
-        return EventTable("events", columns, _as_they_are, self.offset_us)
+        note = ", which is DSEC's, for the file does not tell its own: give --sensor WIDTHxHEIGHT"
+        return EventTable("events", columns, _as_they_are, self.offset_us, note if self.assumed else "")
 
     def since(self, t_us: int) -> Iterator[Events]:
         """As `chunks`, from this time on, by the file's index of milliseconds."""

@@ -137,7 +137,8 @@ def _growing(group: Any, name: str, dtype: Any, *tail: int) -> Any:
     """An empty data set of shape (0, *tail) that can grow."""
     import hdf5plugin  # late, as `hdf5.library` has it
 
-    packing = hdf5plugin.Blosc(cname="zstd", clevel=3, shuffle=hdf5plugin.Blosc.SHUFFLE)
+    # measured on evt3.raw: 10 Mev/s and 3.5 bytes per event; level 3 5 and 3.4, gzip 2.3 and 3.3, lzf 4.4 and 4.4
+    packing = hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.SHUFFLE)
     return group.create_dataset(
         name, (0, *tail), dtype, maxshape=(None, *tail), chunks=(_ROWS, *tail), compression=packing
     )

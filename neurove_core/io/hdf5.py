@@ -80,6 +80,7 @@ def dataset(path: Path, file: Any, name: str, *tail: int) -> Any:
     try:
         found = file[name]
         shape, kind = tuple(found.shape), found.dtype.kind
+        missing = found.size and not found.is_virtual and not found.id.get_storage_size()
         chunk_bytes = int(np.prod(found.chunks or (0,), dtype=np.float64)) * found.dtype.itemsize
     except (*FAULTS, AttributeError) as error:
         raise BrokenRecording(path, name, f"it can not be read: {error}") from None
@@ -89,6 +90,8 @@ def dataset(path: Path, file: Any, name: str, *tail: int) -> Any:
     if chunk_bytes > MAX_CHUNK_BYTES:
         why = f"it is stored in chunks of {chunk_bytes} bytes; at most {MAX_CHUNK_BYTES} are read at once"
         raise BrokenRecording(path, name, why)
+    if missing:  # HDF5 would hand out zeros for as many rows as the header claims
+        raise BrokenRecording(path, name, f"its {shape[0]} rows were never written")
     return found
 
 

@@ -25,6 +25,7 @@ class EventTable(NamedTuple):
     columns: tuple[Any, ...]  # data sets, one row per event
     txyp: Callable[..., tuple[Column, Column, Column, Column]]  # rows of the columns -> t [us], x, y, p; of any type
     offset_us: int = 0  # to add to the times
+    note: str = ""  # on the sensor, told with the first event that lies outside it
 
     @property
     def n(self) -> int:
@@ -52,7 +53,7 @@ def event_chunks(path: Path, table: EventTable, sensor: Sensor, first: int = 0) 
     for at in range(first, n, CHUNK_EVENTS):
         rows, unread = read_rows(table.columns, at, min(at + CHUNK_EVENTS, n))
         with np.errstate(all="ignore"):  # of nan, inf and what overflows, which are told below
-            events, bad = whole_events(*table.txyp(*rows), table.offset_us, sensor, not_before_us)
+            events, bad = whole_events(table, rows, sensor, not_before_us)
         if events.n:
             not_before_us = int(events.t[-1])
             yield events
@@ -64,21 +65,21 @@ def event_chunks(path: Path, table: EventTable, sensor: Sensor, first: int = 0) 
 
 
 def whole_events(
-    t: Column, x: Column, y: Column, p: Column, offset_us: int, sensor: Sensor, not_before_us: int | None
+    table: EventTable, rows: list[Column], sensor: Sensor, not_before_us: int | None
 ) -> tuple[Events, str]:
     """The events before the first that is not good, and what is wrong with that one.
 
+    A polarity above 0 is ON; 0 or -1 is OFF.
+
     Args:
-        t: times [us], of any number type, like the others.
-        x: columns.
-        y: rows.
-        p: polarity, above 0 is ON; 0 or -1 is OFF.
-        offset_us: to add to the times.
+        table: where the rows are from.
+        rows: of its columns, of any number type.
         sensor: the pixel array.
         not_before_us: the time of the event before.
     """
+    t, x, y, p = table.txyp(*rows)
     in_time = (t > -_MAX_T_US) & (t < _MAX_T_US)
-    t_us = np.where(in_time, np.rint(t) if t.dtype.kind == "f" else t, 0).astype(np.int64) + offset_us
+    t_us = np.where(in_time, np.rint(t) if t.dtype.kind == "f" else t, 0).astype(np.int64) + table.offset_us
     inside = (x >= 0) & (x < sensor.width) & (y >= 0) & (y < sensor.height)
     before = np.concatenate([[t_us[0] if not_before_us is None else not_before_us], t_us[:-1]]) if t.size else t_us
     good = in_time & inside & ((p == 0) | (p == 1) | (p == -1)) & (t_us >= before)
@@ -89,7 +90,7 @@ def whole_events(
     if not in_time[whole]:
         return events, f"t={t[whole]:g} is no time"
     if not inside[whole]:
-        return events, f"an event at x={x[whole]:g} y={y[whole]:g} lies outside the sensor {sensor}"
+        return events, f"an event at x={x[whole]:g} y={y[whole]:g} lies outside the sensor {sensor}{table.note}"
     if t_us[whole] < before[whole]:
         return events, f"t={t_us[whole]} us comes after t={before[whole]} us: time runs backwards"
     return events, f"the polarity p={p[whole]:g} is neither 1 nor 0 nor -1"

@@ -51,7 +51,7 @@ def read_poses(path: Path) -> Poses:
         if path.suffix.lower() in (".h5", ".hdf5"):
             with hdf5.opened(path) as file:
                 return _hdf5_poses(path, file)
-        with path.open(encoding="utf-8", errors="backslashreplace") as text:
+        with path.open(encoding="utf-8-sig", errors="backslashreplace") as text:
             return _text_poses(path, text)
     except OSError as error:
         raise UnknownSource(path, SUPPORTED, error.strerror or str(error)) from None

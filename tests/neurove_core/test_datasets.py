@@ -248,6 +248,14 @@ def test_a_table_of_another_kind_is_told_by_its_name(tmp_path):
         read(open_source(str(tmp_path / "b.h5")))
 
 
+def test_rows_that_were_never_written_are_no_events(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name in "pxyt":
+            file.create_dataset(f"events/{name}", (1 << 60,), "u2", chunks=(1000,))
+    with pytest.raises(BrokenRecording, match="1152921504606846976 rows were never written"):
+        read(open_source(str(tmp_path / "a.h5")))
+
+
 def test_chunks_too_large_for_memory_are_refused_before_they_are_unpacked(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for name in "pxyt":
@@ -462,6 +470,17 @@ def test_dsec_is_640x480_and_its_offset_may_be_absent(tmp_path):
     assert recording.sensor == Sensor(640, 480)
     assert_same(read(recording), EVENTS)
     assert recording.camera("cam0") is None
+
+
+def test_a_file_in_dsecs_layout_of_a_larger_sensor_asks_for_it(tmp_path):
+    """TUM-VIE's are such files."""
+    events = make_events(100, seed=4, sensor=Sensor(1280, 720))
+    path = write_dsec_file(tmp_path / "events.h5", events)
+    _, error = read_broken(open_source(path))
+    assert error is not None
+    assert "lies outside the sensor 640x480, which is DSEC's" in error.message
+    assert "--sensor WIDTHxHEIGHT" in error.message
+    assert_same(read(open_source(path, Sensor(1280, 720))), events)
 
 
 def test_dsec_without_an_index_is_read_from_a_time_on_all_the_same(tmp_path):

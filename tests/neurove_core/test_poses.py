@@ -84,7 +84,7 @@ def test_times_are_seconds_or_whole_nanoseconds_by_rule(times, separator, want_u
 
 
 def test_comments_blank_lines_and_line_ends_are_passed_over(tmp_path):
-    text = f"# t x y z qx qy qz qw\r\n\r\n  1.0 1 2 3 {LINE}\r\n# between\n2.0 4 5 6 {LINE} # after\n\n"
+    text = f"\ufeff# t x y z qx qy qz qw\r\n\r\n  1.0 1 2 3 {LINE}\r\n# between\n2.0 4 5 6 {LINE} # after\n\n"
     got = read_poses(put(tmp_path, text))
     assert got.t.tolist() == [1_000_000, 2_000_000]
     assert got.position_m.tolist() == [[1, 2, 3], [4, 5, 6]]
