@@ -19,10 +19,13 @@ from neurove_core.evt import (
     VECTOR_EVENTS,
     Evt2State,
     Evt3State,
+    TriggerState,
     evt2_decode,
     evt2_reference,
+    evt2_triggers,
     evt3_decode,
     evt3_reference,
+    evt3_triggers,
 )
 from neurove_core.geometry import OUTSIDE as NO_CELL
 from protocol.events import Events
@@ -35,13 +38,16 @@ __all__ = [
     "VECTOR_EVENTS",
     "Evt2State",
     "Evt3State",
+    "TriggerState",
     "compiled",
     "count_events",
     "count_events_reference",
     "evt2_decode",
     "evt2_reference",
+    "evt2_triggers",
     "evt3_decode",
     "evt3_reference",
+    "evt3_triggers",
 ]
 
 
