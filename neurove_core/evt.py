@@ -18,6 +18,10 @@ STEP_BACK: Final = 10
 VECTOR_EVENTS: Final = 12
 """Most events that one word makes; `out` must have at least this much room."""
 
+EVT2_WORDS: Final = (0x0, 0x1, 0x8, 0xA, 0xE, 0xF)
+EVT3_WORDS: Final = (0x0, 0x2, 0x3, 0x4, 0x5, 0x6, 0x7, 0x8, 0xA, 0xE, 0xF)
+"""The known types of words, by their first four bits."""
+
 _ADDR_Y, _ADDR_X, _BASE_X, _VECT_12, _VECT_8, _TIME_LOW, _TIME_HIGH = 0, 2, 3, 4, 5, 6, 8
 _EVT3_SKIPPED = 1 << 0x7 | 1 << 0xA | 1 << 0xE | 1 << 0xF  # CONTINUED_4, EXT_TRIGGER, OTHERS, CONTINUED_12
 _EVT2_SKIPPED = (0xA, 0xE, 0xF)  # EXT_TRIGGER, OTHERS, CONTINUED
@@ -226,7 +230,7 @@ def evt2_reference(
 ) -> tuple[Evt2State, int, Events, int]:
     """The plain twin of `evt2_decode`, all words at once: state, words read, events, verdict."""
     kinds = words >> 28
-    known = np.isin(kinds, (0x0, 0x1, 0x8, 0xA, 0xE, 0xF))
+    known = np.isin(kinds, EVT2_WORDS)
     read, verdict = (words.size, OK) if known.all() else (int(np.argmin(known)), ILLEGAL)
 
     ticks = np.flatnonzero(kinds[:read] == 0x8)

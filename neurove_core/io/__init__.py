@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from neurove_core.io.aedat4 import Aedat4Recording
+from neurove_core.io.dat import DatRecording
 from neurove_core.io.ecd import EcdRecording
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
 from neurove_core.io.pattern import Pattern
@@ -61,6 +62,8 @@ def _open_path(path: Path, sensor: Sensor | None) -> Recording:
             return Aedat4Recording.open(path, sensor)
         case ".raw":
             return PropheseeRecording.open(path, sensor)
+        case ".dat":
+            return DatRecording.open(path, sensor)
         case ".txt":
             return EcdRecording.open(path, path.name, sensor)
         case suffix:

@@ -9,7 +9,7 @@ from typing import Any, BinaryIO, NamedTuple, Self, TypeVar
 import aedat
 
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
-from neurove_core.io.recording import SUPPORTED, EventsOnly, in_chunks
+from neurove_core.io.recording import SUPPORTED, EventsOnly, in_chunks, whole
 from protocol.errors import EventOutsideSensor, InvalidField, TimeBackwards
 from protocol.events import Events, Sensor, check_events
 
@@ -84,7 +84,7 @@ class Aedat4Recording(EventsOnly):
             try:
                 check_events(events, self.sensor, not_before_us)
             except (EventOutsideSensor, TimeBackwards) as error:
-                yield from in_chunks(_whole(events, self.sensor, not_before_us))
+                yield from in_chunks(whole(events, self.sensor, not_before_us))
                 raise BrokenRecording(self.path, f"byte {start}", f"in this packet, {error.message}") from None
             yield from in_chunks(events)
             not_before_us = int(events.t[-1]) if events.n else not_before_us
@@ -174,12 +174,3 @@ def _find(file: BinaryIO, at: int, size: int, stream: int) -> _Packet | None:
     while packet is not None and packet.stream != stream:
         packet = _packet(file, packet.stop, size)
     return packet
-
-
-def _whole(events: Events, sensor: Sensor, not_before_us: int | None) -> Events:
-    """The events before the first that is outside the sensor or out of order."""
-    good = (events.x < sensor.width) & (events.y < sensor.height)
-    good[1:] &= events.t[1:] >= events.t[:-1]
-    if not_before_us is not None:
-        good[0] &= events.t[0] >= not_before_us
-    return events.span(0, int(good.argmin()))

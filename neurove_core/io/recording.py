@@ -19,7 +19,7 @@ BLOCK_BYTES: Final = 4 << 20
 
 SUPPORTED: Final = (
     "FILE.aedat4 (DV)",
-    "FILE.raw (Prophesee EVT2, EVT3)",
+    "FILE.raw (Prophesee EVT2, EVT3), FILE.dat (Prophesee DAT)",
     "a folder with events.txt, or FILE.txt (Event Camera Dataset)",
     "pattern:// (built-in)",
 )
@@ -159,3 +159,14 @@ def later(chunks: Iterator[Events], t_us: int) -> Iterator[Events]:
         first = int(chunk.t.searchsorted(t_us))
         if first < chunk.n:
             yield chunk.span(first, chunk.n)
+
+
+def whole(events: Events, sensor: Sensor, not_before_us: int | None) -> Events:
+    """The events before the first that is outside the sensor or out of order."""
+    if not events.n:
+        return events
+    good = (events.x < sensor.width) & (events.y < sensor.height)
+    good[1:] &= events.t[1:] >= events.t[:-1]
+    if not_before_us is not None:
+        good[0] &= events.t[0] >= not_before_us
+    return events.span(0, events.n if good.all() else int(good.argmin()))
