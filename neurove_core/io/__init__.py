@@ -6,6 +6,7 @@ from neurove_core.io.aedat4 import Aedat4Recording
 from neurove_core.io.dat import DatRecording
 from neurove_core.io.ecd import EcdRecording
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
+from neurove_core.io.eventstream import EventStreamRecording
 from neurove_core.io.pattern import Pattern
 from neurove_core.io.prophesee import PropheseeRecording
 from neurove_core.io.recording import SUPPORTED, EventsOnly, Frame, Imu, Recording, Triggers
@@ -64,6 +65,8 @@ def _open_path(path: Path, sensor: Sensor | None) -> Recording:
             return PropheseeRecording.open(path, sensor)
         case ".dat":
             return DatRecording.open(path, sensor)
+        case ".es":
+            return EventStreamRecording.open(path, sensor)
         case ".txt":
             return EcdRecording.open(path, path.name, sensor)
         case suffix:

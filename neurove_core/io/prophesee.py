@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from neurove_core import evt
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
-from neurove_core.io.recording import BLOCK_BYTES, CHUNK_EVENTS, SUPPORTED, EventsOnly, Triggers
+from neurove_core.io.recording import BLOCK_BYTES, CHUNK_EVENTS, SUPPORTED, EventsOnly, Triggers, room
 from protocol.errors import InvalidField
 from protocol.events import Events, Sensor
 
@@ -142,7 +142,7 @@ class PropheseeRecording(EventsOnly):
             while block := file.read(BLOCK_BYTES):
                 words = np.frombuffer(block, dtype, len(block) // dtype.itemsize)
                 while words.size:
-                    out = _room(CHUNK_EVENTS)
+                    out = room(CHUNK_EVENTS)
                     state, read, n, verdict = decode(words, state, self.sensor.width, self.sensor.height, out)
                     if n:
                         yield out.span(0, n)
@@ -183,7 +183,3 @@ class PropheseeRecording(EventsOnly):
         if verdict == evt.OUTSIDE:
             return f"an event at x={out.x[n]} y={out.y[n]} lies outside the sensor {self.sensor}"
         return self._unknown(word)
-
-
-def _room(n: int) -> Events:
-    return Events(np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8))

@@ -20,6 +20,7 @@ BLOCK_BYTES: Final = 4 << 20
 SUPPORTED: Final = (
     "FILE.aedat4 (DV)",
     "FILE.raw (Prophesee EVT2, EVT3), FILE.dat (Prophesee DAT)",
+    "FILE.es (Event Stream)",
     "a folder with events.txt, or FILE.txt (Event Camera Dataset)",
     "pattern:// (built-in)",
 )
@@ -170,3 +171,8 @@ def whole(events: Events, sensor: Sensor, not_before_us: int | None) -> Events:
     if not_before_us is not None:
         good[0] &= events.t[0] >= not_before_us
     return events.span(0, events.n if good.all() else int(good.argmin()))
+
+
+def room(n: int) -> Events:
+    """Columns for a decoder to write this many events into."""
+    return Events(np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8))
