@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from neurove_core.io.aedat2 import Aedat2Recording
 from neurove_core.io.aedat4 import Aedat4Recording
 from neurove_core.io.dat import DatRecording
 from neurove_core.io.ecd import EcdRecording
@@ -61,6 +62,8 @@ def _open_path(path: Path, sensor: Sensor | None) -> Recording:
     match path.suffix.lower():
         case ".aedat4":
             return Aedat4Recording.open(path, sensor)
+        case ".aedat":
+            return Aedat2Recording.open(path, sensor)
         case ".raw":
             return PropheseeRecording.open(path, sensor)
         case ".dat":

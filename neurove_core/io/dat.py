@@ -8,6 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from neurove_core.io.clock import count_on
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
 from neurove_core.io.prophesee import HEADER_BYTES, parse_header
 from neurove_core.io.recording import BLOCK_BYTES, SUPPORTED, EventsOnly, Triggers, in_chunks, later, whole
@@ -16,7 +17,6 @@ from protocol.events import Events, Sensor, check_events
 
 RECORD = np.dtype([("t", "<u4"), ("bits", "<u4")])
 _EVENTS, _TRIGGERS = (0x00, 0x0C), (0x0E,)
-_WRAP_US = 1 << 32
 SEEK_RECORDS = 4096
 """Distance of the records whose time is looked at to find a time in the file."""
 
@@ -86,7 +86,7 @@ class DatRecording(EventsOnly):
         if n <= 0:
             return self.chunks()
         records = np.memmap(self.path, RECORD, "r", self.start, (n,))
-        times, _ = _count_on(np.array(records["t"][::SEEK_RECORDS]), 0)
+        times, _ = count_on(np.array(records["t"][::SEEK_RECORDS]), 0)
         sample = max(int(times.searchsorted(t_us)) - 1, 0)
         return later(self._events(sample * SEEK_RECORDS, int(times[sample])), t_us)
 
@@ -129,18 +129,8 @@ class DatRecording(EventsOnly):
             file.seek(at)
             while block := file.read(BLOCK_BYTES):
                 records = np.frombuffer(block, RECORD, len(block) // RECORD.itemsize)
-                t, before_us = _count_on(records["t"], before_us)
+                t, before_us = count_on(records["t"], before_us)
                 yield at, t, records["bits"]
                 at += records.nbytes
                 if len(block) % RECORD.itemsize:
                     raise BrokenRecording(self.path, f"byte {at}", "the file ends within a record")
-
-
-def _count_on(t: NDArray[np.uint32], before_us: int) -> tuple[NDArray[np.int64], int]:
-    """Times of a 32-bit clock counted on over its wraps, and the last of them: falling by more than half is a wrap."""
-    if not t.size:
-        return t.astype(np.int64), before_us
-    shown = np.concatenate([[before_us % _WRAP_US], t.astype(np.int64)])
-    wraps = before_us // _WRAP_US + np.cumsum(np.diff(shown) < -_WRAP_US // 2)
-    counted = shown[1:] + wraps * _WRAP_US
-    return counted, int(counted[-1])

@@ -19,6 +19,7 @@ BLOCK_BYTES: Final = 4 << 20
 
 SUPPORTED: Final = (
     "FILE.aedat4 (DV)",
+    "FILE.aedat (jAER's AEDAT 2.0)",
     "FILE.raw (Prophesee EVT2, EVT3), FILE.dat (Prophesee DAT)",
     "FILE.es (Event Stream)",
     "a folder with events.txt, or FILE.txt (Event Camera Dataset)",
