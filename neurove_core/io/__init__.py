@@ -70,7 +70,7 @@ def _open_path(path: Path, sensor: Sensor | None) -> Recording:
             return DatRecording.open(path, sensor)
         case ".es":
             return EventStreamRecording.open(path, sensor)
-        case ".txt":
+        case ".txt" | ".zip":
             return EcdRecording.open(path, path.name, sensor)
         case suffix:
             raise UnknownSource(path, SUPPORTED, f"unknown suffix {suffix!r}" if suffix else "a file without suffix")

@@ -22,7 +22,7 @@ SUPPORTED: Final = (
     "FILE.aedat (jAER's AEDAT 2.0)",
     "FILE.raw (Prophesee EVT2, EVT3), FILE.dat (Prophesee DAT)",
     "FILE.es (Event Stream)",
-    "a folder with events.txt, or FILE.txt (Event Camera Dataset)",
+    "a folder with events.txt, a FILE.zip with one, or FILE.txt (Event Camera Dataset)",
     "pattern:// (built-in)",
 )
 """The sources that `open_source` knows."""

@@ -382,7 +382,6 @@ def test_of_several_event_streams_the_first_is_read_and_the_name_says_so(tmp_pat
         ("0.000003 1 2 2", "not `t[s] x y p`"),
         ("nan 1 2 1", "not `t[s] x y p`"),
         ("inf 1 2 1", "not `t[s] x y p`"),
-        ("# t x y p", "not `t[s] x y p`"),
         ("one 1 2 1 " + 100 * "x", "not `t[s] x y p`"),
         ("0.000003 240 2 1", "outside the sensor 240x180"),
         ("0.000003 1 180 1", "outside the sensor 240x180"),
