@@ -15,8 +15,8 @@ from protocol.keys import check_name
 from service.arguments import BAD_NEWS, add_client_flags, client_config, command, seconds, sensor_size
 from service.lifecycle import stop_on_signals
 
-Progress = Callable[[int, int], None]
-"""Events so far, and the sensor time that was reached [us]."""
+Progress = Callable[[int], None]
+"""Events so far."""
 
 
 class NothingRecorded(NeuroVEError):
@@ -81,15 +81,24 @@ def _shown(path: Path) -> Iterator[Callable[[Any], None] | None]:
 def _write_mcap(recording: Any, path: Path, progress: Progress) -> None:
     from neurove_core.io import write_mcap
 
-    write_mcap(recording, path, progress=progress)
+    write_mcap(recording, path, progress=lambda events, _: progress(events))
 
 
-WRITERS: Final[dict[str, Callable[[Any, Path, Progress], None]]] = {".mcap": _write_mcap}
+def _write_dsec(recording: Any, path: Path, progress: Progress) -> None:
+    from neurove_core.io import write_dsec
+
+    try:
+        write_dsec(recording, path, progress)
+    except OSError as error:
+        raise InvalidField("recording", "FILE", str(path), error.strerror or str(error)) from None
+
+
+WRITERS: Final[dict[str, Callable[[Any, Path, Progress], None]]] = {".mcap": _write_mcap, ".h5": _write_dsec}
 """What writes a file of each suffix: (recording, path, progress)."""
 
 
 def convert(args: argparse.Namespace) -> int:
-    """Write a recording of any kind as ours (.mcap)."""
+    """Write a recording of any kind as ours (.mcap) or as HDF5 in DSEC's layout (.h5)."""
     from neurove_core.io import open_source
 
     path: Path = args.out
@@ -101,9 +110,9 @@ def convert(args: argparse.Namespace) -> int:
     counted = {"events": 0}
     with _bar(recording.name) as show:
 
-        def progress(events: int, t_us: int) -> None:
+        def progress(events: int) -> None:
             counted["events"] = events
-            show(events, t_us)
+            show(events)
 
         WRITERS[path.suffix](recording, path, progress)
     told = {"file": str(path), "bytes": path.stat().st_size, "events": counted["events"], "streams": recording.streams}
@@ -124,12 +133,9 @@ def _bar(name: str) -> Iterator[Progress]:
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
     with Bar(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
         task = bar.add_task(name, total=None)
-        first: list[int] = []
 
-        def show(events: int, t_us: int) -> None:
-            if not first:
-                first.append(t_us)
-            bar.update(task, description=f"{name}: {(t_us - first[0]) / 1e6:.2f} s, {events:,} events")
+        def show(events: int) -> None:
+            bar.update(task, description=f"{name}: {events:,} events")
 
         yield show
 
@@ -144,6 +150,6 @@ def add(commands: Any) -> None:
     add_client_flags(parser)
     parser = command(commands, "convert", convert)
     parser.add_argument("source", metavar="IN", help="a recording of any kind")
-    parser.add_argument("out", type=Path, metavar="OUT", help="file to write, ending in .mcap")
+    parser.add_argument("out", type=Path, metavar="OUT", help="file to write, ending in .mcap (ours) or .h5 (DSEC)")
     parser.add_argument("--sensor", type=sensor_size, metavar="WxH", help="sensor size, where the recording lacks it")
     parser.add_argument("--topic", metavar="T", help="which of several event streams, where the recording has names")

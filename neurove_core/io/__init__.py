@@ -2,11 +2,14 @@
 
 from pathlib import Path
 
+from neurove_core.io.aedat2 import Aedat2Recording
 from neurove_core.io.aedat4 import Aedat4Recording
+from neurove_core.io.dat import DatRecording
 from neurove_core.io.datasets import open_hdf5
 from neurove_core.io.dsec_write import write_dsec
 from neurove_core.io.ecd import EcdRecording
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
+from neurove_core.io.eventstream import EventStreamRecording
 from neurove_core.io.mcap_file import McapFile
 from neurove_core.io.mcap_layout import PROFILE
 from neurove_core.io.mcap_recording import McapRecording, RecordedPacket
@@ -82,9 +85,15 @@ def _open_path(path: Path, sensor: Sensor | None, topic: str | None) -> Recordin
     match path.suffix.lower():
         case ".aedat4":
             return Aedat4Recording.open(path, sensor)
+        case ".aedat":
+            return Aedat2Recording.open(path, sensor)
         case ".raw":
             return PropheseeRecording.open(path, sensor)
-        case ".txt":
+        case ".dat":
+            return DatRecording.open(path, sensor)
+        case ".es":
+            return EventStreamRecording.open(path, sensor)
+        case ".txt" | ".zip":
             return EcdRecording.open(path, path.name, sensor)
         case suffix:
             raise UnknownSource(path, SUPPORTED, f"unknown suffix {suffix!r}" if suffix else "a file without suffix")

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from neurove_core.io.errors import BrokenRecording
-from neurove_core.io.recording import CHUNK_EVENTS, in_chunks
+from neurove_core.io.recording import CHUNK_EVENTS, in_chunks, whole
 from protocol.errors import EventOutsideSensor, TimeBackwards
 from protocol.events import Events, Sensor, check_events
 
@@ -48,9 +48,5 @@ def _up_to_the_first_fault(events: Events, sensor: Sensor, not_before_us: int | 
     try:
         check_events(events, sensor, not_before_us)
     except (EventOutsideSensor, TimeBackwards) as error:
-        good = (events.x < sensor.width) & (events.y < sensor.height)
-        good[1:] &= events.t[1:] >= events.t[:-1]
-        if not_before_us is not None:
-            good[0] &= events.t[0] >= not_before_us
-        return events.span(0, int(good.argmin())), error.message
+        return whole(events, sensor, not_before_us), error.message
     return events, ""

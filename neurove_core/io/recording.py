@@ -21,10 +21,12 @@ BLOCK_BYTES: Final = 4 << 20
 
 SUPPORTED: Final = (
     "FILE.aedat4 (DV)",
-    "FILE.raw (Prophesee EVT2, EVT3)",
+    "FILE.aedat (jAER's AEDAT 2.0)",
+    "FILE.raw (Prophesee EVT2, EVT3), FILE.dat (Prophesee DAT)",
+    "FILE.es (Event Stream)",
     "FILE.mcap (our own, of `neurove record` and `neurove convert`)",
     "FILE.bag (ROS 1), FILE.db3, FILE.mcap or their folder (ROS 2)",
-    "a folder with events.txt, or FILE.txt (Event Camera Dataset)",
+    "a folder with events.txt, a FILE.zip with one, or FILE.txt (Event Camera Dataset)",
     "FILE.h5, FILE.hdf5 (MVSEC, DSEC, M3ED)",
     "pattern:// (built-in)",
 )
@@ -174,3 +176,19 @@ def refuse_topic(source: str | Path, topic: str | None) -> None:
     """
     if topic is not None:
         raise UnknownSource(source, SUPPORTED, f"it has one event stream and no topic {topic!r}")
+
+
+def whole(events: Events, sensor: Sensor, not_before_us: int | None) -> Events:
+    """The events before the first that is outside the sensor or out of order."""
+    if not events.n:
+        return events
+    good = (events.x < sensor.width) & (events.y < sensor.height)
+    good[1:] &= events.t[1:] >= events.t[:-1]
+    if not_before_us is not None:
+        good[0] &= events.t[0] >= not_before_us
+    return events.span(0, events.n if good.all() else int(good.argmin()))
+
+
+def room(n: int) -> Events:
+    """Columns for a decoder to write this many events into."""
+    return Events(np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8))

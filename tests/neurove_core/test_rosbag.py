@@ -168,6 +168,13 @@ def test_triggers_have_the_time_level_and_channel_of_their_words(tmp_path):
     assert [(list(t), list(c), list(level)) for t, c, level in triggers] == [([8199], [6], [1]), ([8201], [3], [0])]
 
 
+def test_triggers_keep_to_the_clock_of_the_events_over_a_gap(tmp_path):
+    words = [evt3((TIME_HIGH, 2), (ADDR_Y, 0), (ADDR_X, 1), (TRIGGER, 1)), evt3((TIME_HIGH, 4), (TRIGGER, 0))]
+    path = evt3_bag(tmp_path, words, seqs=[0, 9], stamps_us=[8_192, (1 << 24) + 16_384 + 500])
+    triggers = list(open_source(str(path)).triggers())
+    assert [int(part.t[0]) for part in triggers] == [8_192, (1 << 24) + 16_384]
+
+
 def libcaer(low, x, y, p, valid=1):
     return np.array([(valid | p << 1 | y << 2 | x << 17, low)], [("data", "<u4"), ("t", "<i4")]).tobytes()
 

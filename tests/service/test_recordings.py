@@ -5,6 +5,7 @@ import json
 import pytest
 
 from neurove_core.io import open_source
+from protocol import Sensor
 from service import cli
 from tests.builders import make_events
 from tests.recordings import ecd_text, shared
@@ -32,6 +33,16 @@ def test_convert_writes_a_recording_of_ours(run, tmp_path):
     assert (code, told.startswith(f"{tmp_path / 'b.mcap'}: 2,000 events of a.mcap")) == (0, True)
 
 
+def test_convert_writes_the_layout_of_dsec(run, tmp_path):
+    pytest.importorskip("hdf5plugin")
+    (tmp_path / "events.txt").write_bytes(ecd_text(make_events(2000)))
+    code, told, err = run("convert", tmp_path, tmp_path / "a.h5", "--sensor", "64x48")
+    assert (code, err) == (0, "")
+    assert "2,000 events" in told
+    again = open_source(str(tmp_path / "a.h5"), Sensor(64, 48))
+    assert sum(chunk.n for chunk in again.chunks()) == 2000
+
+
 def test_convert_keeps_what_lies_beside_the_events_of_a_real_bag(run, tmp_path):
     bag = shared("rosbag/test_events_1")
     assert run("convert", bag, tmp_path / "a.mcap", "--topic", "/event_camera/events")[0] == 0
@@ -50,7 +61,7 @@ def test_a_broken_recording_is_told_and_leaves_no_file(run, tmp_path):
 @pytest.mark.parametrize(
     ("source", "out", "topic", "why"),
     [
-        ("a.txt", "a.xyz", [], "its name must end in .mcap"),
+        ("a.txt", "a.xyz", [], "its name must end in .mcap or .h5"),
         ("pattern://", "a.mcap", [], "it has no end"),
         ("a.txt", "no/a.mcap", [], "No such file or directory"),
         ("a.mcap", "b.mcap", ["--topic", "up"], "no stream 'up'; its streams are cam0"),
