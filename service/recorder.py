@@ -51,6 +51,7 @@ class _Inbox:
     """What was received and not yet written; filled on Zenoh's thread."""
 
     waiting: deque[_Message] = field(default_factory=deque)
+    cap: int = QUEUE_BYTES
     size: int = 0
     dropped: dict[str, int] = field(default_factory=dict)
     lock: threading.Lock = field(default_factory=threading.Lock)
@@ -58,7 +59,7 @@ class _Inbox:
 
     def put(self, message: _Message) -> None:
         with self.lock:
-            if self.size + len(message.payload) > QUEUE_BYTES:
+            if self.size + len(message.payload) > self.cap:
                 self.dropped[message.stream] = self.dropped.get(message.stream, 0) + 1
                 return
             self.size += len(message.payload)
@@ -81,11 +82,19 @@ class Recorder:
         transport: an open session.
         keys: of the deployment.
         streams: which; None for all that are published.
+        queue_bytes: so much may wait to be written.
     """
 
-    def __init__(self, writer: PacketWriter, transport: Transport, keys: Keys, streams: tuple[str, ...] | None) -> None:
+    def __init__(
+        self,
+        writer: PacketWriter,
+        transport: Transport,
+        keys: Keys,
+        streams: tuple[str, ...] | None = None,
+        queue_bytes: int = QUEUE_BYTES,
+    ) -> None:
         self._writer, self._keys, self._streams = writer, keys, streams
-        self._inbox = _Inbox()
+        self._inbox = _Inbox(cap=queue_bytes)
         self._accounts: dict[str, Account] = {}
         self._next: dict[str, int] = {}
         self._cameras: dict[str, bytes] = {}

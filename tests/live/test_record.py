@@ -1,5 +1,6 @@
 import json
 import signal
+import threading
 
 import pytest
 
@@ -7,6 +8,7 @@ from neurove_core.io import McapRecording, PacketWriter, open_source
 from protocol import CameraInfo
 from protocol.events import decode_packet, encode_packet
 from protocol.keys import Keys
+from service.recorder import Recorder
 from tests.builders import make_packets
 from tests.live.conftest import client, free_endpoint, neurove, running, wait_until
 from tests.live.test_feed import start_router
@@ -128,6 +130,25 @@ def test_a_recorder_counts_what_is_missing_and_keeps_what_can_not_be_read(router
     }  # fmt: skip
     assert list(told) == ["left"]
     assert McapRecording.open(file).cameras() == {"left": CAMERA.encode()}
+
+
+def test_what_the_queue_can_not_hold_is_dropped_and_counted(router, tmp_path):
+    packets = make_packets(20, stream="left", n=100)
+    payloads = [encode_packet(packet) for packet in packets]
+    cap = sum(map(len, payloads[:5]))
+    with client(router) as transport, client(router) as other, PacketWriter(tmp_path / "a.mcap") as writer:
+        recorder = Recorder(writer, transport, Keys(), queue_bytes=cap)
+        heard = Listener(transport)
+        publisher = other.publisher(Keys().events("left"), "application/msgpack")
+        wait_until(lambda: publisher.matching)
+        for payload in payloads:
+            publisher.put(payload)
+        wait_until(lambda: len(heard.payloads) == 20)  # all before the first is written
+        stop = threading.Event()
+        stop.set()
+        account = recorder.run(stop, 1.0)["left"]
+    assert (account.packets, account.dropped, account.events) == (5, 15, 500)
+    assert [payload for _, payload, _ in McapRecording.open(tmp_path / "a.mcap").packets()] == payloads[:5]
 
 
 def test_a_recording_is_not_written_over_and_silence_leaves_no_file(router, tmp_path):
