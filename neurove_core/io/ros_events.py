@@ -23,6 +23,7 @@ UNIX_TIME: Final = ("libcaer", "libcaer_cmp", DVS)
 _EVT3_PERIOD_US = 1 << 24
 _LIBCAER_PERIOD_US = 1 << 31
 _MICROSECOND = 1000  # [ns]
+_WORDS = CHUNK_EVENTS // WORD_EVENTS  # decoded at once
 
 
 class Anchor(NamedTuple):
@@ -94,7 +95,7 @@ class Decoder:
         self._seq = message.seq
 
     def _of_evt3(self, message: EventMessage) -> Iterator[Events]:
-        words = _words(message)
+        words, done = _words(message), 0
         while words.size:
             out = room(min(CHUNK_EVENTS, max(words.size * kernels.VECTOR_EVENTS, kernels.VECTOR_EVENTS)))
             width, height = self._sensor.width, self._sensor.height
@@ -104,8 +105,8 @@ class Decoder:
             if verdict == kernels.OUTSIDE:
                 raise BadMessage(f"an event at x={out.x[n]} y={out.y[n]} lies outside the sensor {self._sensor}")
             if verdict != kernels.OK:
-                raise BadMessage(f"its word {read}, 0x{int(words[read]):04x}, is of no known type")
-            words = words[read:]
+                raise BadMessage(f"its word {done + read}, 0x{int(words[read]):04x}, is of no known type")
+            words, done = words[read:], done + read
 
     def _counted_on(self, events: Events, message: EventMessage) -> Events:
         """The same events on one clock with those before."""
@@ -122,14 +123,17 @@ class Decoder:
 
     def _of_libcaer_cmp(self, message: EventMessage) -> Iterator[Events]:
         base_us, width, height = message.time_base_ns // _MICROSECOND, self._sensor.width, self._sensor.height
+        self._libcaer = self._libcaer._replace(high=0, low=0)
         words = _words(message)
-        out = room(words.size * WORD_EVENTS)
-        self._libcaer, read, n, verdict = libcaer_decode(words, self._libcaer, base_us, width, height, out)
-        yield out.span(0, n)
-        if verdict == kernels.OUTSIDE:
-            raise BadMessage(f"an event at x={out.x[n]} y={out.y[n]} lies outside the sensor {self._sensor}")
-        if verdict != kernels.OK:
-            raise BadMessage(f"its word {read}, 0x{int(words[read]):04x}, is of no known type")
+        for first in range(0, words.size, _WORDS):
+            part = words[first : first + _WORDS]
+            out = room(part.size * WORD_EVENTS)
+            self._libcaer, read, n, verdict = libcaer_decode(part, self._libcaer, base_us, width, height, out)
+            yield out.span(0, n)
+            if verdict == kernels.OUTSIDE:
+                raise BadMessage(f"an event at x={out.x[n]} y={out.y[n]} lies outside the sensor {self._sensor}")
+            if verdict != kernels.OK:
+                raise BadMessage(f"its word {first + read}, 0x{int(part[read]):04x}, is of no known type")
 
 
 def _words(message: EventMessage) -> NDArray[np.uint16]:
@@ -164,5 +168,6 @@ def _libcaer(message: EventMessage) -> Events:
 def _mono(message: EventMessage) -> Events:
     """8 bytes an event: time after the message's time base [ns], x, y with the polarity in bit 15."""
     rows = _rows(message, [("dt", "<u4"), ("x", "<u2"), ("y", "<u2")])
-    t = (message.time_base_ns + rows["dt"].astype(np.int64)) // _MICROSECOND
+    base_us, rest_ns = divmod(message.time_base_ns, _MICROSECOND)  # as a whole it may not fit a signed number
+    t = base_us + (rest_ns + rows["dt"].astype(np.int64)) // _MICROSECOND
     return Events.from_columns(t, rows["x"].copy(), rows["y"] & 0x7FFF, rows["y"] >> 15)
