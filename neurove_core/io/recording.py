@@ -2,12 +2,14 @@
 
 from abc import abstractmethod
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.geometry import Poses, Twists
+from neurove_core.io.errors import UnknownSource
 from protocol.camera import CameraInfo
 from protocol.events import Events, Sensor
 
@@ -21,6 +23,7 @@ SUPPORTED: Final = (
     "FILE.aedat4 (DV)",
     "FILE.raw (Prophesee EVT2, EVT3)",
     "a folder with events.txt, or FILE.txt (Event Camera Dataset)",
+    "FILE.h5, FILE.hdf5 (MVSEC, DSEC, M3ED)",
     "pattern:// (built-in)",
 )
 """The sources that `open_source` knows."""
@@ -159,3 +162,13 @@ def later(chunks: Iterator[Events], t_us: int) -> Iterator[Events]:
         first = int(chunk.t.searchsorted(t_us))
         if first < chunk.n:
             yield chunk.span(first, chunk.n)
+
+
+def refuse_topic(source: str | Path, topic: str | None) -> None:
+    """Refuse a choice among event streams where there is one stream only.
+
+    Raises:
+        UnknownSource: a topic is given.
+    """
+    if topic is not None:
+        raise UnknownSource(source, SUPPORTED, f"it has one event stream and no topic {topic!r}")
