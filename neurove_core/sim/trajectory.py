@@ -1,6 +1,7 @@
 """Trajectories by name: made up from a seed, of constant velocity, or from a file of poses."""
 
 import math
+from pathlib import Path
 from typing import Final
 from urllib.parse import parse_qsl
 
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from neurove_core import rotations
 from neurove_core.geometry import Poses, check_poses, filter_for, interpolate_poses, smoothed
+from neurove_core.io.poses import read_poses
 from neurove_core.sim.curves import Mounted, ScrewTrajectory, SplineTrajectory, Trajectory
 from neurove_core.sim.generated import driving, hand_held
 from protocol.errors import InvalidField
@@ -36,6 +38,7 @@ TRAJECTORIES: Final = (
     "still",
     "rotation?wx=0&wy=0.5&wz=0",
     "slider?vx=0.3&vy=0&vz=0",
+    "a file of poses, FILE?start=0&smooth=0.5&flat=1",
 )
 """What `parse_trajectory` knows, each with its defaults or an example."""
 
@@ -154,17 +157,17 @@ def _slow(values: Array, step_s: float) -> Array:
 
 
 def parse_trajectory(text: str, seconds: float | None = None) -> Trajectory:
-    """The trajectory of a name; see TRAJECTORIES.
+    """The trajectory of a name, or of a file of poses; see TRAJECTORIES.
 
     >>> parse_trajectory("rotation?wy=0.5").twist(1.0).tolist()
     [0.0, 0.0, 0.0, 0.0, 0.5, 0.0]
 
     Args:
-        text: a name, with its parameters as in the query of a URL.
+        text: a name or a path, with its parameters as in the query of a URL.
         seconds: how long a generated one lasts, unless it says `seconds=`.
 
     Raises:
-        InvalidField: the name or a parameter is unknown, or a value out of its bound.
+        InvalidField: the name or a parameter is unknown, or a value out of its bound; or the file holds no path.
     """
     name, _, query = text.rpartition("?") if "?" in text else (text, "", "")
     given = _Given(text, query)
@@ -183,8 +186,28 @@ def parse_trajectory(text: str, seconds: float | None = None) -> Trajectory:
             constant = (x, y, z, 0.0, 0.0, 0.0) if letter == "v" else (0.0, 0.0, 0.0, x, y, z)
             return ScrewTrajectory(name, constant, math.inf if seconds is None else seconds)
         case _:
-            known = "; ".join(TRAJECTORIES)
-            raise InvalidField("trajectory", "name", name, f"known are {known}")
+            return _from_file(name, given, seconds)
+
+
+def _from_file(name: str, given: "_Given", seconds: float | None) -> SplineTrajectory:
+    """The trajectory along a file's poses, from `start` s after the first on."""
+    path = Path(name)
+    if not path.is_file():
+        known = "; ".join(TRAJECTORIES)
+        raise InvalidField("trajectory", "name", name, f"neither a known trajectory nor a file; known are {known}")
+    start = given.number("start", 0.0, 0.0, 1e6)
+    smooth = given.optional("smooth", 1e-3, 60.0)
+    flat = given.optional("flat", 0, 1)
+    given.done()
+    poses = read_poses(path)
+    since = (poses.t - poses.t[:1]) / 1e6
+    keep = (since >= start) & (since <= start + (seconds or math.inf) + 0.5)  # the filter sees a little further
+    if not keep.any():
+        raise InvalidField("trajectory", "start", start, f"{path} lasts {since[-1] if since.size else 0:g} s")
+    cut = Poses(poses.t[keep], poses.position_m[keep], poses.orientation[keep])
+    whole = from_poses(cut, path.stem, smooth_s=smooth, flat=None if flat is None else flat > 0)
+    lasting = min(whole.duration_s, seconds or math.inf)
+    return SplineTrajectory(whole.name, lasting, whole.step_s, whole.control)
 
 
 class _Given:

@@ -1,6 +1,7 @@
 """Trajectories: the twist is exactly the derivative of the pose, and paths are what their names promise."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from neurove_core import rotations
 from neurove_core.geometry import Poses, twists
 from neurove_core.sim.trajectory import Mounted, Trajectory, driving, from_poses, hand_held, parse_trajectory, still
 from protocol.errors import InvalidField
+from tests.recordings import shared
 
 DT_S = 1e-5
 
@@ -21,6 +23,11 @@ def waving(seconds: float, step_us: int = 5_000) -> Poses:
     position = np.sin(t * [1.0, 1.7, 2.3] + [0.0, 1.0, 2.0])
     orientation = rotations.product(world, rotations.exp(0.4 * np.sin(t * [2.1, 0.9, 1.3])))
     return Poses(t_us, rotations.turn(world, position + 3.0), orientation)
+
+
+def tum(poses: Poses) -> str:
+    rows = zip(poses.t.tolist(), poses.position_m.tolist(), poses.orientation.tolist(), strict=True)
+    return "".join(f"{t / 1e6:.6f} " + " ".join(f"{x:.9f}" for x in (*p, *q)) + "\n" for t, p, q in rows)
 
 
 EACH = {
@@ -230,6 +237,43 @@ def test_hills_are_taken_off_a_drive_so_that_level_ground_stays_beneath_it():
     assert np.ptp(kept[:, 1]) > 50
 
 
+@pytest.mark.parametrize("day", [1, 2])
+def test_mvsecs_drives_become_paths_over_level_ground_with_their_speed_and_turns(day):
+    pytest.importorskip("h5py", reason="h5py is not installed: pip install 'neurove[recordings]'")
+    trajectory = parse_trajectory(str(shared(f"mvsec/outdoor_day{day}_odom.h5")))
+    assert trajectory.duration_s == pytest.approx({1: 256.9, 2: 610.1}[day], abs=0.1)
+    t = np.arange(0, trajectory.duration_s, 0.05)
+    position, rotation = trajectory.pose(t)
+    _, _, vz, _, wy, _ = trajectory.twist(t).T
+    assert vz.mean() == pytest.approx({1: 4.64, 2: 5.66}[day], abs=0.05)
+    assert wy.std() == pytest.approx({1: 0.155, 2: 0.117}[day], abs=0.01)
+    assert np.abs(position[:, 1]).max() < 0.5
+    assert np.degrees(np.arccos(rotation[:, 1, 1])).max() < 6
+    path_m = np.linalg.norm(np.diff(position, axis=0), axis=1).sum()
+    assert path_m == pytest.approx({1: 1219.6, 2: 3495}[day], rel=0.02)
+    np.testing.assert_allclose(
+        trajectory.twist(t[::50]), differences(trajectory, t[::50].clip(1e-3, t[-1] - 1e-3), 1e-4), atol=0.02
+    )
+
+
+def test_a_real_hand_held_path_drives_a_camera_as_fast_as_it_was():
+    trajectory = parse_trajectory(str(shared("trajectories/poster_6dof.csv")) + "?smooth=0.05")
+    twist = trajectory.twist(np.arange(0, trajectory.duration_s, 0.005))
+    speed, turning = (np.linalg.norm(part, axis=1) for part in np.split(twist, 2, axis=1))
+    assert np.percentile(speed, 99) == pytest.approx(2.35, rel=0.05)
+    assert np.percentile(turning, 99) == pytest.approx(13.5, rel=0.05)
+
+
+def test_start_skips_and_seconds_ends_a_recorded_path(tmp_path: Path):
+    file = tmp_path / "path.txt"
+    file.write_text(tum(waving(10)))
+    whole, part = parse_trajectory(str(file)), parse_trajectory(f"{file}?start=2&seconds=3")
+    assert (part.name, part.duration_s) == ("path", 3)
+    t = np.arange(0.2, 2.9, 0.1)
+    np.testing.assert_allclose(part.twist(t), whole.twist(t + 2), atol=0.02)
+    assert parse_trajectory(str(file), seconds=4).duration_s == 4
+
+
 @pytest.mark.parametrize(
     ("field", "change"),
     [
@@ -293,3 +337,15 @@ def test_what_is_no_trajectory_is_refused_and_its_field_named(text, field):
         parse_trajectory(text)
     assert refused.value.details["field"] == field
     assert refused.value.details["bound"]
+
+
+@pytest.mark.parametrize(
+    ("query", "field"),
+    [("start=99", "start"), ("start=-1", "start"), ("smooth=0", "smooth"), ("flat=2", "flat"), ("seed=1", "seed")],
+)
+def test_a_wrong_parameter_of_a_file_is_refused(tmp_path: Path, query: str, field: str):
+    file = tmp_path / "path.txt"
+    file.write_text(tum(waving(3)))
+    with pytest.raises(InvalidField) as refused:
+        parse_trajectory(f"{file}?{query}")
+    assert refused.value.details["field"] == field
