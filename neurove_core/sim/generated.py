@@ -18,6 +18,9 @@ _TAIL_S: Final = 10.0  # made and cut off, so that a longer drive of the same se
 TOP_M_S: Final = 12.0
 """No drive is faster."""
 
+MAX_HEADING: Final = 1.6
+"""No drive turns further than this away from its first direction [rad], but for its springs."""
+
 LEVER_M: Final = 1.5
 """How far the camera is ahead of the axle that does not steer, and so slips sideways."""
 
@@ -26,17 +29,15 @@ def driving(seed: int, seconds: float = 600.0) -> SplineTrajectory:
     """A car's path on level ground: 0 to 12 m/s, stops, bends and corners, a little pitch, roll and heave.
 
     Accelerations are those of calm driving (1.6 m/s2 on, 2.2 m/s2 off, 2.5 m/s2 sideways). It always gets on along z:
-    its heading stays within 100 degrees of it, so that the path does not cross itself. The body leans and dives with
+    its heading stays within MAX_HEADING of it, so that the path does not cross itself. The body leans and dives with
     its acceleration and shakes with its speed; at rest it is still. Meant to be like MVSEC's outdoor_day: forward speed
     5 (3) m/s, yaw rate 0.12 to 0.16 rad/s in the root mean square, at most some 0.6.
     """
     rng, shaking = np.random.default_rng((seed, 1)), np.random.default_rng((seed, 2))
     n = math.ceil(seconds / _DRIVE_STEP_S) + 1
     tail = round(_TAIL_S / _DRIVE_STEP_S)
-    speed, curvature = _manoeuvres(rng, n + tail)
-    speed, curvature = _eased(speed), _eased(curvature)
-    yaw_rate = np.clip(curvature * speed, -2.5 / np.maximum(speed, 1.0), 2.5 / np.maximum(speed, 1.0))
-    yaw = np.cumsum(yaw_rate)[: len(speed)] * _DRIVE_STEP_S
+    speed, yaw_rate = (_eased(values) for values in _manoeuvres(rng, n + tail))
+    yaw = np.cumsum(yaw_rate) * _DRIVE_STEP_S
     lean = np.stack([_rate(speed) * 0.006, 0 * speed, yaw_rate * speed * 0.006], axis=1)  # [rad per m/s2]
     shake = noise(shaking, n + tail, 3, 0.4, 1.5, _DRIVE_STEP_S) * np.minimum(speed / 5, 1)[:, None]
     tilt = lean + shake * np.array([0.0025, 0.0, 0.0025])
@@ -51,35 +52,35 @@ def driving(seed: int, seconds: float = 600.0) -> SplineTrajectory:
 
 
 def _manoeuvres(rng: np.random.Generator, n: int) -> tuple[Array, Array]:
-    """Speed (n,) [m/s] within the accelerations, and curvature (n,) [rad/m] to the right, still with corners."""
-    speed, curvature = np.zeros(n), np.zeros(n)
+    """Speed (n,) [m/s] within the accelerations, and yaw rate (n,) [rad/s], to the right above 0; still with kinks."""
+    speed, yaw_rate = np.zeros(n), np.zeros(n)
     v, heading, i = float(rng.uniform(3, 9)), 0.0, 0
     while i < n:
         kind = rng.choice(["straight", "bend", "corner", "stop"], p=[0.35, 0.3, 0.2, 0.15])
+        kind = kind if i else "straight"  # the first second is eased in from nowhere
         side = -math.copysign(1.0, heading) if abs(heading) > 0.3 else float(rng.choice([-1.0, 1.0]))
-        target, k, angle = float(rng.uniform(4, TOP_M_S)), 0.0, math.inf
+        target, curvature, angle = float(rng.uniform(4, TOP_M_S)), 0.0, 0.0
         duration_s = float(rng.uniform(4, 12))
         if kind == "bend":
-            angle = rng.uniform(0.1, 0.5)
-            k = side / rng.uniform(30, 120)
+            curvature, angle = 1 / rng.uniform(30, 120), rng.uniform(0.1, 0.5)
         elif kind == "corner":
-            target, angle, duration_s = float(rng.uniform(3.5, 6)), rng.uniform(1.2, 1.6), 30.0
-            k = side / rng.uniform(8, 14)
+            target, duration_s = float(rng.uniform(3.5, 6)), 30.0
+            curvature, angle = 1 / rng.uniform(8, 14), min(rng.uniform(1.2, 1.6), MAX_HEADING - side * heading)
         elif kind == "stop":
             target, duration_s = 0.0, float(rng.uniform(2, 7)) + v / 2.2
         turned = 0.0
         for _ in range(round(duration_s / _DRIVE_STEP_S)):
+            if i == n or (kind == "corner" and turned >= angle - 1e-9):
+                break
             v += float(np.clip(target - v, -0.22, 0.16))
             # corners wait until the car is slow enough for them
-            slow = kind != "corner" or v <= target + 0.5
-            here = k if slow and turned < angle else 0.0
-            if i == n or (kind == "corner" and turned >= angle):
-                break
-            turned += abs(here) * v * _DRIVE_STEP_S
-            heading += here * v * _DRIVE_STEP_S
-            speed[i], curvature[i] = v, here
+            ready = turned < angle and (kind != "corner" or v <= target + 0.5)
+            rate = min(curvature * v, 2.5 / max(v, 1.0), (angle - turned) / _DRIVE_STEP_S) if ready else 0.0
+            turned += rate * _DRIVE_STEP_S
+            speed[i], yaw_rate[i] = v, side * rate
             i += 1
-    return speed, curvature
+        heading += side * turned
+    return speed, yaw_rate
 
 
 def _eased(values: Array) -> Array:

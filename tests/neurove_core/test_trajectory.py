@@ -131,7 +131,14 @@ def test_a_drive_is_one_of_a_car(seed):
     assert (rotation[:, 1, 1] > math.cos(math.radians(4))).all()  # level but for its springs
     standing = np.abs(twist).max(axis=1) < 1e-9
     assert 0.01 < standing.mean() < 0.3
-    assert np.diff(position[:, 2]).min() > -0.05  # on and on along z
+    heading = np.arctan2(rotation[:, 0, 2], rotation[:, 2, 2])
+    assert 0.5 < np.abs(heading).max() < 1.61  # round corners, but on and on along z
+
+
+def test_a_drive_of_an_hour_still_gets_on_along_its_first_direction():
+    position, rotation = driving(0, 3600).pose(np.arange(0, 3600, 0.5))
+    assert np.abs(np.arctan2(rotation[:, 0, 2], rotation[:, 2, 2])).max() < 1.61
+    assert position[-1, 2] > 8_000
 
 
 @pytest.mark.parametrize("seed", range(4))
