@@ -167,12 +167,12 @@ class Mounted(Trajectory):
             raise InvalidField("camera mount", "pitch_deg", self.pitch_deg, "must be -90 to 90 degrees")
 
     @property
-    def name(self) -> str:  # type: ignore[override]
+    def name(self) -> str:  # type: ignore[override]  # read here, never set
         """That of the path."""
         return self.trajectory.name
 
     @property
-    def duration_s(self) -> float:  # type: ignore[override]
+    def duration_s(self) -> float:  # type: ignore[override]  # read here, never set
         """That of the path."""
         return self.trajectory.duration_s
 

@@ -38,7 +38,8 @@ def driving(seed: int, seconds: float = 600.0) -> SplineTrajectory:
     tail = round(_TAIL_S / _DRIVE_STEP_S)
     speed, yaw_rate = (_eased(values) for values in _manoeuvres(rng, n + tail))
     yaw = np.cumsum(yaw_rate) * _DRIVE_STEP_S
-    lean = np.stack([_rate(speed) * 0.006, 0 * speed, yaw_rate * speed * 0.006], axis=1)  # [rad per m/s2]
+    # 0.006 rad per m/s2: nose up under power, down under the brakes, and over to the outside of a bend
+    lean = 0.006 * np.stack([_rate(speed), 0 * speed, -yaw_rate * speed], axis=1)
     shake = noise(shaking, n + tail, 3, 0.4, 1.5, _DRIVE_STEP_S) * np.minimum(speed / 5, 1)[:, None]
     tilt = lean + shake * np.array([0.0025, 0.0, 0.0025])
     heading = rotations.exp(np.stack([0 * yaw, yaw, 0 * yaw], axis=1))

@@ -212,7 +212,7 @@ def test_next_to_nothing_can_be_drawn_too(tmp_path: Path, n: int):
     pytest.importorskip("matplotlib")
 
     class Plain(Rich):
-        def twists(self) -> None:  # type: ignore[override]
+        def twists(self) -> None:  # type: ignore[override]  # as `Recording` allows
             return None
 
     for kind in (Rich, Plain):

@@ -135,6 +135,17 @@ def test_a_drive_is_one_of_a_car(seed):
     assert 0.5 < np.abs(heading).max() < 1.61  # round corners, but on and on along z
 
 
+def test_a_car_dives_when_it_brakes_and_leans_to_the_outside_of_a_bend():
+    trajectory, t = driving(1, 300), np.arange(0, 300, 0.02)
+    _, rotation = trajectory.pose(t)
+    _, _, vz, _, wy, _ = trajectory.twist(t).T
+    nose_down, right_down = rotation[:, 1, 2], rotation[:, 1, 0]
+    assert nose_down[np.gradient(vz, t) < -1.8].mean() > 0.005
+    assert nose_down[np.gradient(vz, t) > 1.2].mean() < -0.005
+    assert right_down[wy * vz > 1.5].mean() < -0.005
+    assert right_down[wy * vz < -1.5].mean() > 0.005
+
+
 def test_a_drive_of_an_hour_still_gets_on_along_its_first_direction():
     position, rotation = driving(0, 3600).pose(np.arange(0, 3600, 0.5))
     assert np.abs(np.arctan2(rotation[:, 0, 2], rotation[:, 2, 2])).max() < 1.61
