@@ -47,6 +47,7 @@ class Twists(NamedTuple):
         return np.where(fraction[:, None] == 0, a, np.where(fraction[:, None] == 1, b, between))
 
 
+_BLOCK = 1 << 15  # poses whose motion is fitted at once: some 20 MB
 _ITERATIONS = 20
 _TOLERANCE = 1e-7
 
@@ -149,19 +150,26 @@ def _fits(poses: Poses, filter_s: float | None) -> tuple[NDArray[np.float64], ND
     filter_s = filter_for(poses) if filter_s is None else filter_s
     if not 0 < filter_s < 1e6:
         raise InvalidField("twists", "filter_s", filter_s, "must be above 0 s")
-    n, half_us = poses.t.size, filter_s * 5e5
-    first = np.searchsorted(poses.t, poses.t - half_us, side="left")
-    last = np.searchsorted(poses.t, poses.t + half_us, side="right") - 1
-    moments, sums = np.zeros((n, 5)), np.zeros((n, 3, 6))
-    here = np.arange(n)
-    for offset in range(int((first - here).min(initial=0)), int((last - here).max(initial=0)) + 1):
-        i = here[(here + offset >= first) & (here + offset <= last)]
-        j = i + offset
-        tau = (poses.t[j] - poses.t[i])[:, None] / half_us
-        moments[i] += tau ** np.arange(5)
-        sums[i] += (tau ** np.arange(3))[:, :, None] * _relative(poses, i, j)[:, None, :]
+    screw, rate = np.empty((2, poses.t.size, 6))
+    for start in range(0, poses.t.size, _BLOCK):
+        block = np.arange(start, min(start + _BLOCK, poses.t.size))
+        screw[block], rate[block] = _fit(poses, block, filter_s * 5e5)
+    return screw, rate
+
+
+def _fit(poses: Poses, i: NDArray[np.int64], half_us: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """As _fits, around some poses (N,)."""
+    first = np.searchsorted(poses.t, poses.t[i] - half_us, side="left")
+    last = np.searchsorted(poses.t, poses.t[i] + half_us, side="right") - 1
+    moments, sums = np.zeros((i.size, 5)), np.zeros((i.size, 3, 6))
+    for offset in range(int((first - i).min()), int((last - i).max()) + 1):
+        row = np.flatnonzero((i + offset >= first) & (i + offset <= last))
+        j = i[row] + offset
+        tau = (poses.t[j] - poses.t[i[row]])[:, None] / half_us
+        moments[row] += tau ** np.arange(5)
+        sums[row] += (tau ** np.arange(3))[:, :, None] * _relative(poses, i[row], j)[:, None, :]
     known = (last - first >= 2) & (poses.t[last] - poses.t[first] >= 0.5 * half_us)
-    fit = np.full((n, 3, 6), np.nan)
+    fit = np.full((i.size, 3, 6), np.nan)
     hankel = moments[:, np.add.outer(np.arange(3), np.arange(3))]
     fit[known] = np.linalg.solve(hankel[known], sums[known])
     return fit[:, 0], fit[:, 1] / (half_us / 1e6)
