@@ -25,6 +25,7 @@ from neurove_core.io.hdf5 import Column, dataset, has, opened, value
 from neurove_core.io.hdf5_tables import EventTable, ImuTable, TableRecording, seek_indexed
 from neurove_core.io.poses import stored_poses, table
 from protocol.camera import CameraInfo
+from protocol.errors import InvalidField
 from protocol.events import Events, Sensor
 
 DSEC_SENSOR: Final = Sensor(640, 480)
@@ -64,7 +65,7 @@ class DsecRecording(TableRecording):
             held.append("twists")
         try:
             sensor = sensor or (Sensor(int(stored["width"]), int(stored["height"])) if "width" in stored else None)
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError, InvalidField) as error:
             raise BrokenRecording(path, "attributes of events", f"they are no sensor: {error}") from None
         which, assumed = sensor or DSEC_SENSOR, sensor is None
         return cls(path, path.name, which, "events", tuple(held), offset_us=offset_us, lens=lens, assumed=assumed)
@@ -150,7 +151,7 @@ def _lens(path: Path, attributes: dict[str, Any]) -> CameraInfo:
     try:
         fields = {name: np.asarray(attributes[name]).tolist() for name in LENS_FIELDS if name in attributes}
         return CameraInfo(stream="recording", **fields)
-    except (TypeError, ValueError) as error:  # pydantic's is one too
+    except (TypeError, ValueError, InvalidField) as error:  # pydantic's is one too
         raise BrokenRecording(path, "attributes of camera", f"they are no lens: {error}") from None
 
 

@@ -79,12 +79,13 @@ def dataset(path: Path, file: Any, name: str, *tail: int) -> Any:
     """
     try:
         found = file[name]
-        shape, kind = tuple(found.shape), found.dtype.kind
+        shape, kind, width = tuple(found.shape), found.dtype.kind, found.dtype.itemsize
         missing = found.size and not found.is_virtual and not found.id.get_storage_size()
-        chunk_bytes = int(np.prod(found.chunks or (0,), dtype=np.float64)) * found.dtype.itemsize
+        chunk_bytes = int(np.prod(found.chunks or (0,), dtype=np.float64)) * width
     except (*FAULTS, AttributeError) as error:
         raise BrokenRecording(path, name, f"it can not be read: {error}") from None
-    if len(shape) != 1 + len(tail) or shape[1:] != tail or kind not in "biuf":
+    numbers = kind in "biu" or (kind == "f" and width in (4, 8))  # numpy's linear algebra knows no other floats
+    if len(shape) != 1 + len(tail) or shape[1:] != tail or not numbers:
         want = ", ".join(["N", *map(str, tail)])
         raise BrokenRecording(path, name, f"numbers of shape ({want}) are expected, not {found.dtype} of {shape}")
     if chunk_bytes > MAX_CHUNK_BYTES:

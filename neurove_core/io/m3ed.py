@@ -11,7 +11,7 @@ Source: daniilidis-group/m3ed, build_system/bag_processing/rosbag2hdf5.py.
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,13 @@ EVK4: Final = Sensor(1280, 720)
 """Both cameras, where the file has no calibration."""
 
 TOPICS: Final = ("prophesee/left", "prophesee/right")
-_LENS_OF_MODEL: Final = {"radtan": "pinhole", "equidistant": "equidistant"}
+_IMU: Final = ("ovc/imu/ts", "ovc/imu/accel", "ovc/imu/omega")
+_TAILS: Final = ((), (3,), (3,))
+_IMU_MOUNT: Final = "ovc/imu/calib/T_to_prophesee_left"
+_LENS_OF_MODEL: Final[dict[str, Literal["pinhole", "equidistant"]]] = {
+    "radtan": "pinhole",
+    "equidistant": "equidistant",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,11 +119,6 @@ class M3edRecording(TableRecording):
         return Poses(left.t, left.position_m + offset_m, rotations.product(left.orientation, q))
 
 
-_IMU: Final = ("ovc/imu/ts", "ovc/imu/accel", "ovc/imu/omega")
-_TAILS: Final = ((), (3,), (3,))
-_IMU_MOUNT: Final = "ovc/imu/calib/T_to_prophesee_left"
-
-
 def truth_beside(path: Path) -> Path:
     """Where the truth of a FILE_data.h5 lies."""
     return path.with_name(f"{path.stem.removesuffix('_data')}_pose_gt{path.suffix}")
@@ -137,13 +138,20 @@ def read_lens(path: Path, file: Any, topic: str) -> CameraInfo:
     try:
         fx, fy, cx, cy = map(float, intrinsics)
         width, height = map(int, resolution)
-        lens = _LENS_OF_MODEL[model]
-        numbers = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "width": width, "height": height}
-        return CameraInfo(stream="recording", lens=lens, distortion=tuple(map(float, distortion)), **numbers)  # type: ignore[arg-type]  # one dict of ints and floats, checked by the model
-    except (TypeError, ValueError) as error:
-        raise InvalidField(
-            what, "intrinsics", str(intrinsics), f"fx fy cx cy and a lens are expected: {error}"
-        ) from None
+        return CameraInfo(
+            stream="recording",
+            width=width,
+            height=height,
+            lens=_LENS_OF_MODEL[model],
+            fx=fx,
+            fy=fy,
+            cx=cx,
+            cy=cy,
+            distortion=tuple(map(float, distortion)),
+        )
+    except (TypeError, ValueError, OverflowError, InvalidField) as error:
+        got = f"{intrinsics}, {distortion}, {resolution}"
+        raise InvalidField(what, "intrinsics", got, f"fx fy cx cy, four coefficients, a size: {error}") from None
 
 
 def _transform(path: Path, file: Any, name: str) -> NDArray[np.float64] | None:
@@ -154,7 +162,10 @@ def _transform(path: Path, file: Any, name: str) -> NDArray[np.float64] | None:
     """
     if not has(file, name):
         return None
-    matrix = np.asarray(value(path, file, name), np.float64)
+    try:
+        matrix = np.asarray(value(path, file, name), np.float64)
+    except (TypeError, ValueError):  # a text, say
+        matrix = np.empty(0)
     if matrix.shape != (4, 4) or not np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-2):
         raise BrokenRecording(path, name, "a rigid motion of shape (4, 4) is expected")
     return matrix[:3]

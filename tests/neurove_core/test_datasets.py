@@ -2,6 +2,7 @@
 
 import itertools
 import re
+import sys
 import tracemalloc
 from pathlib import Path
 
@@ -241,11 +242,12 @@ def test_a_table_of_another_kind_is_told_by_its_name(tmp_path):
         file["davis/left/events"] = np.zeros((5, 3))
     with pytest.raises(BrokenRecording, match=r"davis/left/events: numbers of shape \(N, 4\) are expected"):
         read(open_source(str(tmp_path / "a.hdf5")))
-    with h5py.File(tmp_path / "b.h5", "w") as file:
-        for name in "pxyt":
-            file[f"events/{name}"] = [b"one", b"two"]
-    with pytest.raises(BrokenRecording, match="numbers of shape"):
-        read(open_source(str(tmp_path / "b.h5")))
+    for rows in ([b"one", b"two"], np.zeros(2, np.longdouble), np.zeros(2, np.float16)):
+        with h5py.File(tmp_path / "b.h5", "w") as file:
+            for name in "pxyt":
+                file[f"events/{name}"] = rows
+        with pytest.raises(BrokenRecording, match="numbers of shape"):
+            read(open_source(str(tmp_path / "b.h5")))
 
 
 def test_rows_that_were_never_written_are_no_events(tmp_path):
@@ -350,7 +352,7 @@ def test_a_source_with_one_event_stream_refuses_a_topic(source, tmp_path):
 
 def test_without_h5py_its_absence_is_told(tmp_path, monkeypatch):
     path = dsec_file(tmp_path)
-    monkeypatch.setitem(__import__("sys").modules, "h5py", None)
+    monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(MissingExtra, match=r"h5py is not installed: pip install 'neurove\[recordings\]'"):
         open_source(path)
     with pytest.raises(MissingExtra):
@@ -443,6 +445,27 @@ def test_a_bad_imu_sample_ends_the_stream_at_its_row(row, value, tmp_path):
     blocks = open_source(path).imu()
     assert next(blocks).t.tolist() == imu.t[:row].tolist()
     with pytest.raises(BrokenRecording, match=f"row {row} of davis/left/imu"):
+        next(blocks)
+
+
+def test_images_of_another_kind_are_refused(tmp_path):
+    path = write_mvsec(tmp_path, LATE, images=np.zeros((2, 260, 346)))  # type: ignore[arg-type]  # on purpose
+    with pytest.raises(BrokenRecording, match="images of uint8 are expected, not float64"):
+        list(open_source(path).frames())
+
+
+def test_an_imu_that_can_not_be_read_on_ends_there(tmp_path):
+    path = Path(own_file(tmp_path))
+    with h5py.File(path, "r+") as file:
+        imu = make_imu(250, start_us=DAY_US)
+        for name, rows in zip(("t", "accel", "gyro"), imu, strict=True):
+            chunks = (CHUNK, *rows.shape[1:])
+            file.create_dataset(f"imu/{name}", data=rows, chunks=chunks, compression=hdf5plugin.Zstd())
+    with h5py.File(path) as file:
+        spoil(path, file["imu/gyro"], 1)
+    blocks = open_source(str(path)).imu()
+    assert next(blocks).t.tolist() == imu.t[:CHUNK].tolist()
+    with pytest.raises(BrokenRecording, match=f"row {CHUNK} of imu"):
         next(blocks)
 
 
@@ -603,12 +626,21 @@ def test_a_real_recording_survives_the_way_through_dsecs_layout(path, tmp_path):
     assert next(copy.since(middle)).t[0] == next(source.since(middle)).t[0] >= middle
 
 
-@pytest.mark.parametrize(("group", "name"), [("events", "width"), ("camera", "fx")])
-def test_attributes_that_were_spoilt_are_named(group, name, tmp_path):
+@pytest.mark.parametrize(
+    ("group", "name", "value"),
+    [
+        ("events", "width", "wide"),
+        ("events", "width", 0),
+        ("events", "height", np.inf),
+        ("camera", "fx", -1.0),
+        ("camera", "distortion", [1.0]),
+    ],
+)
+def test_attributes_that_were_spoilt_are_named(group, name, value, tmp_path):
     path = tmp_path / "out.h5"
     write_dsec(open_source(write_mvsec(tmp_path, LATE)), path)
     with h5py.File(path, "r+") as file:
-        file[group].attrs[name] = "wide"
+        file[group].attrs[name] = value
     with pytest.raises(BrokenRecording, match=f"attributes of {group}"):
         open_source(str(path))
 
@@ -701,6 +733,9 @@ def test_m3ed_without_calibration_is_1280x720_and_has_no_imu_in_a_frame_that_is_
         ("intrinsics", [1.0, 2.0], "fx fy cx cy"),
         ("intrinsics", [-1.0, 2.0, 3.0, 4.0], "fx fy cx cy"),
         ("resolution", [0, 48], "fx fy cx cy"),
+        ("resolution", [np.inf, 48], "fx fy cx cy"),
+        ("distortion_coeffs", [1.0], "fx fy cx cy"),
+        ("distortion_coeffs", "none", "fx fy cx cy"),
     ],
 )
 def test_a_calibration_that_is_none_is_named_when_the_file_is_opened(name, value, why, tmp_path):
@@ -712,10 +747,12 @@ def test_a_calibration_that_is_none_is_named_when_the_file_is_opened(name, value
         open_source(path)
 
 
-def test_a_mount_that_is_no_rigid_motion_is_named(tmp_path):
+@pytest.mark.parametrize("mount", [np.ones((4, 4)), np.full((4, 4), np.nan), np.eye(3), "none"])
+def test_a_mount_that_is_no_rigid_motion_is_named(mount, tmp_path):
     path = write_m3ed(tmp_path, EVENTS)
     with h5py.File(path, "r+") as file:
-        file["prophesee/left/calib/T_to_prophesee_left"][...] = np.ones((4, 4))
+        del file["prophesee/left/calib/T_to_prophesee_left"]
+        file["prophesee/left/calib/T_to_prophesee_left"] = mount
     with pytest.raises(BrokenRecording, match="T_to_prophesee_left: a rigid motion"):
         open_source(path)
 

@@ -1,5 +1,6 @@
 """Files of poses: what real ones hold, in which unit their times are, and what is said of bad ones."""
 
+import sys
 from pathlib import Path
 
 import h5py
@@ -236,7 +237,7 @@ def test_hdf5_without_poses_of_unequal_length_empty_or_cut_is_told(tmp_path):
 
 
 def test_hdf5_needs_h5py_and_text_does_not(tmp_path, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "h5py", None)
+    monkeypatch.setitem(sys.modules, "h5py", None)
     assert read_poses(put(tmp_path, "1 0 0 0 0 0 0 1")).t.size == 1
     with pytest.raises(MissingExtra, match="h5py"):
         read_poses(shared("mvsec/outdoor_day1_odom.h5"))
