@@ -4,9 +4,11 @@ from pathlib import Path
 
 from neurove_core.io.aedat2 import Aedat2Recording
 from neurove_core.io.aedat4 import Aedat4Recording
+from neurove_core.io.carla import CarlaRecording
 from neurove_core.io.dat import DatRecording
 from neurove_core.io.ecd import EcdRecording
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
+from neurove_core.io.evbench import EvbenchRecording
 from neurove_core.io.eventstream import EventStreamRecording
 from neurove_core.io.pattern import Pattern
 from neurove_core.io.prophesee import PropheseeRecording
@@ -70,6 +72,10 @@ def _open_path(path: Path, sensor: Sensor | None) -> Recording:
             return DatRecording.open(path, sensor)
         case ".es":
             return EventStreamRecording.open(path, sensor)
+        case ".npz":
+            return CarlaRecording.open(path, sensor)
+        case ".mat":
+            return EvbenchRecording.open(path, sensor)
         case ".txt" | ".zip":
             return EcdRecording.open(path, path.name, sensor)
         case suffix:

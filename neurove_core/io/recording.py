@@ -22,6 +22,8 @@ SUPPORTED: Final = (
     "FILE.aedat (jAER's AEDAT 2.0)",
     "FILE.raw (Prophesee EVT2, EVT3), FILE.dat (Prophesee DAT)",
     "FILE.es (Event Stream)",
+    "FILE.mat (eventVision-evbench)",
+    "FILE.npz (CARLA's event camera)",
     "a folder with events.txt, a FILE.zip with one, or FILE.txt (Event Camera Dataset)",
     "pattern:// (built-in)",
 )
