@@ -6,7 +6,6 @@ A .npz of `events` (N,) of RECORD, `width`, `height`, `fov_deg`, and where poses
 
 import math
 import zipfile
-import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from neurove_core.geometry import Poses
 from neurove_core.io.errors import BrokenRecording, UnknownSource
+from neurove_core.io.place import BROKEN_ZIP
 from neurove_core.io.recording import BLOCK_BYTES, SUPPORTED, EventsOnly, in_chunks, whole
 from protocol.camera import CameraInfo
 from protocol.errors import EventOutsideSensor, InvalidField, TimeBackwards
@@ -106,7 +106,7 @@ class CarlaRecording(EventsOnly):
                 raise UnknownSource(path, SUPPORTED, f"it lacks {', '.join(sorted(missing))}")
             width, height, fov_deg = (_array(path, name, ()).item() for name in ("width", "height", "fov_deg"))
             own = Sensor(int(width), int(height))
-        except (zipfile.BadZipFile, BrokenRecording, InvalidField) as error:
+        except (*BROKEN_ZIP, BrokenRecording, InvalidField) as error:
             raise UnknownSource(path, SUPPORTED, f"it is no recording of CARLA: {error}") from None
         if not 0 < fov_deg < 180:
             raise UnknownSource(path, SUPPORTED, f"fov_deg={fov_deg} must lie between 0 and 180")
@@ -182,7 +182,7 @@ def _member(path: Path, name: str) -> Iterator[tuple[IO[bytes], tuple[int, ...],
             if dtype.hasobject:
                 raise ValueError("objects are not read")
             yield file, shape, dtype
-    except (zipfile.BadZipFile, zlib.error, EOFError, KeyError, NotImplementedError, RuntimeError, ValueError) as error:
+    except (*BROKEN_ZIP, KeyError, SyntaxError) as error:
         raise BrokenRecording(path, name, f"it can not be read: {error}") from None
 
 

@@ -40,7 +40,7 @@ class NoCarlaServer(NeuroVEError):
 
     def __init__(self, host: str, port: int, timeout_s: float, why: str) -> None:
         super().__init__(
-            f"no CARLA server answers at {host}:{port} within {timeout_s:g} s: {why}; start one, or give another address",
+            f"no CARLA server answers at {host}:{port} within {timeout_s:g} s: {why}; start one or give its address",
             host=host,
             port=port,
         )

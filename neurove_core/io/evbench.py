@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
-from neurove_core.extras import MissingExtra
 from neurove_core.geometry import Twists
 from neurove_core.io.errors import BrokenRecording, UnknownSource
+from neurove_core.io.mat5 import MatFault, read_columns
 from neurove_core.io.recording import SUPPORTED, EventsOnly, in_chunks, whole
 from protocol.errors import EventOutsideSensor, TimeBackwards
 from protocol.events import Events, Sensor, check_events
@@ -19,8 +20,8 @@ DAVIS240B = Sensor(240, 180)
 """What they were recorded with; of its columns 190 are used."""
 
 COLUMNS: Final = ("ts", "x", "y", "pol")
-MAX_EVENTS: Final = (64 << 20) // 7
-"""A .mat file can not be read in parts, so a longer one is refused; theirs have some 300,000 events of 7 bytes."""
+MAX_COLUMN_BYTES: Final = 16 << 20
+"""A packed column can not be read in parts, so a longer one is refused; theirs have some 300,000 events of 7 bytes."""
 
 TRUTH: Final = "ground-truth_3Dcam.txt"
 FRAME_S: Final = 0.05
@@ -49,17 +50,11 @@ class EvbenchRecording(EventsOnly):
             sensor: the pixel array; by default a DAVIS240b's.
 
         Raises:
-            MissingExtra: scipy is not installed.
             UnknownSource: the file is no MATLAB 5 file with these four columns, or a too long one.
         """
-        shapes = {name: shape for name, shape, _ in _scipy(path, "whosmat")}
-        if not set(COLUMNS) <= set(shapes) or len({shapes[name] for name in COLUMNS}) != 1:
+        columns = _columns(path)
+        if len({column.size for column in columns.values()}) != 1 or set(columns) != set(COLUMNS):
             raise UnknownSource(path, SUPPORTED, f"it has not the columns {', '.join(COLUMNS)} of one length")
-        n = int(np.prod(shapes["ts"], dtype=np.int64))
-        if n > MAX_EVENTS:
-            raise UnknownSource(
-                path, SUPPORTED, f"its {n} events are more than {MAX_EVENTS}, and can not be read in parts"
-            )
         truth = ("twists",) if _rotation(path) is not None else ()
         return cls(path, sensor or DAVIS240B, ("events", *truth))
 
@@ -72,7 +67,7 @@ class EvbenchRecording(EventsOnly):
         """All events from the beginning; see `Recording`. The whole file is read at once.
 
         Raises:
-            BrokenRecording: it can not be read, or an event is outside the sensor or earlier than the one before.
+            BrokenRecording: an event is outside the sensor or earlier than the one before.
         """
         events = self._events()
         try:
@@ -98,33 +93,19 @@ class EvbenchRecording(EventsOnly):
         return Twists(t[[0, -1]], twist) if t.size else None
 
     def _events(self) -> Events:
-        try:
-            data = _scipy(self.path, "loadmat", variable_names=COLUMNS)
-            t, x, y, p = (data[name].ravel().astype(np.int64) for name in COLUMNS)
-        except UnknownSource as error:
-            raise BrokenRecording(self.path, "its columns", str(error.details["why"])) from None
+        columns = _columns(self.path)
+        t, x, y, p = (columns[name].astype(np.int64) for name in COLUMNS)
         bad = (x < 0) | (y < 0) | (y >= self.sensor.height) | ((p != 0) & (p != 1))
         if bad.any():  # told as an event outside: turned over, a y would else be a large one, and a polarity be lost
             x = np.where(bad, np.iinfo(np.uint16).max, x)
         return Events.from_columns(t, x.astype(np.uint16), np.maximum(self.sensor.height - 1 - y, 0), p & 1)
 
 
-def _scipy(path: Path, function: str, **options: Any) -> Any:
-    """What a function of scipy.io makes of the file.
-
-    Raises:
-        MissingExtra: scipy is not installed. UnknownSource: it makes nothing of it.
-    """
+def _columns(path: Path) -> dict[str, NDArray[Any]]:
     try:
-        import scipy.io
-    except ImportError:
-        raise MissingExtra("scipy", "recordings") from None
-    try:
-        return getattr(scipy.io, function)(path, **options)
-    except OSError:
-        raise
-    except Exception as error:  # noqa: BLE001 it has no error of its own: a broken file shows as any kind
-        raise UnknownSource(path, SUPPORTED, f"it can not be read as a MATLAB 5 file: {error}") from None
+        return read_columns(path, COLUMNS, MAX_COLUMN_BYTES)
+    except MatFault as fault:
+        raise UnknownSource(path, SUPPORTED, f"it can not be read as a MATLAB 5 file: {fault}") from None
 
 
 def _rotation(path: Path) -> float | None:
