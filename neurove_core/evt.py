@@ -22,7 +22,7 @@ EVT2_WORDS: Final = (0x0, 0x1, 0x8, 0xA, 0xE, 0xF)
 EVT3_WORDS: Final = (0x0, 0x2, 0x3, 0x4, 0x5, 0x6, 0x7, 0x8, 0xA, 0xE, 0xF)
 """The known types of words, by their first four bits."""
 
-_ADDR_Y, _ADDR_X, _BASE_X, _VECT_12, _VECT_8, _TIME_LOW, _TIME_HIGH = 0, 2, 3, 4, 5, 6, 8
+_ADDR_Y, _ADDR_X, _BASE_X, _VECT_12, _VECT_8, TIME_LOW, TIME_HIGH = 0, 2, 3, 4, 5, 6, 8
 _EVT3_SKIPPED = 1 << 0x7 | 1 << 0xA | 1 << 0xE | 1 << 0xF  # CONTINUED_4, EXT_TRIGGER, OTHERS, CONTINUED_12
 _EVT2_SKIPPED = (0xA, 0xE, 0xF)  # EXT_TRIGGER, OTHERS, CONTINUED
 _ONE = np.uint64(1)
@@ -50,12 +50,14 @@ class Evt2State(NamedTuple):
 
 
 @compiled
-def _signed(word: np.unsignedinteger[Any]) -> int:  # pragma: no cover (machine code)
+def signed(word: np.unsignedinteger[Any]) -> int:  # pragma: no cover (machine code)
+    """A word as a number to reckon with."""
     return np.int64(word)  # type: ignore[return-value]  # int() would stay unsigned in numba, and mix to float
 
 
 @compiled
-def _counted_on(high: int, value: int, period: int) -> int:  # pragma: no cover (machine code)
+def counted_on(high: int, value: int, period: int) -> int:  # pragma: no cover (machine code)
+    """A counter that went on to show `value`, over its wraps: a little back is back, more is once around."""
     return high + (value - high + STEP_BACK) % period - STEP_BACK
 
 
@@ -84,45 +86,47 @@ def evt3_decode(
     """
     timed, high, low, last_us, y, base_x, p = state
     t_out, x_out, y_out, p_out = out
+    if t_out.size < VECTOR_EVENTS:  # below 0 the unsigned room would be without end
+        return state, 0, 0, OK
     n, room = np.uint64(0), np.uint64(t_out.size - VECTOR_EVENTS)  # unsigned: no index needs a look for being negative
     base = high << 12
     for i in range(words.size):
-        word = _signed(words[i])
+        word = signed(words[i])
         kind, value = word >> 12, word & 0xFFF
         if kind == _ADDR_X:
             if timed and y >= 0:
                 if n > room:
-                    return Evt3State(timed, high, low, last_us, y, base_x, p), i, _signed(n), OK
+                    return Evt3State(timed, high, low, last_us, y, base_x, p), i, signed(n), OK
                 last_us = max(last_us, base + low)
                 x = value & 0x7FF
                 t_out[n], x_out[n], y_out[n], p_out[n] = last_us, x, y, value >> 11
                 if (x >= width) | (y >= height):
-                    return Evt3State(timed, high, low, last_us, y, base_x, p), i, _signed(n), OUTSIDE
+                    return Evt3State(timed, high, low, last_us, y, base_x, p), i, signed(n), OUTSIDE
                 n += _ONE
         elif kind == _ADDR_Y:
             y = value & 0x7FF
-        elif kind == _TIME_LOW:
+        elif kind == TIME_LOW:
             low = value
         elif (_EVT3_SKIPPED >> kind) & 1:
             pass
-        elif kind == _TIME_HIGH:
+        elif kind == TIME_HIGH:
             if not timed:
                 timed, high, low, last_us = 1, value, 0, value << 12
                 base = high << 12
             elif value != high & 0xFFF:
-                high, low = _counted_on(high, value, 1 << 12), 0  # the old TIME_LOW belongs to the old TIME_HIGH
+                high, low = counted_on(high, value, 1 << 12), 0  # the old TIME_LOW belongs to the old TIME_HIGH
                 base = high << 12
         elif kind in (_VECT_12, _VECT_8):
             mask = value if kind == _VECT_12 else value & 0xFF
             if mask and timed and y >= 0 and base_x >= 0:
                 if n > room:
-                    return Evt3State(timed, high, low, last_us, y, base_x, p), i, _signed(n), OK
+                    return Evt3State(timed, high, low, last_us, y, base_x, p), i, signed(n), OK
                 last_us = max(last_us, base + low)
                 while mask:
                     x = base_x + _BIT[(mask & -mask) % 13]
                     t_out[n], x_out[n], y_out[n], p_out[n] = last_us, x, y, p
                     if (x >= width) | (y >= height):
-                        return Evt3State(timed, high, low, last_us, y, base_x, p), i, _signed(n), OUTSIDE
+                        return Evt3State(timed, high, low, last_us, y, base_x, p), i, signed(n), OUTSIDE
                     n += _ONE
                     mask &= mask - 1
             if base_x >= 0:
@@ -130,8 +134,8 @@ def evt3_decode(
         elif kind == _BASE_X:
             base_x, p = value & 0x7FF, value >> 11
         else:
-            return Evt3State(timed, high, low, last_us, y, base_x, p), i, _signed(n), ILLEGAL
-    return Evt3State(timed, high, low, last_us, y, base_x, p), words.size, _signed(n), OK
+            return Evt3State(timed, high, low, last_us, y, base_x, p), i, signed(n), ILLEGAL
+    return Evt3State(timed, high, low, last_us, y, base_x, p), words.size, signed(n), OK
 
 
 @compiled
@@ -158,7 +162,7 @@ def evt2_decode(
     timed, high, last_us = state
     n = 0
     for i in range(words.size):
-        word = _signed(words[i])
+        word = signed(words[i])
         kind = word >> 28
         if kind <= 1:
             if timed:
@@ -170,9 +174,9 @@ def evt2_decode(
                 if x >= width or y >= height:
                     return Evt2State(timed, high, last_us), i, n, OUTSIDE
                 n += 1
-        elif kind == _TIME_HIGH:
+        elif kind == TIME_HIGH:
             value = word & 0xFFF_FFFF
-            high = _counted_on(high, value, 1 << 28) if timed else value
+            high = counted_on(high, value, 1 << 28) if timed else value
             if not timed:
                 timed, last_us = 1, high << 6
         elif kind not in _EVT2_SKIPPED:
@@ -210,7 +214,7 @@ def evt3_reference(
             case 0x8 if not s["timed"]:
                 s.update(timed=1, high=value, low=0, last_us=value << 12)
             case 0x8:
-                step = _step(value - s["high"] % (1 << 12), 1 << 12)
+                step = step_of(value - s["high"] % (1 << 12), 1 << 12)
                 s.update(high=s["high"] + step, low=0 if step else s["low"])
             case 0x7 | 0xA | 0xE | 0xF:
                 pass
@@ -237,7 +241,7 @@ def evt2_reference(
     highs = [state.high]
     for value in (words[ticks] & 0xFFF_FFFF).tolist():
         first = len(highs) == 1 and not state.timed
-        highs.append(value if first else highs[-1] + _step(value - highs[-1] % (1 << 28), 1 << 28))
+        highs.append(value if first else highs[-1] + step_of(value - highs[-1] % (1 << 28), 1 << 28))
     floor_us = state.last_us if state.timed or not ticks.size else highs[1] << 6
 
     at = np.flatnonzero(kinds[:read] <= 1)
@@ -255,140 +259,8 @@ def evt2_reference(
     return Evt2State(int(state.timed or ticks.size > 0), highs[-1], last_us), read, events, verdict
 
 
-def _step(difference: int, period: int) -> int:
+def step_of(difference: int, period: int) -> int:
     """How far a counter went that shows this difference: a little back is back, more is once around."""
     if difference < -STEP_BACK:
         return difference + period
     return difference - period if difference >= period - STEP_BACK else difference
-
-
-# --- triggers: a pass of its own, so that the decoders of events need not look ----------------------------------------
-
-Columns = tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.uint8]]
-"""Time [us], channel and level (1 rising, 0 falling) of trigger edges, each (N,); the fields of io's Triggers."""
-
-_TRIGGER = 0xA
-
-
-class TriggerState(NamedTuple):
-    """What the search for triggers carries from word to word; the default is the start of a recording."""
-
-    timed: int = 0  # 1 from the first TIME_HIGH on; before it triggers have no time and are ignored
-    high: int = 0  # TIME_HIGH, counted on over its wraps [4096 us in EVT3, 64 us in EVT2]
-    low: int = 0  # TIME_LOW [us], of EVT3 alone
-    last_us: int = 0  # time of the last trigger [us]
-
-
-def evt3_triggers(words: NDArray[np.uint16], state: TriggerState) -> tuple[TriggerState, Columns]:
-    """The edges on the trigger inputs among EVT3 words; the clock counts on and never runs back, as in `evt3_decode`.
-
-    Source: docs.prophesee.ai, EVT 3.0 format, EXT_TRIGGER: channel in bits 8 to 11, level in bit 0.
-
-    Args:
-        words: (N,) words as the camera wrote them, all of known types (the decoder of events tells others).
-        state: of the words before these.
-
-    Returns:
-        The state after them, and the triggers.
-    """
-    return _triggers(words, state, 12)
-
-
-def evt2_triggers(words: NDArray[np.uint32], state: TriggerState) -> tuple[TriggerState, Columns]:
-    """The edges on the trigger inputs among EVT2 words; see `evt3_triggers`.
-
-    Source: docs.prophesee.ai, EVT 2.0 format, EXT_TRIGGER: time in bits 22 to 27, channel in 8 to 12, level in bit 0.
-    """
-    return _triggers(words, state, 28)
-
-
-def _triggers(words: NDArray[Any], state: TriggerState, shift: int) -> tuple[TriggerState, Columns]:
-    room = np.count_nonzero(words >> shift == _TRIGGER)
-    out = np.empty(room, np.int64), np.empty(room, np.uint8), np.empty(room, np.uint8)
-    state, n = (_evt3_triggers if shift == 12 else _evt2_triggers)(words, state, out)
-    return state, (out[0][:n], out[1][:n], out[2][:n])
-
-
-@compiled
-def _evt3_triggers(
-    words: NDArray[Any], state: TriggerState, out: Columns
-) -> tuple[TriggerState, int]:  # pragma: no cover (machine code)
-    timed, high, low, last_us = state
-    n = 0
-    for i in range(words.size):
-        word = _signed(words[i])
-        kind, value = word >> 12, word & 0xFFF
-        if kind == _TIME_LOW:
-            low = value
-        elif kind == _TIME_HIGH:
-            if not timed:
-                timed, high, low, last_us = 1, value, 0, value << 12
-            elif value != high & 0xFFF:
-                high, low = _counted_on(high, value, 1 << 12), 0
-        elif kind == _TRIGGER and timed:
-            last_us = max(last_us, (high << 12) + low)
-            out[0][n], out[1][n], out[2][n] = last_us, value >> 8, value & 1
-            n += 1
-    return TriggerState(timed, high, low, last_us), n
-
-
-@compiled
-def _evt2_triggers(
-    words: NDArray[Any], state: TriggerState, out: Columns
-) -> tuple[TriggerState, int]:  # pragma: no cover (machine code)
-    timed, high, low, last_us = state
-    n = 0
-    for i in range(words.size):
-        word = _signed(words[i])
-        kind = word >> 28
-        if kind == _TIME_HIGH:
-            value = word & 0xFFF_FFFF
-            high = _counted_on(high, value, 1 << 28) if timed else value
-            if not timed:
-                timed, last_us = 1, high << 6
-        elif kind == _TRIGGER and timed:
-            last_us = max(last_us, (high << 6) + ((word >> 22) & 0x3F))
-            out[0][n], out[1][n], out[2][n] = last_us, (word >> 8) & 0x1F, word & 1
-            n += 1
-    return TriggerState(timed, high, low, last_us), n
-
-
-def evt3_triggers_reference(words: NDArray[np.uint16], state: TriggerState) -> tuple[TriggerState, Columns]:
-    """The plain twin of `evt3_triggers`."""
-    s, rows = state._asdict(), []
-    for word in words.tolist():
-        kind, value = word >> 12, word & 0xFFF
-        if kind == _TIME_LOW:
-            s["low"] = value
-        elif kind == _TIME_HIGH:
-            _show(s, value, 1 << 12, 1 << 12)
-        elif kind == _TRIGGER and s["timed"]:
-            s["last_us"] = max(s["last_us"], (s["high"] << 12) + s["low"])
-            rows.append((s["last_us"], value >> 8, value & 1))
-    return TriggerState(**s), _columns(rows)
-
-
-def evt2_triggers_reference(words: NDArray[np.uint32], state: TriggerState) -> tuple[TriggerState, Columns]:
-    """The plain twin of `evt2_triggers`."""
-    s, rows = state._asdict(), []
-    for word in words.tolist():
-        if word >> 28 == _TIME_HIGH:
-            _show(s, word & 0xFFF_FFFF, 1 << 28, 1 << 6)
-        elif word >> 28 == _TRIGGER and s["timed"]:
-            s["last_us"] = max(s["last_us"], (s["high"] << 6) + (word >> 22 & 0x3F))
-            rows.append((s["last_us"], word >> 8 & 0x1F, word & 1))
-    return TriggerState(**s), _columns(rows)
-
-
-def _show(s: dict[str, int], value: int, period: int, tick_us: int) -> None:
-    """A TIME_HIGH that wraps after this many ticks, as the references count it on."""
-    if not s["timed"]:
-        s.update(timed=1, high=value, low=0, last_us=value * tick_us)
-        return
-    step = _step(value - s["high"] % period, period)
-    s.update(high=s["high"] + step, low=0 if step else s["low"])
-
-
-def _columns(rows: list[tuple[int, int, int]]) -> Columns:
-    t, channel, level = zip(*rows, strict=True) if rows else ((), (), ())
-    return np.array(t, np.int64), np.array(channel, np.uint8), np.array(level, np.uint8)

@@ -4,7 +4,7 @@ A kernel is a pure function: state goes in and comes out as a named tuple, array
 It is compiled by numba on first use, cached on disk, and runs without the GIL. Its reference (`*_reference`) does the
 same in plain Python or numpy, written for reading; tests hold the two together bit for bit.
 
-Here is the binning; the decoders of Prophesee words live in `evt.py`, and are named here too.
+Here is the binning; what reads Prophesee words lives in `evt.py` and `triggers.py`, and is named here too.
 """
 
 import numpy as np
@@ -19,15 +19,13 @@ from neurove_core.evt import (
     VECTOR_EVENTS,
     Evt2State,
     Evt3State,
-    TriggerState,
     evt2_decode,
     evt2_reference,
-    evt2_triggers,
     evt3_decode,
     evt3_reference,
-    evt3_triggers,
 )
 from neurove_core.geometry import OUTSIDE as NO_CELL
+from neurove_core.triggers import TriggerState, evt2_triggers, evt3_triggers
 from protocol.events import Events
 
 __all__ = [

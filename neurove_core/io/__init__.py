@@ -4,11 +4,13 @@ from pathlib import Path
 
 from neurove_core.io.aedat2 import Aedat2Recording
 from neurove_core.io.aedat4 import Aedat4Recording
+from neurove_core.io.carla import CarlaRecording
 from neurove_core.io.dat import DatRecording
 from neurove_core.io.datasets import open_hdf5
 from neurove_core.io.dsec_write import write_dsec
 from neurove_core.io.ecd import EcdRecording
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
+from neurove_core.io.evbench import EvbenchRecording
 from neurove_core.io.eventstream import EventStreamRecording
 from neurove_core.io.mcap_file import McapFile
 from neurove_core.io.mcap_layout import PROFILE
@@ -93,6 +95,10 @@ def _open_path(path: Path, sensor: Sensor | None, topic: str | None) -> Recordin
             return DatRecording.open(path, sensor)
         case ".es":
             return EventStreamRecording.open(path, sensor)
+        case ".npz":
+            return CarlaRecording.open(path, sensor)
+        case ".mat":
+            return EvbenchRecording.open(path, sensor)
         case ".txt" | ".zip":
             return EcdRecording.open(path, path.name, sensor)
         case suffix:

@@ -31,3 +31,16 @@ class BrokenRecording(NeuroVEError):
 
     def __init__(self, path: Path, where: str, why: str) -> None:
         super().__init__(f"{path}: broken at {where}: {why}", value=str(path), where=where, why=why)
+
+
+class NoCarlaServer(NeuroVEError):
+    """No CARLA simulator answers."""
+
+    code = "no_carla_server"
+
+    def __init__(self, host: str, port: int, timeout_s: float, why: str) -> None:
+        super().__init__(
+            f"no CARLA server answers at {host}:{port} within {timeout_s:g} s: {why}; start one or give its address",
+            host=host,
+            port=port,
+        )

@@ -1,6 +1,7 @@
 """Files of a recording that lie together, in a folder or in a .zip, and the images among them."""
 
 import io
+import lzma
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -14,6 +15,9 @@ from numpy.typing import NDArray
 from neurove_core.extras import MissingExtra
 from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.recording import SUPPORTED
+
+BROKEN_ZIP = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, NotImplementedError, RuntimeError, ValueError)
+"""What the standard library raises over an archive that is not whole, or packed in a way that it does not know."""
 
 MAX_IMAGE_BYTES = 64 << 20  # of one image's file
 
@@ -45,7 +49,7 @@ class Place(NamedTuple):
                 return
             with zipfile.ZipFile(self.path) as archive, archive.open(self.inside + name) as packed:
                 yield packed
-        except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:
+        except BROKEN_ZIP as error:
             raise BrokenRecording(self.path, name, f"it can not be unpacked: {error}") from None
 
 
@@ -58,7 +62,7 @@ def folder_in_zip(path: Path, wanted: str) -> str:
     try:
         with zipfile.ZipFile(path) as archive:
             names = [name for name in archive.namelist() if name.rpartition("/")[2] == wanted]
-    except zipfile.BadZipFile as error:
+    except BROKEN_ZIP as error:
         raise UnknownSource(path, SUPPORTED, f"it is no zip file: {error}") from None
     if not names:
         raise UnknownSource(path, SUPPORTED, f"there is no {wanted} in it")

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core import evt
+from neurove_core import evt, triggers
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
 from neurove_core.io.recording import BLOCK_BYTES, CHUNK_EVENTS, SUPPORTED, EventsOnly, Triggers, room
 from protocol.errors import InvalidField
@@ -17,7 +17,7 @@ from protocol.events import Events, Sensor
 HEADER_BYTES = 64 << 10  # a header is some 500 bytes; more than this is none
 
 Decode = Callable[[NDArray[Any], Any, int, int, Events], tuple[Any, int, int, int]]
-FindTriggers = Callable[[NDArray[Any], evt.TriggerState], tuple[evt.TriggerState, evt.Columns]]
+FindTriggers = Callable[[NDArray[Any], triggers.TriggerState], tuple[triggers.TriggerState, triggers.Columns]]
 
 
 class Words(NamedTuple):
@@ -35,8 +35,8 @@ def _known(*kinds: int) -> NDArray[np.bool_]:
 
 
 FORMATS = {
-    "EVT2": Words(np.dtype("<u4"), _known(*evt.EVT2_WORDS), evt.evt2_decode, evt.Evt2State(), evt.evt2_triggers),
-    "EVT3": Words(np.dtype("<u2"), _known(*evt.EVT3_WORDS), evt.evt3_decode, evt.Evt3State(), evt.evt3_triggers),
+    "EVT2": Words(np.dtype("<u4"), _known(*evt.EVT2_WORDS), evt.evt2_decode, evt.Evt2State(), triggers.evt2_triggers),
+    "EVT3": Words(np.dtype("<u2"), _known(*evt.EVT3_WORDS), evt.evt3_decode, evt.Evt3State(), triggers.evt3_triggers),
 }
 _FORMAT_OF_EVT = {"2.0": "EVT2", "2.1": "EVT21", "3.0": "EVT3"}
 
@@ -160,7 +160,7 @@ class PropheseeRecording(EventsOnly):
             BrokenRecording: a word is cut or of no known type; it names the byte.
         """
         dtype, known, _, _, find = self.words
-        at, state = self.header_bytes, evt.TriggerState()
+        at, state = self.header_bytes, triggers.TriggerState()
         with self.path.open("rb") as file:
             file.seek(at)
             while block := file.read(BLOCK_BYTES):

@@ -26,6 +26,8 @@ SUPPORTED: Final = (
     "FILE.es (Event Stream)",
     "FILE.mcap (our own, of `neurove record` and `neurove convert`)",
     "FILE.bag (ROS 1), FILE.db3, FILE.mcap or their folder (ROS 2)",
+    "FILE.mat (eventVision-evbench)",
+    "FILE.npz (CARLA's event camera)",
     "a folder with events.txt, a FILE.zip with one, or FILE.txt (Event Camera Dataset)",
     "FILE.h5, FILE.hdf5 (MVSEC, DSEC, M3ED)",
     "pattern:// (built-in)",

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from neurove_core import evt, kernels
+from neurove_core import kernels, triggers
 from neurove_core.kernels import ILLEGAL, OK, OUTSIDE, VECTOR_EVENTS, Evt2State, Evt3State
 from protocol import Events, Sensor
 from tests.builders import make_events
@@ -198,6 +198,15 @@ def test_a_vector_that_does_not_fit_any_more_is_left_for_the_next_call(room_for)
     assert_same(decode(EVT3, words, room_for=room_for)[2], decode(EVT3, words)[2])
 
 
+def test_without_room_for_a_vector_nothing_is_read_or_written():
+    out = room(VECTOR_EVENTS)
+    _, read, n, verdict = kernels.evt3_decode(
+        evt3((TIME_HIGH, 0), (ADDR_Y, 1), HIT), Evt3State(), 1280, 720, out.span(0, VECTOR_EVENTS - 1)
+    )
+    assert (read, n, verdict) == (0, 0, OK)
+    assert not out.x.any()
+
+
 HIT = (ADDR_X, 7)
 
 
@@ -279,31 +288,31 @@ def test_triggers_and_monitoring_words_make_no_event():
 def test_triggers_are_found_with_their_time_channel_and_level():
     early = [(TRIGGER, 1), (TIME_LOW, 9)]
     words = evt3(*early, (TIME_HIGH, 2), (TIME_LOW, 7), HIT, (TRIGGER, 1 << 8 | 1), (TIME_HIGH, 3), (TRIGGER, 1 << 8))
-    _, (t, channel, level) = evt.evt3_triggers(words, evt.TriggerState())
+    _, (t, channel, level) = triggers.evt3_triggers(words, triggers.TriggerState())
     assert (t.tolist(), channel.tolist(), level.tolist()) == ([2 * 4096 + 7, 3 * 4096], [1, 1], [1, 0])
     words = evt2((TRIGGER, 1), (8, 5), (TRIGGER, 63 << 22 | 17 << 8 | 1), (1, cd(63, 1, 1)))
-    _, (t, channel, level) = evt.evt2_triggers(words, evt.TriggerState())
+    _, (t, channel, level) = triggers.evt2_triggers(words, triggers.TriggerState())
     assert (t.tolist(), channel.tolist(), level.tolist()) == ([5 * 64 + 63], [17], [1])
 
 
 @given(words=evt3_streams(), cuts=st.lists(st.integers(0, 200), max_size=6))
 def test_compiled_evt3_triggers_are_their_reference_however_the_words_are_cut(words, cuts):
-    assert_same_triggers(evt.evt3_triggers, evt.evt3_triggers_reference, np.split(words, sorted(cuts)), words)
+    assert_same_triggers(triggers.evt3_triggers, triggers.evt3_triggers_reference, np.split(words, sorted(cuts)), words)
 
 
 @given(words=evt2_streams(), cuts=st.lists(st.integers(0, 200), max_size=6))
 def test_compiled_evt2_triggers_are_their_reference_however_the_words_are_cut(words, cuts):
-    assert_same_triggers(evt.evt2_triggers, evt.evt2_triggers_reference, np.split(words, sorted(cuts)), words)
+    assert_same_triggers(triggers.evt2_triggers, triggers.evt2_triggers_reference, np.split(words, sorted(cuts)), words)
 
 
 def assert_same_triggers(
     decode: Callable[..., Any], reference: Callable[..., Any], pieces: Sequence[NDArray[Any]], words: NDArray[Any]
 ) -> None:
-    state, parts = evt.TriggerState(), []
+    state, parts = triggers.TriggerState(), []
     for piece in pieces:
         state, columns = decode(piece, state)
         parts.append(columns)
-    want_state, want = reference(words, evt.TriggerState())
+    want_state, want = reference(words, triggers.TriggerState())
     assert state == want_state
     for got, column in zip(zip(*parts, strict=True), want, strict=True):
         np.testing.assert_array_equal(np.concatenate(got), column)
