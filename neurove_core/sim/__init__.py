@@ -1,0 +1,1 @@
+"""Event-camera simulator: scene and trajectory -> events with exact truth, without any recording."""
