@@ -28,17 +28,21 @@ def open_source(source: str, sensor: Sensor | None = None) -> Recording:
     """The recording that `source` names; see SUPPORTED.
 
     Args:
-        source: a file, a folder, or `pattern://`.
+        source: a file, a folder, `pattern://`, or `sim://SCENE?...`.
         sensor: the pixel array; overrides what the recording says of itself.
 
     Raises:
         UnknownSource: there is nothing of this name, or nothing that can be read.
         MissingGeometry: the size of the sensor is neither given nor in the recording.
         BrokenRecording: not even its header is whole.
-        InvalidField: the calibration beside it, or the pattern's query, is not what it must be.
+        InvalidField: the calibration beside it, or the query of a pattern or a simulation, is not what it must be.
     """
     scheme, separator, _ = source.partition("://")
     if separator:
+        if scheme == "sim":
+            from neurove_core.sim.source import simulation_of  # it needs this package itself
+
+            return simulation_of(source, sensor)
         if scheme != "pattern":
             raise UnknownSource(source, SUPPORTED, f"unknown scheme {scheme}://")
         return Pattern.from_url(source, sensor)

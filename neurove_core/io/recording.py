@@ -21,6 +21,7 @@ SUPPORTED: Final = (
     "FILE.aedat4 (DV)",
     "FILE.raw (Prophesee EVT2, EVT3)",
     "a folder with events.txt, or FILE.txt (Event Camera Dataset)",
+    "sim://SCENE?trajectory=...&seed=... (built-in simulator)",
     "pattern:// (built-in)",
 )
 """The sources that `open_source` knows."""

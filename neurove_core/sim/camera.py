@@ -171,7 +171,10 @@ def rays_of(info: CameraInfo) -> Rays:
     high = [np.maximum.reduceat(values[order] + edge, first) for values, edge in ((x, edge_x), (y, edge_y))]
     tile_row, tile_column = np.divmod(names, -(-info.width // TILE))
     return Rays(
-        *(values[order] for values in (x, y, step_x, step_y)),
+        x[order],
+        y[order],
+        step_x[order],
+        step_y[order],
         column[order].astype(np.uint16),
         row[order].astype(np.uint16),
         np.append(first, order.size),

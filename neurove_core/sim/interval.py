@@ -17,7 +17,7 @@ from neurove_core.sim.cull import Candidates
 from neurove_core.sim.pixels import Found, Mismatch, PixelState, find_crossings
 from neurove_core.sim.render import Backdrop, render_span
 
-GRIDS: Final = (12, 48, 192, 768)
+GRIDS: Final = (60, 240, 960)
 """Into how many equal steps an interval may be cut; a tile is rendered after each or after some of them."""
 
 
@@ -87,7 +87,7 @@ def run_tiles(
         backdrop: of the world.
         rays: of the camera.
         candidates: what each tile may see in the interval.
-        views: (G + 1, N, VIEW) after each step of the grid, from the interval's start on.
+        views: (G + 1, candidates.kept, VIEW) after each step of the grid, from the interval's start on.
         rotations: (G + 1, 3, 3) likewise.
         parts: (M,) into how many steps each tile's interval is cut; each divides G.
         span_us: the interval's length.

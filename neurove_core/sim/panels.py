@@ -1,6 +1,6 @@
 """What a simulated world is made of: textured rectangles, and a sky with a far horizon."""
 
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,9 @@ ENDLESS: Final = 1e5
 
 SKY_ROWS: Final = 64
 SKY_COLUMNS: Final = 1024
+CLEAR2: Final = 0.25
+"""Up to which squared share of far_m a panel is seen clearly."""
+
 SKY_TOP: Final = 0.5
 """Slope (height over distance) of the sky's last row; what is higher looks like it."""
 
@@ -35,28 +38,26 @@ class Panels(NamedTuple):
 
     @classmethod
     def join(cls, parts: list["Panels"]) -> "Panels":
-        """All panels of the parts."""
-        if not parts:
-            return cls(*(np.empty((0, 3)) for _ in range(3)), *(np.empty((0, 2)) for _ in range(3)), *_NONE)
-        return cls(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+        """All panels of the parts, of which there is at least one."""
+        columns: list[Any] = [np.concatenate(column) for column in zip(*parts, strict=True)]
+        return cls(*columns)
 
     def take(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> "Panels":
         """Some of them."""
-        return Panels(*(column[chosen] for column in self))
-
-
-_NONE = (np.empty(0, np.int64), np.empty(0))
+        columns: list[Any] = [column[chosen] for column in self]
+        return Panels(*columns)
 
 
 class Sky(NamedTuple):
     """What lies behind all panels, infinitely far: a skyline by azimuth and slope; and the haze before it.
 
-    A panel fades into the haze with its distance d as (1 - d^2 / far_m^2)^2, so that nothing appears or goes suddenly.
+    From CLEAR2 on a panel fades into it with its distance d, as (1 - d^2 / far_m^2)^2, until nothing is left at far_m:
+    so nothing appears or goes suddenly.
     """
 
     image: NDArray[np.float32]  # (SKY_ROWS, SKY_COLUMNS) linear intensity, row 0 at the horizon
-    haze: float  # linear intensity of the haze, and of all below the horizon that no panel covers
-    far_m: float  # where a panel is all haze
+    haze: float  # linear intensity of all below the horizon that no panel covers
+    far_m: float  # where nothing is left of a panel
 
 
 def panel(
@@ -95,10 +96,12 @@ def panel(
     )
 
 
-def upright(
-    start: NDArray[np.float64], end: NDArray[np.float64], top_m: float, texture: str, **more: object
-) -> Panels:
-    """A rectangle that stands on the ground between two points (x, z) and is so high [m]; it is lit by where it looks."""
+NOTHING: Final = panel(np.zeros(3), np.eye(3)[0], np.eye(3)[1], (1.0, 1.0), NAMES[0]).take(np.zeros(1, bool))
+"""No panels."""
+
+
+def upright(start: NDArray[np.float64], end: NDArray[np.float64], top_m: float, texture: str, **more: object) -> Panels:
+    """A rectangle on the ground between two points (x, z), so high [m], lit by the way it looks; `more` as of panel."""
     along = np.array([end[0] - start[0], 0.0, end[1] - start[1]])
     length = float(np.linalg.norm(along))
     centre = np.array([(start[0] + end[0]) / 2, -top_m / 2, (start[1] + end[1]) / 2])
@@ -107,8 +110,14 @@ def upright(
 
 
 def box(
-    centre: NDArray[np.float64], heading: NDArray[np.float64], size_m: tuple[float, float, float], texture: str,
-    *, repeat_m: float = 3.0, offset: tuple[float, float] = (0.0, 0.0), bottom_m: float = 0.0,
+    centre: NDArray[np.float64],
+    heading: NDArray[np.float64],
+    size_m: tuple[float, float, float],
+    texture: str,
+    *,
+    repeat_m: float = 3.0,
+    offset: tuple[float, float] = (0.0, 0.0),
+    bottom_m: float = 0.0,
 ) -> Panels:
     """Four sides and the top of a box on the ground, or above it.
 

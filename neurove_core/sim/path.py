@@ -85,7 +85,7 @@ class Path:
             self.points.append(self.points[-1] + ahead)
             self._passed_s.append(np.inf)
             return
-        t_s = self._asked_s + _PERIOD_S * np.arange(1, _SPAN + 1)
+        t_s = self._asked_s + _PERIOD_S * np.arange(1, _SPAN + 1, dtype=np.float64)
         t_s = t_s[t_s <= self._trajectory.duration_s]
         self._over = t_s.size < _SPAN
         if not t_s.size:

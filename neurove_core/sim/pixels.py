@@ -7,7 +7,7 @@ Differs: bandwidth and shot noise do not depend on how bright it is; a shot nois
 """
 
 import math
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,9 @@ class PixelConfig(Config):
     )
     eps: float = Field(0.001, gt=0, le=1, description="L = log(I + eps), I from 0 to 1 (ESIM, CARLA).")
 
+
+USUAL: Final = PixelConfig()
+"""Pixels as they usually are."""
 
 QUIET: Final = PixelConfig(
     threshold_sigma=0, refractory_us=0, leak_hz=0, shot_noise_hz=0, hot_fraction=0, hot_hz=0, cutoff_hz=0
@@ -225,11 +228,12 @@ def add_noise(pixels: Pixels, start_us: int, stop_us: int, found: Found) -> Foun
     where = np.concatenate([rng.integers(pixels.n, size=shots), np.repeat(pixels.hot, hot)])
     t, p = rng.integers(span, size=where.size), rng.integers(2, size=where.size)
     n = found.n
-    columns = [
-        np.concatenate([old[:n], new.astype(old.dtype)])
-        for old, new in zip((found.t, found.pixel, found.p), (t, where, p), strict=True)
-    ]
-    return Found(*columns, n + where.size)
+    return Found(
+        np.append(found.t[:n], t.astype(np.int32)),
+        np.append(found.pixel[:n], where.astype(np.int32)),
+        np.append(found.p[:n], p.astype(np.uint8)),
+        n + where.size,
+    )
 
 
 @compiled
@@ -258,7 +262,8 @@ def put_in_order(
         begin[found.t[i]] += 1
     out_t, out_pixel, out_p = np.empty(found.n, np.int32), np.empty(found.n, np.int32), np.empty(found.n, np.uint8)
     n = 0
-    for i in order:
+    for k in range(found.n):
+        i = order[k]
         pixel = found.pixel[i]
         t = start_us + found.t[i]
         if t - last_us[pixel] < refractory_us:
@@ -302,7 +307,8 @@ def events_of(
         raise TimeBackwards(0, start_us, stop_us)
     if stop_us - start_us > LONGEST_US:
         raise InvalidField("frame", "t", stop_us, f"at most {LONGEST_US} us after the last frame")
-    state = PixelState(*(column.copy() for column in state))
+    columns: list[Any] = [column.copy() for column in state]
+    state = PixelState(*columns)
     weights = low_pass(pixels.config.cutoff_hz, stop_us - start_us)
     flat, span = np.ascontiguousarray(light, np.float32).ravel(), float(stop_us - start_us)
     found, done = Found.room(4 * flat.size), 0
@@ -320,7 +326,10 @@ def events_of(
 
 def with_more_room(found: Found) -> Found:
     """The same events, and room for twice as many."""
-    more = Found.room(2 * found.t.size)
-    for new, old in zip(more[:3], found[:3], strict=True):
-        new[: found.n] = old[: found.n]
-    return more._replace(n=found.n)
+    more = Found.room(found.t.size)
+    return Found(
+        np.concatenate((found.t, more.t)),
+        np.concatenate((found.pixel, more.pixel)),
+        np.concatenate((found.p, more.p)),
+        found.n,
+    )

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from neurove_core.sim.camera import Rays
 from neurove_core.sim.compile import fast
-from neurove_core.sim.panels import SKY_COLUMNS, SKY_ROWS, SKY_TOP, Panels, Sky
+from neurove_core.sim.panels import CLEAR2, SKY_COLUMNS, SKY_ROWS, SKY_TOP, Panels, Sky
 from neurove_core.sim.textures import CHAIN, LEVEL_START, LEVELS, SIZE, Textures
 
 TAPS: Final = 4
@@ -98,12 +98,14 @@ def _bilinear(texels: NDArray[np.float32], start: int, side: int, u: float, v: f
     v -= 0.5
     left, top = math.floor(u), math.floor(v)
     du, dv = u - left, v - top
-    mask = side - 1
-    i0, j0 = int(left) & mask, start + (int(top) & mask) * side
-    i1, j1 = (int(left) + 1) & mask, start + ((int(top) + 1) & mask) * side
+    mask = np.uint64(side - 1)  # unsigned, for an index that may be negative is asked each time whether it is
+    i0, i1 = np.uint64(np.int64(left)) & mask, np.uint64(np.int64(left) + 1) & mask
+    j0 = np.uint64(start) + (np.uint64(np.int64(top)) & mask) * np.uint64(side)
+    j1 = np.uint64(start) + (np.uint64(np.int64(top) + 1) & mask) * np.uint64(side)
     a, b, c, d = texels[j0 + i0], texels[j0 + i1], texels[j1 + i0], texels[j1 + i1]
     upper, lower = a + du * (b - a), c + du * (d - c)
-    return upper + dv * (lower - upper)
+    value: float = upper + dv * (lower - upper)
+    return value
 
 
 @fast
@@ -118,9 +120,14 @@ def _sample(
     if long2 > 2.25 * short2:
         taps = min(int(math.sqrt(long2 / max(short2, 1e-12)) + 0.999), TAPS)
     width2 = max(short2, long2 / (taps * taps))
-    lod = min(max(0.5 * math.log2(max(width2, 1e-12)), 0.0), _LAST - 1e-6)
+    # the logarithm as straight lines between powers of two: continuous, and at most 0.05 of a level off
+    mantissa, exponent = math.frexp(max(width2, 1.0))
+    lod = min(0.5 * exponent + mantissa - 1.0, _LAST - 1e-6)
     level = int(lod)
-    blend = lod - level
+    # near a level that level alone is read, and the passage from one to the next is the steeper for it
+    blend = min(max(2 * (lod - level) - 0.5, 0.0), 1.0)
+    if blend >= 1 and level + 2 < LEVELS:
+        level, blend = level + 1, 0.0
     start, coarser = base + LEVEL_START[level], base + LEVEL_START[level + 1]
     side = SIZE >> level
     fine = 1.0 / (1 << level)
@@ -153,7 +160,8 @@ def _sky(
     i0, i1 = left % SKY_COLUMNS, (left + 1) % SKY_COLUMNS
     upper = image[top, i0] + du * (image[top, i1] - image[top, i0])
     lower = image[top + 1, i0] + du * (image[top + 1, i1] - image[top + 1, i0])
-    return upper + dv * (lower - upper)
+    value: float = upper + dv * (lower - upper)
+    return value
 
 
 @fast
@@ -175,7 +183,8 @@ def _cover(
     wide_v = min(t * (abs(sx * views[i, 3] - vd * gx) + abs(sy * views[i, 4] - vd * gy)), reach)
     share_u = min(max(in_u / max(wide_u, 1e-12) + 0.5, 0.0), 1.0)
     share_v = min(max(in_v / max(wide_v, 1e-12) + 0.5, 0.0), 1.0)
-    return share_u * share_v
+    share: float = share_u * share_v
+    return share
 
 
 @fast
@@ -188,7 +197,7 @@ def _shade(
     nd = views[i, 6] * x + views[i, 7] * y + views[i, 8]
     gx, gy = sx * views[i, 6] / nd, sy * views[i, 7] / nd
     ku, kv = views[i, 14], views[i, 15]
-    return views[i, 19] * _sample(
+    value: float = views[i, 19] * _sample(
         texels,
         int(views[i, 18]) * CHAIN,
         (t * ud + views[i, 9]) * ku + views[i, 16],
@@ -198,6 +207,7 @@ def _shade(
         t * (sy * views[i, 1] - ud * gy) * ku,
         t * (sy * views[i, 4] - vd * gy) * kv,
     )
+    return value
 
 
 @fast
@@ -232,13 +242,14 @@ def render_span(
     xs, ys, step_x, step_y = rays.x, rays.y, rays.step_x, rays.step_y
     for p in range(first, stop):
         x, y, sx, sy = xs[p], ys[p], step_x[p], step_y[p]
+        slant2 = 1 + x * x + y * y  # squared distance over squared depth
         t1, t2, i1, i2, cover1 = np.inf, np.inf, -1, -1, 0.0
         for k in range(candidates.size):
             if nearest[k] > t2 or (nearest[k] > t1 and cover1 >= 1):
                 break
             i = candidates[k]
             t = views[i, 11] / (views[i, 6] * x + views[i, 7] * y + views[i, 8])
-            if not (NEAR_M < t < t2):
+            if not (NEAR_M < t < t2 and t * t * slant2 < far2):
                 continue
             cover = _cover(views, i, t, x, y, sx, sy)
             if cover <= 0:
@@ -247,22 +258,26 @@ def render_span(
                 t1, t2, i1, i2, cover1 = t, t1, i, i1, cover
             else:
                 t2, i2 = t, i
-        value = 0.0
-        if cover1 < 1:
-            value = _sky(sky, haze, rotation, x, y)
-            if i2 >= 0:
-                value = _hazy(_shade(texels, views, i2, t2, x, y, sx, sy), t2, x, y, haze, far2)
+        far = t1 * t1 * slant2 / far2
+        value, back = 0.0, 0.0
+        if cover1 < 1 or far > CLEAR2:
+            back = value = _sky(sky, haze, rotation, x, y)
+        if cover1 < 1 and i2 >= 0:
+            value = _faded(_shade(texels, views, i2, t2, x, y, sx, sy), back, t2 * t2 * slant2 / far2)
         if i1 >= 0:
-            front = _hazy(_shade(texels, views, i1, t1, x, y, sx, sy), t1, x, y, haze, far2)
+            front = _faded(_shade(texels, views, i1, t1, x, y, sx, sy), back, far)
             value += cover1 * (front - value)
         light[p - first] = math.log(value + eps)
         depth[p] = t1
 
 
 @fast
-def _hazy(value: float, t: float, x: float, y: float, haze: float, far2: float) -> float:  # pragma: no cover
-    far = min(t * t * (1 + x * x + y * y) / far2, 1.0)
-    return haze + (1 - far) * (1 - far) * (value - haze)
+def _faded(value: float, back: float, far: float) -> float:  # pragma: no cover (machine code)
+    """What is seen of an intensity at a squared distance `far`, of that where nothing is to be seen of it."""
+    if far <= CLEAR2:
+        return value
+    clear = (1 - far) / (1 - CLEAR2)
+    return back + clear * clear * (value - back)
 
 
 def render(

@@ -43,15 +43,18 @@ def corridor(trajectory: Moving, seed: int) -> Scene:
 
 
 def room(trajectory: Moving, seed: int) -> Scene:
-    """A textured room around the whole trajectory (of one without end, around its first two minutes), with boards and
-    boxes along its walls.
-    """  # noqa: D205 one sentence
+    """A textured room around the whole trajectory, with boards and boxes along its walls.
+
+    Of a trajectory longer than two minutes it is around those.
+    """
     t_s = np.linspace(0, min(trajectory.duration_s, 120.0), 2400)
     position = trajectory.pose(t_s)[0]
     rng = np.random.default_rng((seed, 103))
     low, high = position.min(0) - rng.uniform(1.6, 2.6, 3), position.max(0) + rng.uniform(1.6, 2.6, 3)
     floor, ceiling = max(0.0, float(position[:, 1].max()) + 0.6), min(-2.6, float(position[:, 1].min()) - 0.9)
-    corners = [np.array(corner) for corner in ((low[0], low[2]), (high[0], low[2]), (high[0], high[2]), (low[0], high[2]))]
+    corners = [
+        np.array(corner) for corner in ((low[0], low[2]), (high[0], low[2]), (high[0], high[2]), (low[0], high[2]))
+    ]
     middle = np.array([(low[0] + high[0]) / 2, 0, (low[2] + high[2]) / 2])
     right, ahead = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
     size = (float(high[0] - low[0]), float(high[2] - low[2]))
@@ -59,7 +62,7 @@ def room(trajectory: Moving, seed: int) -> Scene:
     down = np.array([0, floor, 0])
     parts = [
         panel(middle + down, right, ahead, size, "brick", repeat_m=3.0),
-        panel(middle + [0, ceiling, 0], right, ahead, size, "plaster", repeat_m=3.0),
+        panel(middle + np.array([0, ceiling, 0]), right, ahead, size, "plaster", repeat_m=3.0),
     ]
     for i in range(4):
         start, end = corners[i], corners[(i + 1) % 4]

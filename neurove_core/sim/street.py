@@ -5,9 +5,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.sim.panels import ENDLESS, Panels, Sky, box, panel, upright
+from neurove_core.sim.panels import ENDLESS, NOTHING, Panels, Sky, box, panel, upright
 from neurove_core.sim.path import STEP_M, Moving, Path
-from neurove_core.sim.textures import SIZE
 
 BLOCK: Final = 6
 """Waypoints of one block: 12 m of street."""
@@ -94,7 +93,7 @@ class Street:
             out = side * np.array([ahead[1], -ahead[0]])  # to the right for 1: x right, z forward
             parts += self._walls(rng, start, end, out)
             parts += self._things(rng, start, ahead, out, float(np.linalg.norm(end - start)))
-        return Panels.join([part for part in parts if self._stands_clear(part, way)])
+        return Panels.join([NOTHING, *(part for part in parts if self._stands_clear(part, way))])
 
     def _lines(self, start: NDArray[np.float64], ahead: NDArray[np.float64]) -> list[Panels]:
         """Dashes in the middle and a line on each side, painted on the ground, 6 mm above it."""
@@ -113,7 +112,7 @@ class Street:
         style = self._style
         verge, height = rng.uniform(*style.verge), rng.uniform(*style.height)
         texture, repeat = str(rng.choice(_FACADES)), rng.uniform(6, 11)
-        offset = (rng.uniform(), (height / 2 - SIZE * 0) / repeat)  # the texture's border lies on the ground
+        offset = (rng.uniform(), -height / 2 / repeat)  # the texture's border lies on the ground
         a, b = start + out * verge, end + out * verge
         if rng.uniform() < style.gap:
             return [upright(p, p + out * 18, height, texture, repeat_m=repeat, offset=offset) for p in (a, b)]

@@ -42,11 +42,11 @@ def make_textures(seed: int) -> Textures:
     """
     rng = np.random.default_rng((seed, 101))
     images = {
-        "asphalt": _lognormal(0.20, 0.30 * _noise(rng, 1.2) + 0.28 * _noise(rng, 0.3)),
+        "asphalt": _lognormal(0.20, 0.20 * _noise(rng, 1.2) + 0.15 * _noise(rng, 0.3)),
         "facade": _windows(rng, _lognormal(0.45, 0.25 * _noise(rng, 1.3)), 4, 3),
         "brick": _bricks(rng, _lognormal(0.30, 0.30 * _noise(rng, 1.0))),
         "posters": _rectangles(rng, _lognormal(0.40, 0.30 * _noise(rng, 1.2)), 90),
-        "foliage": _lognormal(0.16, 0.55 * _noise(rng, 0.9)),
+        "foliage": _lognormal(0.16, 0.40 * _noise(rng, 1.0)),
         "paint": _lognormal(0.80, 0.08 * _noise(rng, 0.8)),
         "metal": _rectangles(rng, _lognormal(0.35, 0.15 * _noise(rng, 1.4)), 25),
         "plaster": _lognormal(0.55, 0.18 * _noise(rng, 1.2) + 0.06 * _noise(rng, 0.2)),
@@ -61,7 +61,8 @@ def _noise(rng: np.random.Generator, fall: float) -> NDArray[np.float64]:
     spectrum = np.fft.rfft2(rng.standard_normal((SIZE, SIZE))) / frequency**fall
     spectrum[0, 0] = 0
     noise: NDArray[np.float64] = np.fft.irfft2(spectrum, (SIZE, SIZE))
-    return noise / noise.std()
+    noise /= noise.std()
+    return noise
 
 
 def _lognormal(middle: float, log_noise: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -110,7 +111,8 @@ def _contrasted(rng: np.random.Generator, image: NDArray[np.float64]) -> NDArray
     """The image with its log contrast stretched by a drawn factor about its mean, within what paint can be."""
     level = np.log(image)
     mean = level.mean()
-    return np.clip(np.exp(mean + rng.uniform(0.7, 1.4) * (level - mean)), 0.015, 1.0)
+    stretched: NDArray[np.float64] = np.exp(mean + rng.uniform(0.7, 1.4) * (level - mean))
+    return stretched.clip(0.015, 1.0)
 
 
 def _chain(image: NDArray[np.float64]) -> NDArray[np.float32]:
