@@ -47,7 +47,7 @@ def open_source(source: str, sensor: Sensor | None = None, topic: str | None = N
     """The recording that `source` names; see SUPPORTED.
 
     Args:
-        source: a file, a folder, or `pattern://`.
+        source: a file, a folder, `pattern://`, or `sim://SCENE?...`.
         sensor: the pixel array; overrides what the recording says of itself.
         topic: which event stream, where a recording has several: `davis/right` of MVSEC, say; by default the first.
 
@@ -56,13 +56,17 @@ def open_source(source: str, sensor: Sensor | None = None, topic: str | None = N
         MissingGeometry: the size of the sensor is neither given nor in the recording.
         BrokenRecording: not even its header is whole.
         MissingExtra: a library that reads it is not installed.
-        InvalidField: the calibration beside it, or the pattern's query, is not what it must be.
+        InvalidField: the calibration beside it, or the query of a pattern or a simulation, is not what it must be.
     """
     scheme, separator, _ = source.partition("://")
     if separator:
-        if scheme != "pattern":
+        if scheme not in ("sim", "pattern"):
             raise UnknownSource(source, SUPPORTED, f"unknown scheme {scheme}://")
         refuse_topic(source, topic)
+        if scheme == "sim":
+            from neurove_core.sim.source import simulation_of  # it needs this package itself
+
+            return simulation_of(source, sensor)
         return Pattern.from_url(source, sensor)
     path = Path(source)
     try:

@@ -15,7 +15,7 @@ from typing import IO, Any, Final, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.geometry import Poses
+from neurove_core.geometry import Poses, Twists, twists
 from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.place import BROKEN_ZIP
 from neurove_core.io.recording import BLOCK_BYTES, SUPPORTED, EventsOnly, in_chunks, whole
@@ -165,6 +165,11 @@ class CarlaRecording(EventsOnly):
         if (np.diff(t_ns) < 0).any() or not (np.isfinite(location).all() and np.isfinite(rotation).all()):
             raise BrokenRecording(self.path, "pose_t_ns", "a pose is not finite, or time runs backwards")
         return to_optical(CarlaPoses(t_ns, location, rotation))
+
+    def twists(self) -> Twists | None:
+        """How the camera moved, from its poses by `geometry.twists`; None without them."""
+        poses = self.poses()
+        return twists(poses) if poses is not None and poses.t.size > 1 else None
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.geometry import Poses
+from neurove_core.geometry import Poses, Twists, twists
 from neurove_core.io.errors import BrokenRecording
 from neurove_core.io.place import Place, folder_in_zip, read_image
 from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Frame, Imu, in_chunks
@@ -128,6 +128,11 @@ class EcdRecording(EventsOnly):
             why = f"a quaternion of length {norm[bad[0], 0]:.4g} is no rotation"
             raise BrokenRecording(self.path, f"{_FILES['poses']} pose {bad[0] + 1}", why)
         return Poses(t, rows[:, :3].copy(), rows[:, 3:] / norm)
+
+    def twists(self) -> Twists | None:
+        """How the camera moved, from its poses by `geometry.twists`; None without them."""
+        poses = self.poses()
+        return twists(poses) if poses is not None and poses.t.size > 1 else None
 
     def frames(self) -> Iterator[Frame]:
         """The images that images.txt lists, `t path` [s]; see `Recording`.

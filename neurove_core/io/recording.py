@@ -30,6 +30,7 @@ SUPPORTED: Final = (
     "FILE.npz (CARLA's event camera)",
     "a folder with events.txt, a FILE.zip with one, or FILE.txt (Event Camera Dataset)",
     "FILE.h5, FILE.hdf5 (MVSEC, DSEC, M3ED)",
+    "sim://SCENE?trajectory=...&seed=... (built-in simulator)",
     "pattern:// (built-in)",
 )
 """The sources that `open_source` knows."""

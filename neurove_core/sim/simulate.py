@@ -1,0 +1,277 @@
+"""The simulator as a recording: events of a camera that moves through a scene, and exactly how it moves."""
+
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurove_core.geometry import Twists
+from neurove_core.io.recording import EventsOnly, in_chunks
+from neurove_core.sim.camera import Camera, Rays, rays_of
+from neurove_core.sim.cull import Candidates, candidates_of
+from neurove_core.sim.interval import GRIDS, render_all, run_tiles, tile_speeds
+from neurove_core.sim.path import Moving
+from neurove_core.sim.pixels import (
+    USUAL,
+    PixelConfig,
+    Pixels,
+    PixelState,
+    add_noise,
+    at_rest,
+    low_pass,
+    make_pixels,
+    put_in_order,
+)
+from neurove_core.sim.render import Backdrop, World, views_of
+from neurove_core.sim.scene import Scene, named_scene
+from neurove_core.sim.textures import make_textures
+from neurove_core.sim.trajectory import Mounted, Trajectory
+from protocol.camera import CameraInfo
+from protocol.errors import InvalidField
+from protocol.events import Events, Sensor
+
+INTERVAL_US: Final = 20_000
+"""How much time is simulated at once; a chunk of events."""
+
+MOTION_PX: Final = 0.5
+"""No pixel sees more motion than this between two of its renders."""
+
+TRUTH_HZ: Final = 1000
+"""How often `Simulation.twists` tells the velocity."""
+
+
+class Step(NamedTuple):
+    """One interval: its events, and how the camera moved at each instant that anything was rendered at."""
+
+    start_us: int
+    stop_us: int
+    events: Events
+    twists: Twists  # at the renders, the interval's end the last of them; exact, of the trajectory
+    renders: float  # pictures rendered, in whole sensors: tiles are rendered at their own rates
+
+    def later(self, shift_us: int) -> "Step":
+        """The same with all times shifted."""
+        events, twists = (part._replace(t=part.t + shift_us) for part in (self.events, self.twists))
+        return Step(self.start_us + shift_us, self.stop_us + shift_us, events, twists, self.renders)  # type: ignore[arg-type]
+
+
+class View(NamedTuple):
+    """What the camera saw at one instant; see `Simulation.view`."""
+
+    light: NDArray[np.float32]  # (N,) log intensity
+    depth: NDArray[np.float32]  # (N,) along z [m], infinite where nothing is
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Simulation(EventsOnly):
+    """A camera that films a scene along a trajectory; see `Recording`.
+
+    Nothing is kept from one reading to the next: the same events come each time, and for the same seed. Where it lasts
+    longer than its trajectory, the film is cut there, and goes on along the next one in another scene of its kind.
+    """
+
+    scene: str
+    make_scene: Callable[[Moving, int], Scene]
+    trajectory: Moving  # of the camera, as it is mounted
+    lens: Camera
+    pixels: PixelConfig
+    seed: int
+    duration_s: float  # infinite for one without end
+    following: Callable[[int], Moving] | None = None  # the trajectories that come after the first, by number from 1 on
+
+    @property
+    def name(self) -> str:
+        """Scene, trajectory and seed."""
+        return f"{self.scene} {self.trajectory.name} {self.seed}"
+
+    @property
+    def sensor(self) -> Sensor:
+        """The pixel array of the camera."""
+        return self.lens.info.sensor
+
+    @property
+    def endless(self) -> bool:
+        """Whether it never ends."""
+        return math.isinf(self.duration_s)
+
+    @property
+    def streams(self) -> tuple[str, ...]:
+        """Events and twists; of a simulation without end the truth comes with `steps` alone."""
+        return ("events",) if self.endless else ("events", "twists")
+
+    def camera(self, stream: str) -> CameraInfo:
+        """The lens, with its height above the ground."""
+        return self.lens.info.model_copy(update={"stream": stream})
+
+    def chunks(self) -> Iterator[Events]:
+        """All events from t = 0 on; see `Recording`."""
+        for step in self.steps():
+            yield from in_chunks(step.events)
+
+    def twists(self) -> Twists | None:
+        """How the camera moves, at TRUTH_HZ and exact; None for a simulation without end."""
+        if self.endless:
+            return None
+        t_us = np.arange(0, round(self.duration_s * 1e6) + 1, 1_000_000 // TRUTH_HZ, dtype=np.int64)
+        return Twists(t_us, self.trajectory.twist(t_us / 1e6))
+
+    def steps(self, start_s: float = 0.0) -> Iterator[Step]:
+        """The same events with their truth, interval by interval, also those without events.
+
+        Args:
+            start_s: when to begin; the pixels are then as after a long past, as they else are at 0.
+        """
+        if self.following is None or start_s:
+            yield from _Film(self, self.trajectory, self.seed, start_s).run(round(start_s * 1e6), self.duration_s)
+            return
+        shift_us, trajectory = 0, self.trajectory
+        for number in itertools.count(1):
+            stop_us = math.floor(trajectory.duration_s * 1e6) // INTERVAL_US * INTERVAL_US
+            for step in _Film(self, trajectory, self.seed + number - 1).run(0, stop_us * 1e-6):
+                yield step.later(shift_us)
+            shift_us, trajectory = shift_us + stop_us, self.following(number)
+
+    def view(self, t_s: float) -> View:
+        """What the camera sees at this time, pixel by pixel as `rays_of` orders them."""
+        film = _Film(self, self.trajectory, self.seed, t_s)
+        return View(film.state.light, film.depth)
+
+
+class _Film:
+    """One reading of a simulation: what it carries from interval to interval."""
+
+    def __init__(self, simulation: Simulation, trajectory: Moving, seed: int, t_s: float = 0.0) -> None:
+        self._simulation, self._trajectory = simulation, trajectory
+        self._rays: Rays = rays_of(simulation.lens.info)
+        self._margin = float(max(self._rays.step_x.max(), self._rays.step_y.max()))
+        self._textures = make_textures(seed)
+        self._scene = simulation.make_scene(trajectory, seed)
+        self._grid_of_tiles = tuple(int(side.max()) + 1 for side in (self._rays.tile_row, self._rays.tile_column))
+        self._pixels: Pixels = make_pixels(simulation.pixels, self._rays.x.size, simulation.seed)
+        self._weights: dict[tuple[int, int], NDArray[np.float64]] = {}
+        self.depth = np.full(self._rays.x.size, np.inf, np.float32)
+        self.state: PixelState = at_rest(self._pixels, self._first_render(t_s))
+
+    def _first_render(self, t_s: float) -> NDArray[np.float32]:
+        world, when = self._world(t_s), np.array([t_s])
+        position, rotation = self._places(when)
+        candidates = self._candidates(world, position, rotation)
+        views = views_of(world.panels.take(candidates.kept), position, rotation)
+        light = np.empty(self._rays.x.size, np.float32)
+        backdrop = Backdrop.of(world, self._simulation.pixels.eps)
+        render_all(backdrop, self._rays, candidates, views[0], rotation[0], light, self.depth)
+        return light
+
+    def _candidates(self, world: World, position: NDArray[np.float64], rotation: NDArray[np.float64]) -> Candidates:
+        """What each tile may see from some places along an interval, its ends among them."""
+        views = views_of(world.panels, position, rotation)
+        return candidates_of(views, self._rays.box, world.sky.far_m, self._margin)
+
+    def _places(self, t_s: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        position, rotation = self._trajectory.pose(t_s)
+        return np.ascontiguousarray(position), np.ascontiguousarray(rotation)  # one layout, one compilation
+
+    def _world(self, t_s: float) -> World:
+        return World(self._scene.near(t_s), self._textures, self._scene.sky)
+
+    def run(self, start_us: int, end_s: float) -> Iterator[Step]:
+        """All intervals from where it began."""
+        end_us = math.inf if math.isinf(end_s) else round(end_s * 1e6)
+        while start_us < end_us:
+            stop_us = int(min(start_us + INTERVAL_US, end_us))
+            yield self.step(start_us, stop_us)
+            start_us = stop_us
+
+    def step(self, start_us: int, stop_us: int) -> Step:
+        """The next interval."""
+        span_us, config = stop_us - start_us, self._simulation.pixels
+        parts, steps = self._parts(start_us, stop_us)
+        when = (start_us + span_us * np.arange(steps + 1) / steps) * 1e-6
+        position, rotation = self._places(when)
+        world = self._world(start_us * 1e-6)
+        candidates = self._candidates(world, position[[0, steps // 2, steps]], rotation[[0, steps // 2, steps]])
+        views = views_of(world.panels.take(candidates.kept), position, rotation)
+        weights = self._weights_of(span_us, steps)
+        found = run_tiles(
+            Backdrop.of(world, config.eps),
+            self._rays,
+            candidates,
+            views,
+            rotation,
+            parts,
+            float(span_us),
+            weights,
+            self._pixels.made,
+            self.state,
+            self.depth,
+        )
+        found = add_noise(self._pixels, start_us, stop_us, found)
+        found = put_in_order(found, start_us, span_us, config.refractory_us, self.state.last_us)
+        t, pixel = found.t[: found.n] + np.int64(start_us), found.pixel[: found.n]
+        events = Events(t, self._rays.column[pixel], self._rays.row[pixel], found.p[: found.n])
+        rendered = when[steps // int(parts.max()) :: steps // int(parts.max())]
+        twists = Twists(np.rint(rendered * 1e6).astype(np.int64), self._trajectory.twist(rendered))
+        sizes = np.diff(self._rays.first)
+        return Step(start_us, stop_us, events, twists, float((parts * sizes).sum() / sizes.sum()))
+
+    def _parts(self, start_us: int, stop_us: int) -> tuple[NDArray[np.int64], int]:
+        """Into how many steps each tile's interval is cut, and the grid's steps, of which each is a divisor.
+
+        The largest motion in a tile and in those around it counts, for what is at their border may come into it.
+        """
+        speeds = np.zeros(self._rays.first.size - 1)
+        ends = np.array([start_us, (start_us + stop_us) / 2, stop_us]) * 1e-6
+        tile_speeds(self._rays, self.depth, self._trajectory.twist(ends), speeds)
+        grid = np.zeros((self._grid_of_tiles[0] + 2, self._grid_of_tiles[1] + 2))
+        row, column = self._rays.tile_row + 1, self._rays.tile_column + 1
+        grid[row, column] = speeds
+        around = np.max([grid[row + i, column + j] for i in (-1, 0, 1) for j in (-1, 0, 1)], axis=0)
+        needed = around * (stop_us - start_us) * 1e-6 / MOTION_PX
+        steps = next((steps for steps in GRIDS if steps >= needed.max()), GRIDS[-1])
+        divisors = np.array([count for count in range(1, steps + 1) if steps % count == 0])
+        return divisors[np.minimum(divisors.searchsorted(needed), divisors.size - 1)], steps
+
+    def _weights_of(self, span_us: int, steps: int) -> NDArray[np.float64]:
+        if (span_us, steps) not in self._weights:
+            cutoff_hz = self._simulation.pixels.cutoff_hz
+            rows = [low_pass(cutoff_hz, span_us / count) for count in range(1, steps + 1)]
+            self._weights[span_us, steps] = np.array([rows[0], *rows])
+        return self._weights[span_us, steps]
+
+
+def simulate(
+    scene: str,
+    trajectory: Trajectory,
+    camera: Camera,
+    pixels: PixelConfig = USUAL,
+    *,
+    seed: int = 0,
+    seconds: float | None = None,
+) -> Simulation:
+    """A recording that is made as it is read.
+
+    Args:
+        scene: one of scene.SCENES.
+        trajectory: of a level camera at height 0; the camera's mount is added.
+        camera: see camera.named_camera.
+        pixels: how they behave.
+        seed: of the scene and of the pixels.
+        seconds: how long; by default as long as the trajectory.
+
+    Raises:
+        InvalidField: the scene is unknown, the seed below 0, or `seconds` longer than the trajectory.
+    """
+    make_scene = named_scene(scene)
+    if seed < 0:
+        raise InvalidField("simulation", "seed", seed, "must be 0 or more")
+    duration_s = trajectory.duration_s if seconds is None else seconds
+    if not 0 < duration_s <= trajectory.duration_s:
+        raise InvalidField(
+            "simulation", "seconds", seconds, f"must be above 0 and at most the trajectory's {trajectory.duration_s:g}"
+        )
+    mounted = Mounted(trajectory, camera.height_m, camera.pitch_deg)
+    return Simulation(scene, make_scene, mounted, camera, pixels, seed, duration_s)
