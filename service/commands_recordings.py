@@ -1,4 +1,4 @@
-"""The commands of recordings: record, convert."""
+"""The commands of recordings: info, record, convert, simulate."""
 
 import argparse
 import contextlib
@@ -6,6 +6,7 @@ import json
 import math
 import sys
 import time
+import urllib.parse
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
@@ -96,6 +97,8 @@ def _write_dsec(recording: Any, path: Path, progress: Progress) -> None:
 WRITERS: Final[dict[str, Callable[[Any, Path, Progress], None]]] = {".mcap": _write_mcap, ".h5": _write_dsec}
 """What writes a file of each suffix: (recording, path, progress)."""
 
+_ENDLESS_S: Final = 5.0  # how much is surveyed of a source without end
+
 
 def convert(args: argparse.Namespace) -> int:
     """Write a recording of any kind as ours (.mcap) or as HDF5 in DSEC's layout (.h5)."""
@@ -107,6 +110,10 @@ def convert(args: argparse.Namespace) -> int:
     recording = open_source(args.source, args.sensor, args.topic)
     if path.exists() and Path(args.source).exists() and path.samefile(args.source):
         raise InvalidField("convert", "OUT", str(path), "it is the recording that is read")
+    return _written(recording, path, as_json=args.json)
+
+
+def _written(recording: Any, path: Path, *, as_json: bool) -> int:
     counted = {"events": 0}
     with _bar(recording.name) as show:
 
@@ -116,10 +123,64 @@ def convert(args: argparse.Namespace) -> int:
 
         WRITERS[path.suffix](recording, path, progress)
     told = {"file": str(path), "bytes": path.stat().st_size, "events": counted["events"], "streams": recording.streams}
-    if args.json:
+    if as_json:
         print(json.dumps(told))
     else:
         print(f"{path}: {told['events']:,} events of {recording.name}, {told['bytes']:,} bytes")
+    return 0
+
+
+def info(args: argparse.Namespace) -> int:
+    """What a recording holds: sensor, counts, rates, inertial unit, truth; and how it looks."""
+    from rich.console import Console
+
+    from neurove_core.io import open_source, summary
+    from service.views import survey_table
+
+    recording = open_source(args.source, args.sensor, args.topic)
+    seconds = args.seconds if args.seconds is not None else (_ENDLESS_S if recording.endless else None)
+    surveyed = summary.survey(recording, seconds)
+    if args.plot:
+        from neurove_core.io import summary_plot
+
+        summary_plot.draw(surveyed, args.plot)
+    told = surveyed.summary
+    if args.json:
+        print(json.dumps(told.as_json()))
+    else:
+        Console().print(survey_table(told))
+    if args.plot:
+        print(f"wrote {args.plot}", file=sys.stderr)
+    if told.broken:
+        print(f"neurove: {told.broken}", file=sys.stderr)
+    return BAD_NEWS if told.broken else 0
+
+
+def simulate(args: argparse.Namespace) -> int:
+    """Write what a simulated event camera sees, with the exact truth of how it moves."""
+    from neurove_core.io import open_source
+
+    if args.scene == "carla":
+        return _simulate_carla(args)
+    path: Path = args.out
+    if path.suffix not in WRITERS:
+        raise InvalidField("simulate", "--out", str(path), f"its name must end in {' or '.join(WRITERS)}")
+    query = {name: getattr(args, name) for name in ("trajectory", "camera", "height", "pitch", "seed", "seconds")}
+    given = {name: value for name, value in query.items() if value is not None}
+    recording = open_source(f"sim://{args.scene}?{urllib.parse.urlencode(given)}")
+    return _written(recording, path, as_json=args.json)
+
+
+def _simulate_carla(args: argparse.Namespace) -> int:
+    """Record an event camera on a car of a running CARLA server, with its poses."""
+    from neurove_core.io.carla_server import record as record_carla
+
+    host, _, port = args.server.rpartition(":")
+    if not (host and port.isdecimal()):
+        raise InvalidField("simulate carla", "--server", args.server, "HOST:PORT is expected, such as 127.0.0.1:2000")
+    events = record_carla(args.out, args.seconds, host=host, port=int(port), seed=args.seed)
+    told = {"file": str(args.out), "events": events}
+    print(json.dumps(told) if args.json else f"{args.out}: {events:,} events")
     return 0
 
 
@@ -153,3 +214,27 @@ def add(commands: Any) -> None:
     parser.add_argument("out", type=Path, metavar="OUT", help="file to write, ending in .mcap (ours) or .h5 (DSEC)")
     parser.add_argument("--sensor", type=sensor_size, metavar="WxH", help="sensor size, where the recording lacks it")
     parser.add_argument("--topic", metavar="T", help="which of several event streams, where the recording has names")
+    parser = command(commands, "info", info)
+    parser.add_argument("source", metavar="SOURCE", help="a recording of any kind, or sim://")
+    parser.add_argument("--sensor", type=sensor_size, metavar="WxH", help="sensor size, where the recording lacks it")
+    parser.add_argument("--topic", metavar="T", help="which of several event streams, where the recording has names")
+    parser.add_argument("--seconds", type=seconds, metavar="S", help="so much of it; default all, 5 of an endless one")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw events, rate and truth (.png or .svg)")
+    _add_simulate(commands)
+
+
+def _add_simulate(commands: Any) -> None:
+    parser = command(commands, "simulate", simulate)
+    parser.add_argument("scene", metavar="SCENE", help="street, corridor, room, wall; or carla: of a CARLA server")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="FILE", help=".mcap (ours), .h5 (DSEC); .npz of carla"
+    )
+    parser.add_argument("--seconds", type=seconds, default=10.0, metavar="S", help="default 10")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="of scene, path and pixels; default 0")
+    parser.add_argument(
+        "--trajectory", metavar="T", help="driving, handheld, still, rotation?wy=1, a file of poses, ..."
+    )
+    parser.add_argument("--camera", metavar="C", help="davis346-half (default), davis346, davis240c, prophesee, ...")
+    parser.add_argument("--height", metavar="M", help="of the camera above the ground [m]; default 1.5")
+    parser.add_argument("--pitch", metavar="DEG", help="how far it looks down; default 5")
+    parser.add_argument("--server", default="127.0.0.1:2000", metavar="HOST:PORT", help="CARLA's; this is the default")

@@ -11,6 +11,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
+from neurove_core.io.summary import Summary
 from protocol import Flag, Twist, TwistEstimate
 from protocol.control import HealthReply, ModelsReply, StreamStatus
 from protocol.velocity import AXES
@@ -179,6 +180,44 @@ def _streams_table(streams: tuple[StreamStatus, ...]) -> Table:
         table.caption = "* uncalibrated: no CameraInfo of this sensor"
         table.caption_justify = "left"
     return table
+
+
+def survey_table(told: Summary) -> RenderableType:
+    """What a recording holds."""
+    table = Table(show_header=False, **_PLAIN)
+    table.add_row("sensor", str(told.sensor))
+    on = "" if told.on_fraction is None else f", {100 * told.on_fraction:.1f} % ON"
+    table.add_row("events", f"{told.events:,}{on}")
+    if told.first_us is not None and told.last_us is not None:
+        span = f"{told.first_us / 1e6:.6f} to {told.last_us / 1e6:.6f} s of the sensor's clock"
+        table.add_row("duration", f"{told.duration_s:.6f} s ({span})")
+    if told.mean_rate_hz is not None and told.peak_rate_hz is not None:
+        rates = f"{told.mean_rate_hz / 1e3:,.1f} k events/s, {told.peak_rate_hz / 1e3:,.1f} in the busiest 10 ms"
+        table.add_row("rate", rates)
+    table.add_row("streams", ", ".join(told.streams))
+    for name, count in (("frames", told.frames), ("triggers", told.triggers)):
+        if count:
+            table.add_row(name, f"{count:,}")
+    if told.imu is not None:
+        rate = "" if told.imu.rate_hz is None else f" at {told.imu.rate_hz:,.1f} Hz"
+        table.add_row("imu", f"{told.imu.samples:,} samples{rate}")
+        table.add_row("  gyro", _spread(told.imu.gyro_mean_rad_s, told.imu.gyro_std_rad_s, "rad/s"))
+        table.add_row("  accelerometer", _spread(told.imu.accel_mean_m_s2, told.imu.accel_std_m_s2, "m/s²"))
+    if told.truth is None:
+        table.add_row("truth", "none")
+    else:
+        table.add_row("truth", f"{told.truth.samples:,} samples, from {told.truth.source}")
+        for what, mean, peak, unit in (
+            ("speed", told.truth.mean_linear_m_s, told.truth.peak_linear_m_s, "m/s"),
+            ("rotation", told.truth.mean_angular_rad_s, told.truth.peak_angular_rad_s, "rad/s"),
+        ):
+            if mean is not None and peak is not None:
+                table.add_row(f"  {what}", f"mean {mean:.3f}, peak {peak:.3f} {unit}")
+    return Panel(table, title=told.name, title_align="left", width=_WIDTH)
+
+
+def _spread(mean: tuple[float, ...], std: tuple[float, ...], unit: str) -> str:
+    return "  ".join(f"{axis} {m:+.4f} ± {s:.4f}" for axis, m, s in zip("xyz", mean, std, strict=True)) + f" {unit}"
 
 
 def models_table(replies: list[ModelsReply]) -> RenderableType:

@@ -71,7 +71,10 @@ class EcdRecording(EventsOnly):
             with place.open("calib.txt") as file:
                 where = place.path / "calib.txt" if place.inside is None else path
                 lens = parse_calib(where, file.read(1024), sensor)
-        streams = ("events", *(stream for stream, beside in _FILES.items() if place.has(beside)))
+        beside = [stream for stream, file in _FILES.items() if place.has(file)]
+        if "frames" in beside and not _has_images(place):  # a list whose images were left out
+            beside.remove("frames")
+        streams = ("events", *beside)
         return cls(path, name, sensor, lens, place, events_file, streams)
 
     def camera(self, stream: str) -> CameraInfo | None:
@@ -220,6 +223,16 @@ def _is_row(line: bytes, columns: int) -> bool:
         )
     except ValueError:
         return False
+
+
+def _has_images(place: Place) -> bool:
+    """Whether the first image that images.txt lists is there."""
+    with place.open(_FILES["frames"]) as file:
+        lines = [line.split() for line in file.read(4096).splitlines()]
+    paths = [
+        words[1].decode("utf-8", "replace") for words in lines if len(words) == 2 and not words[0].startswith(b"#")
+    ]
+    return not paths or ".." in paths[0].split("/") or place.has(paths[0])
 
 
 def parse_calib(path: Path, data: bytes, sensor: Sensor) -> CameraInfo:

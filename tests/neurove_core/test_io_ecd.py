@@ -145,3 +145,11 @@ def test_images_without_pillow_say_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "PIL", None)
     with pytest.raises(MissingExtra, match=r"pillow is not installed: pip install 'neurove\[recordings\]'"):
         next(recording.frames())
+
+
+def test_a_list_whose_images_were_left_out_is_no_stream(tmp_path):
+    (tmp_path / "events.txt").write_bytes(b"0.1 1 2 1\n")
+    (tmp_path / "images.txt").write_bytes(IMAGES)
+    recording = open_source(str(tmp_path))
+    assert recording.streams == ("events",)
+    assert list(recording.frames()) == []

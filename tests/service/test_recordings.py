@@ -1,4 +1,4 @@
-"""neurove convert: what it writes, what it says, and what it refuses."""
+"""neurove convert, info and simulate: what they write, what they say, and what they refuse."""
 
 import json
 
@@ -75,3 +75,72 @@ def test_what_can_not_be_converted_is_one_line(run, tmp_path, monkeypatch, sourc
         run("convert", "a.txt", "a.mcap")
     code, _, err = run("convert", source, out, *topic)
     assert (code, why in err, err.count("\n")) == (2, True, 1), err
+
+
+def test_info_tells_what_a_recording_holds(run, tmp_path):
+    (tmp_path / "events.txt").write_bytes(ecd_text(make_events(2000)))
+    picture = tmp_path / "a.png"
+    code, told, err = run("info", tmp_path, "--sensor", "64x48", "--json", "--plot", picture)
+    about = json.loads(told)
+    assert (code, err) == (0, f"wrote {picture}\n")
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert (about["sensor"], about["events"], about["streams"]) == ({"width": 64, "height": 48}, 2000, ["events"])
+    assert (about["imu"], about["truth"], about["broken"]) == (None, None, None)
+    assert about.keys() >= {"on_fraction", "first_us", "last_us", "duration_s"}
+    code, told, _ = run("info", tmp_path, "--sensor", "64x48")
+    assert code == 0
+    assert "2,000" in told
+
+
+def test_info_of_a_real_recording_with_an_inertial_unit(run):
+    code, told, _ = run("info", shared("aedat4/davis346.aedat4"))
+    assert code == 0
+    assert all(text in told for text in ("78,830, 52.3 % ON", "2,363 samples at 1,001.2 Hz", "59", "truth"))
+
+
+def test_info_of_a_broken_recording_is_bad_news(run, tmp_path):
+    (tmp_path / "events.txt").write_bytes(ecd_text(make_events(2000)) + b"and then\n")
+    code, told, err = run("info", tmp_path, "--sensor", "64x48", "--json")
+    assert code == 1
+    assert json.loads(told)["events"] == 2000
+    assert "broken at line 2001" in err
+
+
+def test_a_simulation_is_written_with_its_truth(run, tmp_path):
+    out = tmp_path / "a.mcap"
+    code, told, err = run("simulate", "wall", "--seconds", 0.2, "--seed", 4, "--out", out, "--json")
+    assert (code, err) == (0, "")
+    assert json.loads(told)["streams"] == ["events", "twists"]
+    recording = open_source(str(out))
+    twists = recording.twists()
+    assert sum(chunk.n for chunk in recording.chunks()) == json.loads(told)["events"] > 0
+    assert twists.twist[:, 0] == pytest.approx(0.3, abs=1e-6)  # the wall's trajectory slides at 0.3 m/s
+    assert recording.camera("cam0").height_m == 1.5
+    code, told, _ = run("info", "sim://wall?seed=4&seconds=0.2", "--json")
+    assert (code, json.loads(told)["truth"]["from"]) == (0, "twists")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere"], "scene='nowhere': known are street, corridor, room, wall"),
+        (["street", "--camera", "nikon"], "camera='nikon': known are"),
+        (["street", "--trajectory", "flying"], "'flying': neither a known trajectory nor a file"),
+        (["street", "--height", "0"], "height"),
+        (["street", "--seed", "-1"], "seed='-1'"),
+    ],
+)
+def test_what_can_not_be_simulated_is_named_and_leaves_no_file(run, tmp_path, arguments, message):
+    code, _, err = run("simulate", *arguments, "--out", tmp_path / "a.mcap")
+    assert (code, message in err) == (2, True), err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_simulations_are_written_in_known_formats_only(run, tmp_path):
+    code, _, err = run("simulate", "wall", "--out", tmp_path / "a.avi")
+    assert (code, "must end in .mcap or .h5" in err) == (2, True)
+
+
+def test_recording_from_carla_says_what_it_needs(run, tmp_path):
+    code, _, err = run("simulate", "carla", "--out", tmp_path / "a.npz", "--server", "nowhere")
+    assert (code, "--server='nowhere': HOST:PORT is expected" in err) == (2, True)
