@@ -3,7 +3,7 @@
 import statistics
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 
 class Row(NamedTuple):
@@ -16,10 +16,6 @@ class Row(NamedTuple):
     ratio: float  # the peer's time over ours
     share_of_limit: float | None  # of what the same run measured as this machine's limit, where there is one
     equal: bool  # whether the answers agree
-
-    def told(self) -> dict[str, Any]:
-        """For JSON."""
-        return self._asdict()
 
 
 def interleaved(runs: dict[str, Callable[[], object]], rounds: int, warm_up: int = 2) -> dict[str, float]:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 RECIPES = {
     "aslstm": Recipe(model="aslstm"),
-    "aslstm-spiking": Recipe(model="aslstm", low_v_th=0.2, low_units=8, alpha=0.1),
+    "aslstm-spiking": Recipe(model="aslstm", v_th=0.6, alpha=0.1, damping=0.1, rate=0.012),
     "aslstm-wo": Recipe(model="aslstm-wo", v_th=0.3, width=1.0),
     "slstm": Recipe(model="slstm", v_th=0.1),
     "ltc": Recipe(model="ltc", v_th=0.1, width=0.5),
