@@ -1,4 +1,4 @@
-"""The commands of models and experiments, which need no service: model, reproduce."""
+"""The commands of models and experiments, which need no service: model, reproduce, bench."""
 
 import argparse
 import json
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from protocol.errors import InvalidField
-from service.arguments import command
+from service.arguments import BAD_NEWS, command
 
 
 def new_model(args: argparse.Namespace) -> int:
@@ -70,7 +70,7 @@ def reproduce_sine(args: argparse.Namespace) -> int:
 
         runs: list[sine_report.Run] = []
         files: dict[Path, None] = {}
-        for run in sine_report.reproduce(models, seeds, quick=args.quick, progress=progress):
+        for run in sine_report.reproduce(models, seeds, changes=dict(args.set), quick=args.quick, progress=progress):
             runs.append(run)
             if args.out:
                 files |= dict.fromkeys(sine_report.save_run(runs, args.out, command=command, commit=commit))
@@ -82,6 +82,30 @@ def reproduce_sine(args: argparse.Namespace) -> int:
     for file in files:
         print(f"wrote {file}", file=sys.stderr)
     return 0
+
+
+def bench_sine(args: argparse.Namespace) -> int:
+    """The fused recurrence of the sine experiment against plain PyTorch steps."""
+    import torch
+
+    from neurove_core.bench import sine
+
+    torch.set_num_threads(1)
+    rows = sine.compare()
+    if args.json:
+        print(json.dumps([row._asdict() for row in rows]))
+    else:
+        for row in rows:
+            agree = "equal answers" if row.equal else "DIFFERENT ANSWERS"
+            print(f"{row.name}: {row.ratio:.1f} times as fast as {row.peer} ({agree})")
+    return 0 if all(row.equal for row in rows) else BAD_NEWS
+
+
+def _assignment(text: str) -> tuple[str, str]:
+    field, separator, value = text.partition("=")
+    if not separator:
+        raise argparse.ArgumentTypeError(f"{text!r}: FIELD=VALUE is expected")
+    return field, value
 
 
 def _commit() -> str:
@@ -100,6 +124,8 @@ def add(commands: Any) -> None:
     """Add these commands to the parser."""
     _add_model(commands)
     _add_reproduce(commands)
+    bench = commands.add_parser("bench", help="Speed, as ratios of one run.").add_subparsers(required=True)
+    command(bench, "sine", bench_sine)
 
 
 def _add_model(commands: Any) -> None:
@@ -120,5 +146,8 @@ def _add_reproduce(commands: Any) -> None:
     sine.add_argument("--models", default="aslstm,aslstm-spiking,aslstm-wo,slstm,ltc", help="which, joined by commas")
     sine.add_argument("--seed", type=int, default=0, help="the first seed; default 0")
     sine.add_argument("--seeds", type=int, default=1, metavar="N", help="so many seeds, one after the other; default 1")
+    sine.add_argument(
+        "--set", type=_assignment, action="append", default=[], metavar="FIELD=VALUE", help="a trial: another recipe"
+    )
     sine.add_argument("--quick", action="store_true", help="a few updates, to see that it runs: figures mean nothing")
     sine.add_argument("--out", type=Path, metavar="DIR", help="write figures, tables, pictures and networks there")
