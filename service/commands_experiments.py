@@ -4,6 +4,7 @@ import argparse
 import json
 import shlex
 import sys
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -86,14 +87,28 @@ def reproduce_sine(args: argparse.Namespace) -> int:
 
 def bench_sine(args: argparse.Namespace) -> int:
     """The fused recurrence of the sine experiment against plain PyTorch steps."""
-    import torch
-
     from neurove_core.bench import sine
 
+    return _benched(args, sine.compare)
+
+
+def bench_simulate(args: argparse.Namespace) -> int:
+    """Frames to events against v2e's algorithm; simulated seconds and events per second."""
+    from neurove_core.bench import simulate
+
+    speeds = [simulate.speed()]
+    if not args.json:
+        print(speeds[0].told)
+    return _benched(args, simulate.compare, [speed._asdict() for speed in speeds])
+
+
+def _benched(args: argparse.Namespace, compare: Callable[[], list[Any]], speeds: Sequence[dict[str, Any]] = ()) -> int:
+    import torch
+
     torch.set_num_threads(1)
-    rows = sine.compare()
+    rows = compare()
     if args.json:
-        print(json.dumps([row._asdict() for row in rows]))
+        print(json.dumps([*(row._asdict() for row in rows), *speeds]))
     else:
         for row in rows:
             agree = "equal answers" if row.equal else "DIFFERENT ANSWERS"
@@ -126,6 +141,7 @@ def add(commands: Any) -> None:
     _add_reproduce(commands)
     bench = commands.add_parser("bench", help="Speed, as ratios of one run.").add_subparsers(required=True)
     command(bench, "sine", bench_sine)
+    command(bench, "simulate", bench_simulate)
 
 
 def _add_model(commands: Any) -> None:

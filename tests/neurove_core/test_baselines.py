@@ -7,7 +7,7 @@ from neurove_core import rotations
 from neurove_core.baselines import accumulate, accumulate_reference, angular, image_grid, planar
 from neurove_core.geometry import distort
 from neurove_core.io import open_source
-from neurove_core.io.ecd import DAVIS240C, read_calib
+from neurove_core.io.ecd import DAVIS240C, parse_calib
 from protocol import CameraInfo, Events
 from protocol.errors import InvalidField
 from tests.neurove_core.test_geometry import ECD, MVSEC
@@ -45,7 +45,8 @@ def of_slide(camera: CameraInfo, velocity_per_depth: np.ndarray, seconds: float,
 
 
 def ecd(path: str, calib: str) -> tuple[Events, CameraInfo]:
-    return Events.join(list(open_source(str(shared(path))).chunks())), read_calib(shared(calib), DAVIS240C)
+    lens = parse_calib(shared(calib), shared(calib).read_bytes(), DAVIS240C)
+    return Events.join(list(open_source(str(shared(path))).chunks())), lens
 
 
 @pytest.mark.parametrize("camera", [ECD, MVSEC], ids=lambda camera: camera.stream)

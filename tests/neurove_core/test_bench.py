@@ -1,12 +1,17 @@
 """The benchmarks compare like with like; how fast is not a test's business."""
 
-from neurove_core.bench import interleaved, sine
+from neurove_core.bench import interleaved, simulate, sine
 
 
 def test_the_fused_recurrence_and_plain_steps_give_the_same_answers():
     rows = sine.compare(rounds=1)
     assert [row.name for row in rows] == ["sine forward", "sine forward and backward"]
     assert all(row.equal and row.ratio == row.peer_ms / row.ours_ms for row in rows)
+
+
+def test_our_pixels_and_the_algorithm_of_v2e_make_the_same_events():
+    (row,) = simulate.compare(rounds=1, frames=10)
+    assert row.equal
 
 
 def test_every_round_runs_all_in_turn():

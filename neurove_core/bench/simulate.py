@@ -1,0 +1,107 @@
+"""Frames to events: our pixels against the algorithm of v2e, and how much faster than real time the simulator runs.
+
+v2e (Hu, Liu, Delbruck, CVPRW 2021) is in no package index, so its algorithm is written out here from the paper, section
+4, in PyTorch as v2e's own code is: all pixels of a frame at once, one pass for each event that a pixel may have made
+since the last frame, evenly spread in time. Ours asks each pixel where its straight line crosses.
+"""
+
+import time
+from typing import Final, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from neurove_core.bench import Row, interleaved
+from neurove_core.sim.camera import as_image, named_camera, rays_of
+from neurove_core.sim.generated import driving
+from neurove_core.sim.pixels import QUIET, at_rest, events_of, make_pixels
+from neurove_core.sim.simulate import Simulation, simulate
+
+FRAME_US: Final = 2_000
+FRAMES: Final = 50
+THRESHOLD: Final = QUIET.threshold_on
+
+
+class Speed(NamedTuple):
+    """How fast the simulator runs; CPU time of one thread, compilation left out."""
+
+    camera: str
+    simulated_s_per_s: float
+    events_per_s: float
+    renders_per_simulated_s: float  # whole sensors
+
+    @property
+    def told(self) -> str:
+        """For people."""
+        return (
+            f"simulate {self.camera}: {self.simulated_s_per_s:.2f} simulated s and {self.events_per_s / 1e6:.2f} Mev "
+            f"per CPU second, {self.renders_per_simulated_s:.0f} renders per simulated s"
+        )
+
+
+def speed(camera: str = "davis346-half", seconds: float = 4.0) -> Speed:
+    """Driving through a street, seed 3."""
+    simulation = simulate("street", driving(3, seconds), named_camera(camera), seed=3)
+    next(iter(simulation.steps()))  # compiles
+    began = time.process_time()
+    steps = [(step.events.n, step.renders) for step in simulation.steps()]
+    spent = time.process_time() - began
+    events, renders = (sum(column) for column in zip(*steps, strict=True))
+    return Speed(camera, seconds / spent, events / spent, renders / seconds)
+
+
+def compare(rounds: int = 5, frames: int = FRAMES) -> list[Row]:
+    """The same frames through both; the counts of events of each pixel must be the same in nine of ten pixels.
+
+    Not in all: v2e compares whole frames with a level that moves by whole thresholds, as ours does, but in float32.
+    """
+    camera = named_camera("davis346-half")
+    simulation = simulate("street", driving(3, 2.0), camera, seed=3)
+    pictures = _pictures(simulation, frames)
+    times = interleaved({"ours": lambda: _ours(simulation, pictures), "v2e": lambda: _v2e(pictures)}, rounds)
+    ours, theirs = _ours(simulation, pictures), _v2e(pictures)
+    equal = bool((ours == theirs).mean() > 0.9 and abs(int(ours.sum()) - int(theirs.sum())) < 0.01 * ours.sum())
+    ratio = times["v2e"] / times["ours"]
+    return [Row("simulate frames to events", times["ours"], "v2e's algorithm", times["v2e"], ratio, None, equal)]
+
+
+def _pictures(simulation: Simulation, frames: int) -> list[NDArray[np.float32]]:
+    """Log intensity (H, W) every FRAME_US."""
+    rays, sensor = rays_of(simulation.lens.info), simulation.sensor
+    views = (simulation.view(k * FRAME_US * 1e-6).light for k in range(frames + 1))
+    return [np.ascontiguousarray(as_image(rays, sensor, light), np.float32) for light in views]
+
+
+def _ours(simulation: Simulation, pictures: list[NDArray[np.float32]]) -> NDArray[np.int64]:
+    """Events of each pixel (H * W,)."""
+    pixels = make_pixels(QUIET, pictures[0].size, 0)
+    state = at_rest(pixels, pictures[0].ravel())
+    state = state._replace(level=pictures[0].ravel().astype(np.float64))
+    parts = []
+    for k, picture in enumerate(pictures[1:]):
+        events, state = events_of(pixels, state, picture, k * FRAME_US, (k + 1) * FRAME_US, simulation.sensor)
+        parts.append(events.y.astype(np.int64) * simulation.sensor.width + events.x)
+    return np.bincount(np.concatenate(parts), minlength=pixels.n)
+
+
+def _v2e(pictures: list[NDArray[np.float32]]) -> NDArray[np.int64]:
+    """Events of each pixel (H * W,), by v2e's emulator without its noise: thresholds alone."""
+    frames = [torch.from_numpy(picture) for picture in pictures]
+    level = frames[0].clone()
+    events: list[Tensor] = []
+    for k, frame in enumerate(frames[1:]):
+        change = frame - level
+        on = torch.div(change.clamp(min=0), THRESHOLD, rounding_mode="floor")
+        off = torch.div((-change).clamp(min=0), THRESHOLD, rounding_mode="floor")
+        most = int(torch.maximum(on, off).max())
+        for i in range(most):
+            t_us = k * FRAME_US + FRAME_US * (i + 1) // most
+            for polarity, counts in ((1, on), (0, off)):
+                y, x = torch.nonzero(counts > i, as_tuple=True)
+                rows = torch.stack((torch.full_like(x, t_us), x, y, torch.full_like(x, polarity)), dim=1)
+                events.append(rows[torch.randperm(len(rows))])
+        level += THRESHOLD * (on - off)
+    table = torch.cat(events)
+    return np.bincount((table[:, 2] * pictures[0].shape[1] + table[:, 1]).numpy(), minlength=pictures[0].size)
