@@ -193,7 +193,8 @@ def _rows_of(bias, rows):  # type: ignore[no-untyped-def]  # compiled for its ar
     """Rows of a bias, to add products to."""
     out = np.empty((rows, bias.size), bias.dtype)
     for r in range(rows):
-        out[r] = bias
+        for j in range(bias.size):  # assigning a whole row would take seconds to compile
+            out[r, j] = bias[j]
     return out
 
 
@@ -213,7 +214,9 @@ def _layer(x, weights, at, c, v, s, alpha, v_th):  # type: ignore[no-untyped-def
     up = np.empty((rows, hidden), c.dtype)
     gates, tc = np.empty((batch, 4 * hidden), c.dtype), np.empty((batch, hidden), c.dtype)
     for first in range(0, rows, batch):
-        gates[:] = from_x[first : first + batch, : 4 * hidden]
+        for b in range(batch):
+            for j in range(4 * hidden):
+                gates[b, j] = from_x[first + b, j]
         _add_product(v, w_v, gates)
         for b in range(batch):
             for j in range(2 * hidden, 3 * hidden):
