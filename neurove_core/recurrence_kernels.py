@@ -5,61 +5,16 @@ Compiled by numba on first use for the arrays it gets, and cached on disk.
 
 from typing import Any, Final, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from neurove_core.activations import fused, sigmoid, tanh
 
 ASLSTM: Final = 0
 SLSTM: Final = 1
 LTC: Final = 2
 
 Array = NDArray[Any]  # float32 or float64
-
-fused = numba.njit(nogil=True, cache=True, fastmath={"contract", "reassoc", "nsz", "arcp"})
-
-
-@fused
-def _sigmoid(values, scale, fast):  # type: ignore[no-untyped-def]  # compiled for its arguments
-    """Values <- 1 / (1 + exp(-scale * values)), in place; `fast` is float32 by a polynomial that vectorises."""
-    one = values.dtype.type(1)
-    flat = values.reshape(-1)
-    n = flat.size
-    if not fast:
-        for i in range(n):
-            flat[i] = one / (one + np.exp(-scale * flat[i]))
-        return
-    powers = np.empty(n, np.int32)
-    rest = np.empty(n, np.float32)
-    for i in range(n):
-        x = min(max(-scale * flat[i], np.float32(-87.0)), np.float32(87.0))
-        k = np.floor(x * np.float32(1.44269504) + np.float32(0.5))
-        r = x - k * np.float32(0.693359375) + k * np.float32(2.12194440e-4)
-        p = np.float32(1.9875691500e-4)
-        p = p * r + np.float32(1.3981999507e-3)
-        p = p * r + np.float32(8.3334519073e-3)
-        p = p * r + np.float32(4.1665795894e-2)
-        p = p * r + np.float32(1.6666665459e-1)
-        p = p * r + np.float32(5.0000001201e-1)
-        rest[i] = p * r * r + r + np.float32(1.0)
-        powers[i] = (np.int32(k) + np.int32(127)) << np.int32(23)
-    twos = powers.view(np.float32)
-    for i in range(n):
-        flat[i] = one / (one + rest[i] * twos[i])
-
-
-@fused
-def _tanh(values, fast):  # type: ignore[no-untyped-def]  # compiled for its arguments
-    """Values <- tanh(values), in place."""
-    flat = values.reshape(-1)
-    one = values.dtype.type(1)
-    two = values.dtype.type(2)
-    if not fast:
-        for i in range(flat.size):
-            flat[i] = np.tanh(flat[i])
-        return
-    _sigmoid(values, two, fast)
-    for i in range(flat.size):
-        flat[i] = two * flat[i] - one
 
 
 @fused
@@ -84,7 +39,7 @@ def _lstm_step(kind, w, constants, tape, t, fast):  # type: ignore[no-untyped-de
             q[b, j] += gates[b, j]
         for j in range(2 * hidden, 3 * hidden):
             q[b, j] += q[b, j]
-    _sigmoid(q, one, fast)
+    sigmoid(q, one, fast)
     for b in range(batch):
         for j in range(2 * hidden):
             gates[b, j] = q[b, j]
@@ -97,7 +52,7 @@ def _lstm_step(kind, w, constants, tape, t, fast):  # type: ignore[no-untyped-de
         for j in range(hidden):
             c[b, j] = gates[b, hidden + j] * tape.c[t, b, j] + gates[b, j] * gates[b, 2 * hidden + j]
             tc[b, j] = c[b, j]
-    _tanh(tc, fast)
+    tanh(tc, fast)
     for b in range(batch):
         for j in range(hidden):
             h = gates[b, 3 * hidden + j] * tc[b, j]
@@ -137,7 +92,7 @@ def _ltc_step(w, tape, t, fast):  # type: ignore[no-untyped-def]  # compiled for
     for b in range(batch):
         for j in range(hidden):
             a[b, j] += w.b_a[j]
-    _sigmoid(a, one, fast)
+    sigmoid(a, one, fast)
     for b in range(batch):
         for j in range(hidden):
             m = tape.v[t, b, j]

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 from protocol.control import PeerError
 from protocol.errors import NeuroVEError
-from service import commands_asking, commands_experiments, commands_recordings, commands_running
+from service import commands_asking, commands_bench, commands_experiments, commands_recordings, commands_running
 from service.arguments import BAD_NEWS, WRONG_USAGE, Command
 
 
@@ -49,6 +49,7 @@ def _parser() -> argparse.ArgumentParser:
     commands_asking.add(commands)
     commands_recordings.add(commands)
     commands_experiments.add(commands)
+    commands_bench.add(commands)
     return parser
 
 

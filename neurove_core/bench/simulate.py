@@ -6,7 +6,7 @@ since the last frame, evenly spread in time. Ours asks each pixel where its stra
 """
 
 import time
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 import torch
@@ -24,32 +24,20 @@ FRAMES: Final = 50
 THRESHOLD: Final = QUIET.threshold_on
 
 
-class Speed(NamedTuple):
-    """How fast the simulator runs; CPU time of one thread, compilation left out."""
-
-    camera: str
-    simulated_s_per_s: float
-    events_per_s: float
-    renders_per_simulated_s: float  # whole sensors
-
-    @property
-    def told(self) -> str:
-        """For people."""
-        return (
-            f"simulate {self.camera}: {self.simulated_s_per_s:.2f} simulated s and {self.events_per_s / 1e6:.2f} Mev "
-            f"per CPU second, {self.renders_per_simulated_s:.0f} renders per simulated s"
-        )
+def rows(rounds: int, *, quick: bool) -> list[Row]:
+    """Frames to events, and a second of driving through a street against real time."""
+    return [*compare(rounds, 10 if quick else FRAMES), real_time(0.1 if quick else 4.0)]
 
 
-def speed(camera: str = "davis346-half", seconds: float = 4.0) -> Speed:
-    """Driving through a street, seed 3."""
+def real_time(seconds: float, camera: str = "davis346-half") -> Row:
+    """CPU time of one simulated second, the mean over so many, against that second; compilation is left out."""
     simulation = simulate("street", driving(3, seconds), named_camera(camera), seed=3)
     next(iter(simulation.steps()))  # compiles
-    began = time.process_time()
-    steps = [(step.events.n, step.renders) for step in simulation.steps()]
-    spent = time.process_time() - began
-    events, renders = (sum(column) for column in zip(*steps, strict=True))
-    return Speed(camera, seconds / spent, events / spent, renders / seconds)
+    began = time.thread_time()
+    events = sum(step.events.n for step in simulation.steps())
+    spent_ms = 1e3 * (time.thread_time() - began) / seconds
+    name = f"simulate a second of {camera}, {events / seconds / 1e3:.0f} k events"
+    return Row(name, spent_ms, "real time", 1e3, 1e3 / spent_ms, None, None)
 
 
 def compare(rounds: int = 5, frames: int = FRAMES) -> list[Row]:
