@@ -24,12 +24,17 @@ if TYPE_CHECKING:
 
 RECIPES = {
     "aslstm": Recipe(model="aslstm"),
-    "aslstm-spiking": Recipe(model="aslstm", v_th=0.6, alpha=0.1, damping=0.1, rate=0.012),
+    "aslstm-spiking": Recipe(
+        model="aslstm", v_th=0.6, alpha=0.1, damping=0.1, rate=0.012, updates=4000, fine_updates=2000
+    ),
     "aslstm-wo": Recipe(model="aslstm-wo", v_th=0.3, width=1.0),
     "slstm": Recipe(model="slstm", v_th=0.1),
     "ltc": Recipe(model="ltc", v_th=0.1, width=0.5),
 }
-"""One budget for all: updates, batches and learning rates of Recipe; threshold and surrogate are each model's own."""
+"""One budget for the paper's four: updates, batches and learning rates of Recipe; threshold and surrogate differ.
+
+`aslstm-spiking`, which is ours, takes 1.7 times as many updates.
+"""
 
 PAPER_REGRESSION_X1000 = {
     "aslstm": (0.31, 0.30, 0.31),
