@@ -40,7 +40,8 @@ class SpikingBlock(nn.Module):
     def forward(self, spikes: Tensor, state: LIFState) -> tuple[Tensor, LIFState]:
         """(T, B, C, H, W) to (T, B, C', H', W'); the norm's statistics run over time and batch together."""
         steps, batch = spikes.shape[:2]
-        current = self.norm(self.conv(spikes.flatten(0, 1)))
+        frames = spikes.flatten(0, 1).contiguous(memory_format=torch.channels_last)  # a convolution's own order on CPUs
+        current = self.norm(self.conv(frames))
         return lif_scan(current.unflatten(0, (steps, batch)), state, self.lif)
 
 

@@ -5,13 +5,16 @@ stored, which is the same as the factor (1 - S) of the paper's next step. The gr
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
+from neurove_core import scan
 from neurove_core.surrogate import SURROGATES, Surrogate, spike
 from protocol.errors import InvalidField
 
@@ -106,12 +109,38 @@ def diffuse(spikes: Tensor, v: Tensor, d: Tensor | float) -> Tensor:
 
 
 def lif_scan(currents: Tensor, state: LIFState, params: LIFParams) -> tuple[Tensor, LIFState]:
-    """A LIF population over a sequence: currents (T, ...) to spikes (T, ...) and the last state."""
+    """A LIF population over a sequence: currents (T, ...) to spikes (T, ...) and the last state.
+
+    On a CPU, and with the rectangular surrogate where gradients are asked for, this is one compiled pass over all
+    steps (scan.py); else, or inside `plain()`, it is `lif_scan_reference`. Spikes and state are the same bit for bit.
+    """
+    trained = torch.is_grad_enabled() and (currents.requires_grad or state.v.requires_grad)
+    if not _PLAIN.get() and scan.fits(currents, state.v) and (params.surrogate == "rectangular" or not trained):
+        spikes, v = scan.scan(currents, state.v, params.decay, params.v_th, params.surrogate_width)
+        return spikes, LIFState(v)
+    return lif_scan_reference(currents, state, params)
+
+
+def lif_scan_reference(currents: Tensor, state: LIFState, params: LIFParams) -> tuple[Tensor, LIFState]:
+    """What lif_scan computes, one plain step after the other."""
     spikes = []
     for current in currents:
         out, state = lif_step(current, state, params)
         spikes.append(out)
     return torch.stack(spikes), state
+
+
+_PLAIN: ContextVar[bool] = ContextVar("plain", default=False)
+
+
+@contextmanager
+def plain() -> Iterator[None]:
+    """Inside this, nothing is fused: each step is plain PyTorch, the reference that the fast path is held against."""
+    token = _PLAIN.set(True)
+    try:
+        yield
+    finally:
+        _PLAIN.reset(token)
 
 
 class LTCParams(NamedTuple):

@@ -51,6 +51,7 @@ class Constants(NamedTuple):
 
     alpha: float  # ASLSTM: share of h in the potential
     width: float  # of the rectangular surrogate, in units of the potential
+    damping: float = 1.0  # area under the surrogate; below 1 gradients through many spikes die out instead of exploding
 
 
 class LayerState(NamedTuple):
@@ -134,7 +135,15 @@ def forward(kind: int, weights: Weights, constants: Constants, x: Array, state: 
     return tape
 
 
-def backward(kind: int, weights: Weights, constants: Constants, tape: Tape, grad_y: Array, free_from: int) -> Weights:
+def backward(
+    kind: int,
+    weights: Weights,
+    constants: Constants,
+    tape: Tape,
+    grad_y: Array,
+    free_from: int,
+    grad_s: tuple[float, float] = (0.0, 0.0),
+) -> Weights:
     """Gradients of all weights; the state before the first step is taken as given.
 
     Args:
@@ -144,9 +153,11 @@ def backward(kind: int, weights: Weights, constants: Constants, tape: Tape, grad
         tape: of forward; used up by this call.
         grad_y: (T, B) gradient of the loss by the answers.
         free_from: as in forward.
+        grad_s: gradient of the loss by each single spike of the first and of the second layer, as of a rate.
     """
     grads = weights_like(weights)
-    _backward(kind, weights, _typed(constants, grad_y.dtype), tape, grad_y.copy(), grads, free_from)
+    pull = np.array(grad_s, grad_y.dtype)
+    _backward(kind, weights, _typed(constants, grad_y.dtype), tape, grad_y.copy(), grads, free_from, pull)
     return grads
 
 
@@ -351,20 +362,20 @@ class _Carry(NamedTuple):
 
 
 @_fused
-def _layer_back(kind, w, w_x_t, w_r_t, w_a_t, constants, tape, t, dz, carry, du, dq, grads):  # type: ignore[no-untyped-def]  # as above
+def _layer_back(kind, w, w_x_t, w_r_t, w_a_t, constants, tape, t, dz, carry, du, dq, grads, pull):  # type: ignore[no-untyped-def]  # as above
     """Gradient of one step of one layer: from dz of what went up to du of its input.
 
     What the weights' gradients are made of stays in the tape (gates and q): one large product gathers it at the end.
     """
     batch, hidden = tape.tc.shape[1:]
     one, none = w.b.dtype.type(1), w.b.dtype.type(0)
-    half, height = constants.width / w.b.dtype.type(2), one / constants.width
+    half, height = constants.width / w.b.dtype.type(2), constants.damping / constants.width
     gates = tape.gates[t]
     for b in range(batch):
         for j in range(hidden):
             s = tape.s[t + 1, b, j]
             grads.d_space[j] += dz[b, j] * tape.v[t + 1, b, j]
-            ds = w.s_weight[0] * dz[b, j] + carry.s[b, j]
+            ds = w.s_weight[0] * dz[b, j] + carry.s[b, j] + pull
             from_spike = ds * height if abs(tape.pre[t, b, j] - w.v_th[j]) < half else none
             grads.v_th[j] -= from_spike
             dv = carry.v[b, j] + w.d_space[j] * dz[b, j]
@@ -449,7 +460,7 @@ def _carry(batch, hidden, like):  # type: ignore[no-untyped-def]  # as above
 
 
 @_fused
-def _backward(kind, weights, constants, tape, grad_y, grads, free_from):  # type: ignore[no-untyped-def]  # as above
+def _backward(kind, weights, constants, tape, grad_y, grads, free_from, pull):  # type: ignore[no-untyped-def]  # as above
     steps, batch = grad_y.shape
     hidden = weights.w_out.size
     first, second = weights.first, weights.second
@@ -473,7 +484,7 @@ def _backward(kind, weights, constants, tape, grad_y, grads, free_from):  # type
             for j in range(hidden):
                 grads.w_out[j] += dy * tape.second.z[t, b, j]
                 dz2[b, j] = dy * weights.w_out[j]
-        _layer_back(kind, second, x2, r2, a2, constants, tape.second, t, dz2, carry2, dz1, dq, grads.second)
-        _layer_back(kind, first, x1, r1, a1, constants, tape.first, t, dz1, carry1, dx, dq, grads.first)
+        _layer_back(kind, second, x2, r2, a2, constants, tape.second, t, dz2, carry2, dz1, dq, grads.second, pull[1])
+        _layer_back(kind, first, x1, r1, a1, constants, tape.first, t, dz1, carry1, dx, dq, grads.first, pull[0])
     _gather(kind, tape.first, grads.first)
     _gather(kind, tape.second, grads.second)

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from neurove_core.io import BrokenRecording, Recording
+from neurove_core.io.packets import Slice, slices
 from protocol import EventPacket, Events
 from protocol.camera import SCHEMA as CAMERA_SCHEMA
 from protocol.events import SCHEMA as EVENTS_SCHEMA
@@ -14,18 +15,7 @@ from protocol.events import encode_packet
 from protocol.keys import Keys
 from service.transport import Transport
 
-PACKET_US = 4_000
-PACKET_EVENTS = 20_000
-
 _POLL_S = 0.02
-
-
-class Slice(NamedTuple):
-    """Some events of a recording that go into one packet."""
-
-    t0_us: int
-    end_us: int  # sensor time by which a real camera could have sent it
-    events: Events
 
 
 class Summary(NamedTuple):
@@ -36,48 +26,6 @@ class Summary(NamedTuple):
     first_us: int | None
     last_us: int | None
     broken: BrokenRecording | None  # where and why the recording ended early
-
-
-def slices(chunks: Iterator[Events]) -> Iterator[Slice]:
-    """Cut ordered events into slices of at most PACKET_US and PACKET_EVENTS.
-
-    A span without events gives an empty slice, which tells the service how far sensor time has come; so does the end.
-
-    Raises:
-        BrokenRecording: what the chunks raise, after everything before it was handed out.
-    """
-    start_us: int | None = None
-    last_us = 0
-    carried = Events.empty()
-    broken: BrokenRecording | None = None
-    try:
-        for chunk in chunks:
-            events = Events.join([carried, chunk]) if carried.n else chunk
-            start_us = int(events.t[0]) if start_us is None else start_us
-            last_us = int(events.t[-1])
-            done = 0
-            while start_us + PACKET_US <= last_us:
-                stop = done + int(events.t[done:].searchsorted(start_us + PACKET_US))
-                yield from _split(start_us, events.span(done, stop))
-                done, start_us = stop, start_us + PACKET_US
-            carried = events.span(done, events.n)
-    except BrokenRecording as error:
-        broken = error
-    if start_us is not None:
-        yield from _split(start_us, carried)
-        yield Slice(last_us + 1, last_us + 1, Events.empty())
-    if broken is not None:
-        raise broken
-
-
-def _split(start_us: int, events: Events) -> Iterator[Slice]:
-    end_us = start_us + PACKET_US
-    if events.n <= PACKET_EVENTS:
-        yield Slice(start_us, end_us, events)
-        return
-    for first in range(0, events.n, PACKET_EVENTS):
-        part = events.span(first, min(first + PACKET_EVENTS, events.n))
-        yield Slice(int(part.t[0]) if first else start_us, int(part.t[-1]) + 1, part)
 
 
 def repeated(recording: Recording) -> Iterator[Events]:

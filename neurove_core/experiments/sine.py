@@ -26,6 +26,8 @@ _WAVES, _PERIOD = 100, 20
 _BETAS, _EPSILON = (0.9, 0.99), 1e-8
 _LOG_FLOOR = 1e-9
 _LEAST_V_TH = 0.02  # of a learned threshold
+_CHECK_EVERY, _CHECKED_SHARE = 20, 0.4  # when the closed loop is looked at: every so many of the last fine updates
+_CHECK_FROM, _CHECK_WAVES = 300, 16  # and how: on its own answers from this step on, over so many training waves
 _NO_ANSWER = 1e3  # error of an answer that is not finite
 
 KINDS = {
@@ -47,6 +49,7 @@ class Recipe(Config):
     learn_v_th: bool = Field(False, description="Whether thresholds are learned, one per unit.")
     alpha: float = Field(0.5, ge=0, le=1)
     width: float = Field(0.25, gt=0, description="Of the rectangular surrogate.")
+    damping: float = Field(1.0, gt=0, le=1, description="Of the surrogate gradient.")
     diffusion: float = Field(0.5, description="Start of D in time and across layers.")
     batch: int = Field(16, ge=1)
     chunk: int = Field(100, ge=1, description="Steps of truncated backpropagation.")
@@ -58,6 +61,8 @@ class Recipe(Config):
     fine_lr_end: float = Field(2e-6, gt=0)
     closed_share: float = Field(0.4, ge=0, le=1)
     closed_steps: int = Field(700, ge=10, lt=LENGTH, description="Longest closed-loop window.")
+    rate: float = Field(0.0, ge=0, lt=1, description="Spike rate that each layer is held to; 0 for none.")
+    rate_weight: float = Field(1.0, ge=0, description="Of a missing rate, relative to the error.")
     clip: float = Field(0.5, gt=0, description="Norm of the gradient.")
 
 
@@ -90,7 +95,7 @@ class Network:
 
     def __init__(self, recipe: Recipe, rng: np.random.Generator, dtype: Any = np.float32) -> None:
         self.kind = KINDS[recipe.model]
-        self.constants = recurrence.Constants(recipe.alpha, recipe.width)
+        self.constants = recurrence.Constants(recipe.alpha, recipe.width, recipe.damping)
         self.theta, self.weights = _allocated(self.kind, recipe.hidden, dtype)
         self.grad, self._grads = _allocated(self.kind, recipe.hidden, dtype)
         self.learned = np.ones_like(self.theta, dtype=bool)
@@ -122,10 +127,12 @@ class Network:
         """The network over x (T, B) from a state."""
         return recurrence.forward(self.kind, self._real(), self.constants, x, state, free_from)
 
-    def gradient(self, tape: recurrence.Tape, grad_y: Array, free_from: int) -> Array:
+    def gradient(
+        self, tape: recurrence.Tape, grad_y: Array, free_from: int, grad_s: tuple[float, float] = (0.0, 0.0)
+    ) -> Array:
         """Gradient of the loss by theta, (parameters)."""
         real = self._real()
-        grads = recurrence.backward(self.kind, real, self.constants, tape, grad_y, free_from)
+        grads = recurrence.backward(self.kind, real, self.constants, tape, grad_y, free_from, grad_s)
         own = (*self._grads.first, *self._grads.second)
         for target, source in zip(own, (*grads.first, *grads.second), strict=True):
             target[...] = source
@@ -222,7 +229,7 @@ def train(recipe: Recipe, seed: int, progress: Callable[[int, float], None] = la
 
     First teacher-forced, truncated backpropagation over chunks with carried state; then the same mixed with
     closed-loop windows, whose gradient goes through the fed-back answers, under log(mse), which puts the tiny one-step
-    and the large closed-loop errors on one scale.
+    and the large closed-loop errors on one scale. Of the last weights, those are kept that do best on training waves.
 
     Args:
         recipe: what and how.
@@ -237,12 +244,13 @@ def train(recipe: Recipe, seed: int, progress: Callable[[int, float], None] = la
     walk = _Walk(data, recipe, network, rng)
     for update in range(recipe.updates):
         x, target, state = walk.chunk()
-        mse, grad, tape = _loss(network, x, target, state, len(x), log=False)
+        mse, grad, tape = _loss(network, recipe, x, target, state, len(x), log=False)
         walk.advance(tape)
         adam.step(grad, _rate(update, recipe.updates, recipe.lr, recipe.lr_end, warm_up=50))
         progress(update, mse)
     skipped = adam.skipped
     adam = Adam(network, recipe.clip)
+    best = _Best(network, data)
     for update in range(recipe.fine_updates):
         lr = _rate(update, recipe.fine_updates, recipe.fine_lr, recipe.fine_lr_end, warm_up=20)
         closed = rng.random() < recipe.closed_share
@@ -250,12 +258,44 @@ def train(recipe: Recipe, seed: int, progress: Callable[[int, float], None] = la
             x, target, state = walk.window(_closed_steps(update, recipe, rng))
         else:
             x, target, state = walk.chunk()
-        mse, grad, tape = _loss(network, x, target, state, 1 if closed else len(x), log=True)
+        mse, grad, tape = _loss(network, recipe, x, target, state, 1 if closed else len(x), log=True)
         if not closed:
             walk.advance(tape)
         adam.step(grad, lr)
+        left = recipe.fine_updates - 1 - update
+        if left % _CHECK_EVERY == 0 and left < _CHECKED_SHARE * recipe.fine_updates:
+            best.look()
         progress(recipe.updates + update, mse)
+    best.restore()
     return Trained(network, recipe.updates + recipe.fine_updates, time.process_time() - began, skipped + adam.skipped)
+
+
+class _Best:
+    """The weights that did best on some training waves: in a closed loop one update more may be much better or worse.
+
+    Args:
+        network: whose weights are watched.
+        data: (1000, rows) training waves.
+    """
+
+    def __init__(self, network: Network, data: Array) -> None:
+        self._network, self._data = network, np.ascontiguousarray(data[:, :_CHECK_WAVES])
+        self._score, self._theta = math.inf, network.theta.copy()
+
+    def look(self) -> None:
+        """Compare the weights of now: the product of both errors, over _CHECK_FROM steps and from there on alone."""
+        x, target = self._data[:-1], self._data[1:]
+        tape = self._network.run(x, self._network.initial_state(x.shape[1]), _CHECK_FROM)
+        error = tape.y[1:] - target
+        with np.errstate(over="ignore", invalid="ignore"):  # a network that diverges is not the best
+            regression = float(np.mean(error[SKIP:_CHECK_FROM].astype(np.float64) ** 2))
+            forecast = float(np.mean(error[_CHECK_FROM:].astype(np.float64) ** 2))
+        if regression * forecast < self._score:
+            self._score, self._theta = regression * forecast, self._network.theta.copy()
+
+    def restore(self) -> None:
+        """Go back to them."""
+        self._network.theta[:] = self._theta
 
 
 def _closed_steps(update: int, recipe: Recipe, rng: np.random.Generator) -> int:
@@ -269,15 +309,25 @@ def _rate(update: int, updates: int, high: float, low: float, warm_up: int) -> f
     return warm * (low + (high - low) * 0.5 * (1 + math.cos(math.pi * update / updates)))
 
 
+def _rate_gradient(recipe: Recipe, tape: recurrence.Tape, scale: float) -> tuple[float, float]:
+    """Gradient by one spike of scale * rate_weight * (how much of the rate is missing)^2, for each layer."""
+    gradient = []
+    for layer in tape[:2]:
+        missing = max(0.0, 1 - float(layer.s[1:].mean()) / recipe.rate)
+        gradient.append(-2 * scale * recipe.rate_weight * missing / recipe.rate / layer.s[1:].size)
+    return gradient[0], gradient[1]
+
+
 def _loss(
-    network: Network, x: Array, target: Array, state: State, free_from: int, *, log: bool
+    network: Network, recipe: Recipe, x: Array, target: Array, state: State, free_from: int, *, log: bool
 ) -> tuple[float, Array, recurrence.Tape]:
     tape = network.run(x, state, free_from)
     error = tape.y[1:] - target
     mse = float(np.mean(error.astype(np.float64) ** 2))
     scale = 2 / error.size * (0.1 / (mse + _LOG_FLOOR) if log else 1.0)
+    grad_s = _rate_gradient(recipe, tape, 0.1 if log else mse) if recipe.rate else (0.0, 0.0)
     last = recurrence.state_after(tape, len(x))
-    grad = network.gradient(tape, (error * np.float32(scale)).astype(x.dtype), free_from)
+    grad = network.gradient(tape, (error * np.float32(scale)).astype(x.dtype), free_from, grad_s)
     return mse, grad, tape._replace(first=last.first, second=last.second)  # type: ignore[arg-type]  # only the end is used
 
 

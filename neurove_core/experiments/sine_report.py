@@ -4,12 +4,13 @@ import importlib.util
 import json
 import math
 import statistics
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import safetensors.numpy
+from pydantic import ValidationError
 
 from neurove_core.experiments import save_text
 from neurove_core.experiments.sine import LENGTH, SKIP, VALIDATION, Recipe, Trained, evaluate, train, waves
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
 RECIPES = {
     "aslstm": Recipe(model="aslstm"),
-    "aslstm-spiking": Recipe(model="aslstm", low_v_th=0.2, low_units=8, alpha=0.1),
+    "aslstm-spiking": Recipe(model="aslstm", v_th=0.6, alpha=0.1, damping=0.1, rate=0.012),
     "aslstm-wo": Recipe(model="aslstm-wo", v_th=0.3, width=1.0),
     "slstm": Recipe(model="slstm", v_th=0.1),
     "ltc": Recipe(model="ltc", v_th=0.1, width=0.5),
@@ -64,28 +65,52 @@ class Run(NamedTuple):
 
 
 def reproduce(
-    models: Sequence[str], seeds: Sequence[int], *, quick: bool = False, progress: Progress | None = None
+    models: Sequence[str],
+    seeds: Sequence[int],
+    *,
+    changes: Mapping[str, str] | None = None,
+    quick: bool = False,
+    progress: Progress | None = None,
 ) -> Iterator[Run]:
     """Train and evaluate every model from every seed, one after the other.
 
     Args:
         models: keys of RECIPES.
         seeds: of weights and batches.
+        changes: fields of Recipe that are to be otherwise than in RECIPES, as texts: a trial.
         quick: a few updates only, to see that everything runs.
         progress: called after each update.
 
     Raises:
-        InvalidField: a model is unknown. MissingExtra: scipy is not installed.
+        InvalidField: a model, or a field of `changes` or its value, is unknown. MissingExtra: scipy is not installed.
     """
     if importlib.util.find_spec("scipy") is None:
         raise MissingExtra("scipy")
     for model in models:
         if model not in RECIPES:
             raise InvalidField("reproduce sine", "models", model, f"known are {', '.join(RECIPES)}")
-    for model in models:
-        recipe = RECIPES[model].model_copy(update=QUICK) if quick else RECIPES[model]
+    recipes = {model: changed(RECIPES[model], changes or {}) for model in models}
+    for model, recipe in recipes.items():
         for seed in seeds:
-            yield _run(model, seed, recipe, progress)
+            yield _run(model, seed, recipe.model_copy(update=QUICK) if quick else recipe, progress)
+
+
+def changed(recipe: Recipe, changes: Mapping[str, str]) -> Recipe:
+    """The recipe with some fields set from their texts.
+
+    >>> changed(RECIPES["aslstm"], {"v_th": "0.5", "learn_v_th": "true"}).v_th
+    0.5
+
+    Raises:
+        InvalidField: a field is unknown, or its text is not what it must be.
+    """
+    try:
+        return Recipe.model_validate(recipe.model_dump() | dict(changes))
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        name = str(first["loc"][0]) if first["loc"] else "set"
+        why = f"known are {', '.join(Recipe.model_fields)}" if first["type"] == "extra_forbidden" else first["msg"]
+        raise InvalidField("recipe", name, first["input"], why) from None
 
 
 def _run(model: str, seed: int, recipe: Recipe, progress: Progress | None) -> Run:

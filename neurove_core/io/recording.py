@@ -20,6 +20,8 @@ BLOCK_BYTES: Final = 4 << 20
 SUPPORTED: Final = (
     "FILE.aedat4 (DV)",
     "FILE.raw (Prophesee EVT2, EVT3)",
+    "FILE.mcap (our own, of `neurove record` and `neurove convert`)",
+    "FILE.bag (ROS 1), FILE.db3, FILE.mcap or their folder (ROS 2)",
     "a folder with events.txt, or FILE.txt (Event Camera Dataset)",
     "sim://SCENE?trajectory=...&seed=... (built-in simulator)",
     "pattern:// (built-in)",

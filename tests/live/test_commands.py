@@ -7,7 +7,7 @@ import pytest
 
 from neurove_core import bundle
 from neurove_core.io import open_source
-from service.driver import slices
+from neurove_core.io.packets import slices
 from tests.live.conftest import Process, free_endpoint, neurove, running, service, wait_until
 from tests.recordings import shared
 

@@ -477,7 +477,7 @@ def test_a_folder_is_called_by_its_own_name_and_given_a_sensor_takes_it(tmp_path
     [
         ("missing.raw", "no such file or folder"),
         ("", "the folder has no events.txt"),
-        ("a.bag", "unknown suffix '.bag'"),
+        ("a.xyz", "unknown suffix '.xyz'"),
         ("events", "a file without suffix"),
         ("zenoh://cam0", "unknown scheme zenoh://"),
         ("pattern://stripes", "a seed and nothing else"),
@@ -485,7 +485,7 @@ def test_a_folder_is_called_by_its_own_name_and_given_a_sensor_takes_it(tmp_path
     ],
 )
 def test_an_unknown_source_is_told_what_would_be_known(source, why, tmp_path):
-    put(tmp_path, "a.bag", b"")
+    put(tmp_path, "a.xyz", b"")
     put(tmp_path, "events", b"")
     with pytest.raises(UnknownSource) as caught:
         open_source(source if "://" in source else str(tmp_path / source))

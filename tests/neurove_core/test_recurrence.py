@@ -10,7 +10,8 @@ from neurove_core.neurons import LTCParams, LTCState, diffuse, ltc_step
 from neurove_core.recurrence import ASLSTM, LTC, SLSTM, Constants, LayerState, LayerWeights, State, Weights
 
 STEPS, BATCH, HIDDEN = 40, 5, 7
-CONSTANTS = Constants(alpha=0.5, width=0.5)
+CONSTANTS = Constants(alpha=0.5, width=0.5, damping=0.25)
+GRAD_S = (0.02, -0.03)  # of the loss by each spike of a layer
 
 
 def make_weights(kind, dtype=np.float64, seed=0):
@@ -77,7 +78,8 @@ class Plain:
             state = aslstm_step(u, ASLSTMState(*state), params)
         else:
             state = slstm_step(u, SLSTMState(*state), SLSTMParams(w.w_x.T, w.w_r.T, w.b, w.v_th, *surrogate))
-        return state, diffuse(w.s_weight * state[2], state[1], w.d_space)
+        s = CONSTANTS.damping * state[2] + (1 - CONSTANTS.damping) * state[2].detach()
+        return (state[0], state[1], s), diffuse(w.s_weight * s, state[1], w.d_space)
 
     def run(self, x, state, free_from):
         one, two = (tuple(torch.tensor(array) for array in layer) for layer in state[:2])
@@ -108,8 +110,9 @@ def test_answers_and_every_gradient_equal_autograds_and_spikes_bit_for_bit(kind,
     assert np.array_equal(fired, spikes.detach().numpy())
     assert 0.01 < fired.mean() < 0.99  # the comparison is about something
     grad_y = np.random.default_rng(3).normal(size=answers.shape)
-    (answers * torch.tensor(grad_y)).sum().backward()
-    grads = recurrence.backward(kind, weights, CONSTANTS, tape, grad_y, free_from)
+    of_spikes = (spikes.sum(dim=(0, 2, 3)) * torch.tensor(GRAD_S, dtype=answers.dtype)).sum()
+    ((answers * torch.tensor(grad_y)).sum() + of_spikes).backward()
+    grads = recurrence.backward(kind, weights, CONSTANTS, tape, grad_y, free_from, GRAD_S)
     fields = [f"{layer}.{name}" for layer in ("first", "second") for name in LayerWeights._fields]
     ours = [*grads.first, *grads.second, *grads[2:]]
     for name, own, leaf in zip([*fields, "w_out", "b_out", "kappa"], ours, plain.leaves(), strict=True):

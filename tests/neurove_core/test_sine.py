@@ -58,6 +58,26 @@ def test_a_network_that_diverges_is_reported_as_a_number():
     assert min(result.forecast_rmse) > 1
 
 
+def test_a_rate_in_the_loss_makes_layers_fire_more():
+    free, held = (Recipe(model="aslstm", v_th=0.5, hidden=16, rate=r, updates=150, fine_updates=0) for r in (0, 0.3))
+    fewer, more = (evaluate(train(recipe, 0).network)[0].spike_rate for recipe in (free, held))
+    assert all(b > a + 0.05 for a, b in zip(fewer, more, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"hiden": "5"}, r"hiden='5': known are model, hidden, .*rate"),
+        ({"hidden": "many"}, r"hidden='many': .*integer"),
+        ({"v_th": "0"}, r"v_th='0': .*greater than 0"),
+        ({"rate": "1"}, r"rate='1': .*less than 1"),
+    ],
+)
+def test_a_wrong_trial_is_named(changes, message):
+    with pytest.raises(InvalidField, match=message):
+        next(sine_report.reproduce(["aslstm"], [0], changes=changes))
+
+
 def test_an_unknown_model_is_named():
     with pytest.raises(InvalidField, match="models='gru': known are aslstm"):
         next(sine_report.reproduce(["gru"], [0]))

@@ -8,7 +8,7 @@ import structlog
 
 from neurove_core import bundle
 from neurove_core.experiments import firing
-from service import cli
+from service import cli, commands_running
 
 
 @pytest.fixture
@@ -101,7 +101,7 @@ def test_control_c_before_a_command_took_over_is_no_traceback(run, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "load", interrupted)
+    monkeypatch.setattr(commands_running, "load", interrupted)
     assert run("config", "show") == (130, "", "")
 
 

@@ -6,8 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neurove_core.io import BrokenRecording
+from neurove_core.io.packets import PACKET_EVENTS, PACKET_US, slices
 from protocol import Events
-from service.driver import PACKET_EVENTS, PACKET_US, repeated, slices
+from service.driver import repeated
 from tests.builders import make_events
 
 

@@ -1,0 +1,163 @@
+"""A population of LIF neurons over all its time steps in one pass: what `neurons.lif_scan` runs on a CPU.
+
+Step after step, plain PyTorch sends every membrane potential to memory and back some ten times per step. Here a block
+of neurons stays in the cache for all T steps; currents are read once and spikes written once. The backward pass keeps
+one byte per neuron and step instead of potentials and spikes. `neurons.lif_scan_reference` is the plain form; tests
+compare spikes and potentials bit for bit, and gradients.
+"""
+
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from neurove_core.kernels import compiled
+
+Array = NDArray[Any]  # float32 or float64
+
+FIRED: Final = 1  # bits of a code: the neuron fired in this step
+NEAR: Final = 2  # its potential lay in the surrogate's window
+
+_BLOCK: Final = 1024  # neurons whose potentials stay in the first cache over all steps
+
+
+def fits(currents: Tensor, v: Tensor) -> bool:
+    """Whether the fused scan takes these: on the CPU, float32 or float64 alike, one current per neuron, not empty."""
+    return (
+        currents.device.type == "cpu"
+        and currents.dtype in (torch.float32, torch.float64)
+        and v.dtype == currents.dtype
+        and v.device == currents.device
+        and v.shape == currents.shape[1:]
+        and currents.numel() > 0
+    )
+
+
+def scan(currents: Tensor, v: Tensor, decay: float, v_th: float, width: float) -> tuple[Tensor, Tensor]:
+    """A LIF population over a sequence, with the rectangular surrogate.
+
+    Args:
+        currents: (T, ...) as `fits` wants them; answered in the layout that they come in, channels last too.
+        v: potentials after the reset of the step before (...).
+        decay: per step.
+        v_th: firing threshold.
+        width: of the surrogate's window, in units of the potential.
+
+    Returns:
+        spikes (T, ...) of 0 and 1, and the potentials after the last reset.
+    """
+    if torch.is_grad_enabled() and (currents.requires_grad or v.requires_grad):
+        return _Scan.apply(currents, v, decay, v_th, width)  # type: ignore[no-any-return, no-untyped-call]  # torch types apply as Any
+    spikes, after, _ = _run(currents, v, decay, v_th, width, tape=False)
+    return spikes, after
+
+
+class _Scan(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, currents: Tensor, v: Tensor, decay: float, v_th: float, width: float
+    ) -> tuple[Tensor, Tensor]:  # torch's own type
+        spikes, after, codes = _run(currents, v, decay, v_th, width, tape=True)
+        ctx.save_for_backward(codes)
+        ctx.decay, ctx.height, ctx.channels_last = decay, 1 / width, _is_channels_last(currents)
+        return spikes, after
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, None, None, None]:  # torch's own type
+        (codes,) = ctx.saved_tensors
+        by_spikes = _rows(grads[0], ctx.channels_last)
+        by_v = _flat(grads[1], ctx.channels_last).clone()  # becomes the gradient by v of the start
+        by_currents = torch.empty_like(by_spikes)
+        kind = by_spikes.numpy().dtype.type
+        _backward(
+            by_spikes.numpy(), codes.numpy(), by_currents.numpy(), by_v.numpy(), kind(ctx.decay), kind(ctx.height)
+        )
+        shape, channels_last = grads[0].shape, ctx.channels_last
+        return _shaped(by_currents, shape, channels_last), _shaped(by_v, shape[1:], channels_last), None, None, None
+
+
+def _run(
+    currents: Tensor, v: Tensor, decay: float, v_th: float, width: float, *, tape: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    channels_last = _is_channels_last(currents)
+    rows, after = _rows(currents.detach(), channels_last), _flat(v.detach(), channels_last).clone()
+    spikes = torch.empty_like(rows)
+    codes = torch.empty(rows.shape if tape else (0, 0), dtype=torch.uint8)
+    kind = rows.numpy().dtype.type
+    constants = kind(decay), kind(v_th), kind(width / 2)
+    _forward(rows.numpy(), after.numpy(), spikes.numpy(), codes.numpy(), *constants, tape)
+    shape = currents.shape
+    return _shaped(spikes, shape, channels_last), _shaped(after, shape[1:], channels_last), codes
+
+
+def _is_channels_last(x: Tensor) -> bool:
+    """Whether channels, the third axis from the end, vary fastest in memory."""
+    return x.dim() >= 4 and not x.is_contiguous() and x.movedim(-3, -1).is_contiguous()
+
+
+def _rows(x: Tensor, channels_last: bool) -> Tensor:
+    """(T, ...) as (T, N) in the order of memory; a copy only where memory has another order."""
+    return (x.movedim(-3, -1) if channels_last else x).contiguous().view(x.shape[0], -1)
+
+
+def _flat(x: Tensor, channels_last: bool) -> Tensor:
+    return (x.movedim(-3, -1) if channels_last else x).contiguous().view(-1)
+
+
+def _shaped(x: Tensor, shape: torch.Size, channels_last: bool) -> Tensor:
+    """What `_rows` and `_flat` undid."""
+    if not channels_last:
+        return x.view(shape)
+    *before, channels, rows, columns = shape
+    return x.view(*before, rows, columns, channels).movedim(-1, -3)
+
+
+@compiled
+def _forward(
+    currents: Array, v: Array, spikes: Array, codes: NDArray[np.uint8], decay: Any, v_th: Any, half: Any, tape: bool
+) -> None:  # pragma: no cover (machine code)
+    steps, n = currents.shape
+    one, none = v.dtype.type(1), v.dtype.type(0)
+    for start in range(0, n, _BLOCK):
+        stop = min(start + _BLOCK, n)
+        v_now = v[start:stop]
+        for t in range(steps):
+            current, s = currents[t, start:stop], spikes[t, start:stop]
+            if tape:
+                code = codes[t, start:stop]
+                for i in range(stop - start):
+                    u = decay * v_now[i] + current[i]
+                    distance = u - v_th
+                    fired = one if distance >= none else none
+                    s[i] = fired
+                    v_now[i] = u * (one - fired)
+                    code[i] = (FIRED if distance >= none else 0) | (NEAR if abs(distance) < half else 0)
+            else:
+                for i in range(stop - start):
+                    u = decay * v_now[i] + current[i]
+                    fired = one if u - v_th >= none else none
+                    s[i] = fired
+                    v_now[i] = u * (one - fired)
+
+
+@compiled
+def _backward(
+    by_spikes: Array, codes: NDArray[np.uint8], by_currents: Array, by_v: Array, decay: Any, height: Any
+) -> None:  # pragma: no cover (machine code)
+    steps, n = by_spikes.shape
+    one, none = by_v.dtype.type(1), by_v.dtype.type(0)
+    for start in range(0, n, _BLOCK):
+        stop = min(start + _BLOCK, n)
+        carried = by_v[start:stop]
+        for t in range(steps - 1, -1, -1):
+            pull, code, out = by_spikes[t, start:stop], codes[t, start:stop], by_currents[t, start:stop]
+            for i in range(stop - start):
+                slope = height if code[i] & NEAR else none
+                kept = none if code[i] & FIRED else one
+                u = pull[i] * slope + carried[i] * kept
+                out[i] = u
+                carried[i] = decay * u

@@ -1,0 +1,153 @@
+"""The commands of models and experiments, which need no service: model, reproduce, bench."""
+
+import argparse
+import json
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+
+from protocol.errors import InvalidField
+from service.arguments import BAD_NEWS, command
+
+
+def new_model(args: argparse.Namespace) -> int:
+    """Write a bundle with random weights, to try a change of model with."""
+    from neurove_core import bundle
+
+    path: Path = args.file
+    if path.suffix != bundle.SUFFIX:
+        raise InvalidField("model new", "FILE", str(path), f"its name must end in {bundle.SUFFIX}")
+    made = bundle.untrained(args.seed, name=path.stem)
+    try:
+        bundle.save(made, path)
+    except OSError as error:
+        raise InvalidField("model new", "FILE", str(path), error.strerror or str(error)) from None
+    print(f"{path}: {made.name}, {made.digest[:12]}, untrained")
+    return 0
+
+
+def inspect_model(args: argparse.Namespace) -> int:
+    """What a bundle's file holds."""
+    from neurove_core import bundle
+
+    found = bundle.load(args.file)
+    about = found.info.model_dump() | {"config": found.config.model_dump(mode="json")}
+    print(json.dumps(about, indent=None if args.json else 2))
+    return 0
+
+
+def reproduce_firing(args: argparse.Namespace) -> int:
+    """How often ALIF, LIF and LTC fire under one random current."""
+    from neurove_core.experiments import firing
+
+    report = firing.run(args.seed)
+    files = firing.save(report, args.out) if args.out else []
+    print(firing.to_json(report) if args.json else firing.to_markdown(report), end="")
+    for file in files:
+        print(f"wrote {file}", file=sys.stderr)
+    return 0
+
+
+def reproduce_sine(args: argparse.Namespace) -> int:
+    """Tables I and II: regression and forecast of a sine by ASLSTM, ASLSTM-w/o, SLSTM and LTC."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    from neurove_core.experiments import sine_report
+
+    models, seeds = args.models.split(","), range(args.seed, args.seed + args.seeds)
+    command, commit = shlex.join(["neurove", *sys.argv[1:]]), _commit()
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
+        tasks: dict[tuple[str, int], Any] = {}
+
+        def progress(model: str, seed: int, update: int, updates: int, mse: float) -> None:
+            if (model, seed) not in tasks:
+                tasks[model, seed] = bar.add_task("", total=updates)
+            rmse = f"{model} seed {seed}: update {update}, RMSE {mse**0.5:.2e}"
+            bar.update(tasks[model, seed], completed=update, description=rmse)
+
+        runs: list[sine_report.Run] = []
+        files: dict[Path, None] = {}
+        for run in sine_report.reproduce(models, seeds, changes=dict(args.set), quick=args.quick, progress=progress):
+            runs.append(run)
+            if args.out:
+                files |= dict.fromkeys(sine_report.save_run(runs, args.out, command=command, commit=commit))
+    if args.out:
+        files |= dict.fromkeys(sine_report.save(runs, args.out))
+    figures = [run.figures for run in runs]
+    tables = sine_report.tables(figures)
+    print(json.dumps(figures) if args.json else "\n".join(sine_report.markdown(tables[n], n) for n in tables))
+    for file in files:
+        print(f"wrote {file}", file=sys.stderr)
+    return 0
+
+
+def bench_sine(args: argparse.Namespace) -> int:
+    """The fused recurrence of the sine experiment against plain PyTorch steps."""
+    import torch
+
+    from neurove_core.bench import sine
+
+    torch.set_num_threads(1)
+    rows = sine.compare()
+    if args.json:
+        print(json.dumps([row._asdict() for row in rows]))
+    else:
+        for row in rows:
+            agree = "equal answers" if row.equal else "DIFFERENT ANSWERS"
+            print(f"{row.name}: {row.ratio:.1f} times as fast as {row.peer} ({agree})")
+    return 0 if all(row.equal for row in rows) else BAD_NEWS
+
+
+def _assignment(text: str) -> tuple[str, str]:
+    field, separator, value = text.partition("=")
+    if not separator:
+        raise argparse.ArgumentTypeError(f"{text!r}: FIELD=VALUE is expected")
+    return field, value
+
+
+def _commit() -> str:
+    """The commit of the code that runs, with a + where it was changed since; or the version of the package."""
+    import importlib.metadata
+    import subprocess
+
+    git = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"]
+    try:
+        return subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return importlib.metadata.version("neurove")
+
+
+def add(commands: Any) -> None:
+    """Add these commands to the parser."""
+    _add_model(commands)
+    _add_reproduce(commands)
+    bench = commands.add_parser("bench", help="Speed, as ratios of one run.").add_subparsers(required=True)
+    command(bench, "sine", bench_sine)
+
+
+def _add_model(commands: Any) -> None:
+    parser = commands.add_parser("model", help="Model bundles.").add_subparsers(required=True)
+    new = command(parser, "new", new_model, as_json=False)
+    new.add_argument("file", type=Path, metavar="FILE", help="bundle to write, ending in .safetensors")
+    new.add_argument("--seed", type=int, default=0, help="of the weights")
+    inspect = command(parser, "inspect", inspect_model)
+    inspect.add_argument("file", type=Path, metavar="FILE", help="bundle to read")
+
+
+def _add_reproduce(commands: Any) -> None:
+    parser = commands.add_parser("reproduce", help="The paper's experiments.").add_subparsers(required=True)
+    firing = command(parser, "firing", reproduce_firing)
+    firing.add_argument("--seed", type=int, default=0, help="of the first of ten runs; default 0")
+    firing.add_argument("--out", type=Path, metavar="DIR", help="write table and figure (PNG, SVG) into this folder")
+    sine = command(parser, "sine", reproduce_sine)
+    sine.add_argument("--models", default="aslstm,aslstm-spiking,aslstm-wo,slstm,ltc", help="which, joined by commas")
+    sine.add_argument("--seed", type=int, default=0, help="the first seed; default 0")
+    sine.add_argument("--seeds", type=int, default=1, metavar="N", help="so many seeds, one after the other; default 1")
+    sine.add_argument(
+        "--set", type=_assignment, action="append", default=[], metavar="FIELD=VALUE", help="a trial: another recipe"
+    )
+    sine.add_argument("--quick", action="store_true", help="a few updates, to see that it runs: figures mean nothing")
+    sine.add_argument("--out", type=Path, metavar="DIR", help="write figures, tables, pictures and networks there")
