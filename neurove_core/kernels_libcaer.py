@@ -30,11 +30,13 @@ _TIME_HIGH, _TIME_LOW, _ADDR_X, _ADDR_Y, _BASE_Y, _VECT_8 = range(6)
 
 
 class LibcaerState(NamedTuple):
-    """What goes from packet to packet; the default is the start of a recording or what follows a gap."""
+    """What goes from word to word; the default is the start of a recording or what follows a gap."""
 
     x: int = -1  # column [px], -1 before the first one
     base_y: int = -1  # row of the next vector [px], -1 before the first one
     p: int = 0  # polarity of the vectors
+    high: int = 0  # TIME_HIGH [us]; a packet begins at 0
+    low: int = 0  # TIME_LOW [us]; a packet begins at 0
 
 
 @compiled
@@ -47,22 +49,22 @@ def signed(word: np.unsignedinteger[Any]) -> int:  # pragma: no cover (machine c
 def libcaer_decode(
     words: NDArray[np.uint16], state: LibcaerState, base_us: int, width: int, height: int, out: Events
 ) -> tuple[LibcaerState, int, int, int]:  # pragma: no cover (machine code)
-    """Decode the words of one packet, or those before the first that can not be used.
+    """Decode words of one packet, up to the first that can not be used.
 
     Args:
-        words: (N,) words of the packet.
-        state: of the packet before it.
+        words: (N,) words of the packet, all or some of them.
+        state: of the words before these.
         base_us: the packet's time base [us].
         width: of the sensor [px].
         height: of the sensor [px].
         out: columns of at least WORD_EVENTS * N places to write events into; times are as the words have them.
 
     Returns:
-        The state after the packet, how many words were read, how many events lie in `out`, and kernels.OK, ILLEGAL or
+        The state after the words, how many words were read, how many events lie in `out`, and kernels.OK, ILLEGAL or
         OUTSIDE; in the last case the event that is outside lies in `out`, after the good ones.
     """
-    x, base_y, p = state
-    high = low = n = 0
+    x, base_y, p, high, low = state
+    n = 0
     for i in range(words.size):
         word = signed(words[i])
         kind, value = word >> 12, word & 0xFFF
@@ -80,19 +82,19 @@ def libcaer_decode(
         elif kind == _BASE_Y:
             base_y, p = value & 0x7FF, value >> 11
         else:
-            return LibcaerState(x, base_y, p), i, n, ILLEGAL
+            return LibcaerState(x, base_y, p, high, low), i, n, ILLEGAL
         if mask and x >= 0 and y >= 0:
             while mask:
                 if mask & 1:
                     out.t[n], out.x[n], out.y[n], out.p[n] = base_us + high + low, x, y, polarity
                     if x >= width or y >= height:
-                        return LibcaerState(x, base_y, p), i, n, OUTSIDE
+                        return LibcaerState(x, base_y, p, high, low), i, n, OUTSIDE
                     n += 1
                 y += 1
                 mask >>= 1
         if base_y >= 0 and kind == _VECT_8:
             base_y += 8
-    return LibcaerState(x, base_y, p), words.size, n, OK
+    return LibcaerState(x, base_y, p, high, low), words.size, n, OK
 
 
 def libcaer_reference(
@@ -100,7 +102,6 @@ def libcaer_reference(
 ) -> tuple[LibcaerState, int, Events, int]:
     """The plain twin of `libcaer_decode`: state, words read, events, verdict."""
     s = state._asdict()
-    high = low = 0
     events: list[tuple[int, int, int, int]] = []
 
     def done(read: int, verdict: int) -> tuple[LibcaerState, int, Events, int]:
@@ -110,9 +111,9 @@ def libcaer_reference(
         value, hits = word & 0xFFF, []
         match word >> 12:
             case 0:
-                high = value << 12
+                s["high"] = value << 12
             case 1:
-                low = value
+                s["low"] = value
             case 2:
                 s["x"] = value & 0x7FF
             case 3:
@@ -128,5 +129,5 @@ def libcaer_reference(
         for y, p in hits if s["x"] >= 0 else []:
             if s["x"] >= width or y >= height:
                 return done(i, OUTSIDE)
-            events.append((base_us + high + low, s["x"], y, p))
+            events.append((base_us + s["high"] + s["low"], s["x"], y, p))
     return done(words.size, OK)

@@ -34,6 +34,7 @@ def add_source(parser: argparse.ArgumentParser, **source: Any) -> None:
     """The source of events and how it is read."""
     parser.add_argument("source", metavar="SOURCE", help="a recording, or pattern:// (the built-in pattern)", **source)
     parser.add_argument("--sensor", type=sensor_size, metavar="WxH", help="sensor size, where the recording lacks it")
+    parser.add_argument("--topic", metavar="T", help="which of several event streams, where the recording has names")
     parser.add_argument("--loop", action="store_true", help="begin again at the end")
 
 

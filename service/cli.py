@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 from protocol.control import PeerError
 from protocol.errors import NeuroVEError
-from service import commands_asking, commands_experiments, commands_running
+from service import commands_asking, commands_experiments, commands_recordings, commands_running
 from service.arguments import BAD_NEWS, WRONG_USAGE, Command
 
 
@@ -34,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _exit_code(error: NeuroVEError) -> int:
-    bad_news = {"no_service", "broken_recording", "demo"}
+    bad_news = {"no_service", "broken_recording", "nothing_recorded", "demo"}
     return BAD_NEWS if isinstance(error, PeerError) or error.code in bad_news else WRONG_USAGE
 
 
@@ -47,6 +47,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     commands_running.add(commands)
     commands_asking.add(commands)
+    commands_recordings.add(commands)
     commands_experiments.add(commands)
     return parser
 

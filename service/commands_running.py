@@ -7,6 +7,7 @@ import math
 import sys
 from typing import Any
 
+from protocol.errors import InvalidField
 from service import logs
 from service.arguments import (
     BAD_NEWS,
@@ -24,6 +25,7 @@ from service.lifecycle import stop_on_signals
 
 DEFAULT_SOURCE = "pattern://"
 _DEFAULT_DEMO_S = 20.0
+_STREAM = "cam0"
 
 
 def serve(args: argparse.Namespace) -> int:
@@ -44,31 +46,43 @@ def serve(args: argparse.Namespace) -> int:
 
 
 def drive(args: argparse.Namespace) -> int:
-    """Publish a recording or a synthetic source as one stream."""
+    """Publish a recording or a synthetic source as one stream; a recording of ours as it was published."""
     from neurove_core.io import open_source
-    from service.driver import Driver
 
     stop = stop_on_signals(with_parent=args.with_parent)
     config = client_config(args)
-    recording = open_source(args.source, args.sensor)
+    recording = open_source(args.source, args.sensor, args.topic)
     from service import ask
 
     with ask.connect(config, patience_s=max(ask.CONNECT_S, args.wait), stop=stop) as transport:
-        driver = Driver(recording, args.stream, transport, config.keys)
-        if args.wait and not driver.wait_for_listener(args.wait, stop) and not stop.is_set():
-            raise ask.NoService(f"no service took up stream {args.stream} within {args.wait:g} s")
-        sent = driver.play(stop, speed=args.speed, loop=args.loop, duration_s=args.duration)
+        player = _player(args, recording, transport, config.keys)
+        if args.wait and not player.wait_for_listener(args.wait, stop) and not stop.is_set():
+            raise ask.NoService(f"no service took up stream {player.label} within {args.wait:g} s")
+        sent = player.play(stop, speed=args.speed, loop=args.loop, duration_s=args.duration)
     broken = sent.broken.message if sent.broken else None
     if args.json:
         sensor = {"width": recording.sensor.width, "height": recording.sensor.height}
         print(json.dumps({"sensor": sensor, "packets": sent.packets, "events": sent.events, "broken": broken}))
     else:
-        print(
-            f"{args.stream}: {sent.packets:,} packets, {sent.events:,} events of {recording.name} ({recording.sensor})"
-        )
+        about = f"{recording.name} ({recording.sensor})"
+        print(f"{player.label}: {sent.packets:,} packets, {sent.events:,} events of {about}")
     if broken:
         print(f"neurove: {broken}", file=sys.stderr)
     return BAD_NEWS if broken else 0
+
+
+def _player(args: argparse.Namespace, recording: Any, transport: Any, keys: Any) -> Any:
+    """A replay of packets for a recording of ours, a driver for every other; both are used alike."""
+    from neurove_core.io import McapRecording
+    from service.driver import Driver
+    from service.replay import Replay
+
+    if not isinstance(recording, McapRecording) or args.stream:  # another name stands in every packet: encoded anew
+        return Driver(recording, args.stream or _STREAM, transport, keys)
+    if args.loop:
+        why = "what was recorded would repeat its numbers and times; give --stream NAME to encode it anew"
+        raise InvalidField("drive", "--loop", True, why)
+    return Replay(recording, recording.stream if args.topic else None, transport, keys)
 
 
 def demo(args: argparse.Namespace) -> int:
@@ -80,7 +94,7 @@ def demo(args: argparse.Namespace) -> int:
 
     stop = stop_on_signals()
     logs.configure("warning")
-    endless = open_source(args.source, args.sensor).endless
+    endless = open_source(args.source, args.sensor, args.topic).endless
     console = Console(stderr=args.json)
     duration_s = args.duration
     if duration_s is None:
@@ -88,6 +102,7 @@ def demo(args: argparse.Namespace) -> int:
     summary = demonstration.run(
         args.source,
         sensor=str(args.sensor) if args.sensor else None,
+        topic=args.topic,
         speed=str(args.rate),
         loop=args.loop,
         duration_s=duration_s,
@@ -160,7 +175,9 @@ def _add_drive(commands: Any) -> None:
     parser = command(commands, "drive", drive)
     add_source(parser)
     add_client_flags(parser)
-    parser.add_argument("--stream", default="cam0", help="name of the stream, one key chunk; default cam0")
+    parser.add_argument(
+        "--stream", metavar="S", help=f"name of the stream, one key chunk; default {_STREAM}, or as it was recorded"
+    )
     parser.add_argument("--speed", type=speed, default=1.0, help="sensor seconds per second, or max; default 1.0")
     parser.add_argument("--duration", type=seconds, default=math.inf, metavar="S", help="seconds of the source to play")
     parser.add_argument("--wait", type=seconds, default=0.0, metavar="S", help="wait so long for a service to listen")

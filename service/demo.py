@@ -44,6 +44,7 @@ def run(
     source: str,
     *,
     sensor: str | None,
+    topic: str | None,
     speed: str,
     loop: bool,
     duration_s: float,
@@ -57,6 +58,7 @@ def run(
     Args:
         source: as io.open_source.
         sensor: WIDTHxHEIGHT, where the source lacks it.
+        topic: as io.open_source.
         speed: as `neurove drive --speed`.
         loop: play it again at its end.
         duration_s: sensor time to play; infinity until its end or the stop event.
@@ -74,6 +76,7 @@ def run(
     serve = ["serve", "--listen", endpoint, "--node", "demo", *(["--model", model] if model else [])]
     drive = ["drive", source, "--connect", endpoint, "--stream", STREAM, "--speed", speed, "--wait", "10", "--json"]
     drive += ["--sensor", sensor] if sensor else []
+    drive += ["--topic", topic] if topic else []
     drive += ["--loop"] if loop else []
     drive += ["--duration", str(duration_s)] if math.isfinite(duration_s) else []
     with _process(*serve) as service, _session(config, service, stop, console) as transport:

@@ -15,7 +15,7 @@ from protocol.events import encode_packet
 from protocol.keys import Keys
 from service.transport import Transport
 
-_POLL_S = 0.02
+POLL_S = 0.02
 
 
 class Summary(NamedTuple):
@@ -64,11 +64,16 @@ class Driver:
             self._transport.answer(self._keys.camera(self._stream), lambda _: payload)
             self._transport.put(self._keys.camera(self._stream), payload, CAMERA_SCHEMA)
 
+    @property
+    def label(self) -> str:
+        """The stream, for people."""
+        return self._stream
+
     def wait_for_listener(self, timeout_s: float, stop: threading.Event) -> bool:
         """Wait until some service listens, for a real camera would be on before it is used."""
         deadline = time.monotonic() + timeout_s
         while not self._publisher.matching:
-            if time.monotonic() >= deadline or stop.wait(_POLL_S):
+            if time.monotonic() >= deadline or stop.wait(POLL_S):
                 return False
         return True
 

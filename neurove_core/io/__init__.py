@@ -2,16 +2,22 @@
 
 from pathlib import Path
 
+from neurove_core.io.aedat2 import Aedat2Recording
 from neurove_core.io.aedat4 import Aedat4Recording
+from neurove_core.io.dat import DatRecording
+from neurove_core.io.datasets import open_hdf5
+from neurove_core.io.dsec_write import write_dsec
 from neurove_core.io.ecd import EcdRecording
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
+from neurove_core.io.eventstream import EventStreamRecording
 from neurove_core.io.mcap_file import McapFile
 from neurove_core.io.mcap_layout import PROFILE
 from neurove_core.io.mcap_recording import McapRecording, RecordedPacket
 from neurove_core.io.mcap_write import PacketWriter, write_mcap
 from neurove_core.io.pattern import Pattern
+from neurove_core.io.poses import read_poses
 from neurove_core.io.prophesee import PropheseeRecording
-from neurove_core.io.recording import SUPPORTED, EventsOnly, Frame, Imu, Recording, Triggers
+from neurove_core.io.recording import SUPPORTED, EventsOnly, Frame, Imu, Recording, Triggers, refuse_topic
 from neurove_core.io.rosbag import RosbagRecording
 from protocol.events import Sensor
 
@@ -29,6 +35,8 @@ __all__ = [
     "Triggers",
     "UnknownSource",
     "open_source",
+    "read_poses",
+    "write_dsec",
     "write_mcap",
 ]
 
@@ -39,12 +47,13 @@ def open_source(source: str, sensor: Sensor | None = None, topic: str | None = N
     Args:
         source: a file, a folder, `pattern://`, or `sim://SCENE?...`.
         sensor: the pixel array; overrides what the recording says of itself.
-        topic: which of several event streams, where the recording has names for them; by default the first.
+        topic: which event stream, where a recording has several: `davis/right` of MVSEC, say; by default the first.
 
     Raises:
-        UnknownSource: there is nothing of this name, or nothing that can be read, or no such topic.
+        UnknownSource: there is nothing of this name, nothing that can be read, or no such topic.
         MissingGeometry: the size of the sensor is neither given nor in the recording.
         BrokenRecording: not even its header is whole.
+        MissingExtra: a library that reads it is not installed.
         InvalidField: the calibration beside it, or the query of a pattern or a simulation, is not what it must be.
     """
     scheme, separator, _ = source.partition("://")
@@ -55,6 +64,7 @@ def open_source(source: str, sensor: Sensor | None = None, topic: str | None = N
             return simulation_of(source, sensor)
         if scheme != "pattern":
             raise UnknownSource(source, SUPPORTED, f"unknown scheme {scheme}://")
+        refuse_topic(source, topic)
         return Pattern.from_url(source, sensor)
     path = Path(source)
     try:
@@ -66,27 +76,37 @@ def open_source(source: str, sensor: Sensor | None = None, topic: str | None = N
 def _open_path(path: Path, sensor: Sensor | None, topic: str | None) -> Recording:
     if not path.exists():
         raise UnknownSource(path, SUPPORTED, "no such file or folder")
+    if path.is_file() and path.suffix.lower() in (".h5", ".hdf5"):
+        return open_hdf5(path, sensor, topic)
+    if _is_bag(path):
+        ours = path.suffix.lower() == ".mcap" and path.is_file() and McapFile.open(path).profile == PROFILE
+        return (McapRecording if ours else RosbagRecording).open(path, sensor, topic)
+    refuse_topic(path, topic)
     if path.is_dir():
-        if _is_bag(path):
-            return RosbagRecording.open(path, sensor, topic)
         if not (path / "events.txt").is_file():
             raise UnknownSource(path, SUPPORTED, "the folder has no events.txt")
         return EcdRecording.open(path / "events.txt", path.resolve().name, sensor)
     match path.suffix.lower():
         case ".aedat4":
             return Aedat4Recording.open(path, sensor)
+        case ".aedat":
+            return Aedat2Recording.open(path, sensor)
         case ".raw":
             return PropheseeRecording.open(path, sensor)
-        case ".mcap" if McapFile.open(path).profile == PROFILE:
-            return McapRecording.open(path, sensor, topic)
-        case ".bag" | ".db3" | ".mcap":
-            return RosbagRecording.open(path, sensor, topic)
-        case ".txt":
+        case ".dat":
+            return DatRecording.open(path, sensor)
+        case ".es":
+            return EventStreamRecording.open(path, sensor)
+        case ".txt" | ".zip":
             return EcdRecording.open(path, path.name, sensor)
         case suffix:
             raise UnknownSource(path, SUPPORTED, f"unknown suffix {suffix!r}" if suffix else "a file without suffix")
 
 
-def _is_bag(folder: Path) -> bool:
-    """Whether this is a folder of rosbag2; its metadata.yaml is missing where the recorder was killed."""
-    return any(path.name == "metadata.yaml" or path.suffix in (".db3", ".mcap") for path in folder.iterdir())
+def _is_bag(path: Path) -> bool:
+    """Whether this is a bag or an .mcap of ours; the metadata.yaml of a folder is missing where its recorder died."""
+    if path.is_file():
+        return path.suffix.lower() in (".bag", ".db3", ".mcap")
+    if (path / "events.txt").is_file():
+        return False
+    return any(one.name == "metadata.yaml" or one.suffix in (".db3", ".mcap") for one in path.iterdir())

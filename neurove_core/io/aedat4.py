@@ -1,21 +1,43 @@
-"""AEDAT4 files of DV: compressed packets of several streams; the event stream is read, by the `aedat` package."""
+"""AEDAT4 files of DV: compressed packets of events, inertial samples, frames and triggers, read by `aedat`."""
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, Self, TypeVar
 
 import aedat
+import numpy as np
+from numpy.typing import NDArray
 
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
-from neurove_core.io.recording import SUPPORTED, EventsOnly, in_chunks
+from neurove_core.io.recording import SUPPORTED, EventsOnly, Frame, Imu, Triggers, in_chunks, whole
 from protocol.errors import EventOutsideSensor, InvalidField, TimeBackwards
 from protocol.events import Events, Sensor, check_events
 
 _MAGIC = b"#!AER-DAT4.0\r\n"
 MAX_HEADER_BYTES = 16 << 20  # a header has some 3,000 bytes
 _PACKET_HEADER = struct.Struct("<ii")  # stream, size of what follows [bytes]
+
+G_M_S2 = 9.80665
+"""Standard gravity: what DV writes an acceleration in."""
+
+EXTERNAL, GENERATOR, READOUT, EXPOSURE = range(4)
+"""Channels of the triggers: the camera's input, its own generator, and when it read out and exposed a frame."""
+
+_KINDS = {"events": "events", "imus": "imu", "frame": "frames", "triggers": "triggers"}  # the decoder's words, and ours
+_UNITS = ("accelerometer", "gyroscope")
+_EDGES = {  # source in the file -> channel and level; a pulse is told once, as a rise
+    1: (EXTERNAL, 1),
+    2: (EXTERNAL, 0),
+    3: (EXTERNAL, 1),
+    4: (GENERATOR, 1),
+    5: (GENERATOR, 0),
+    6: (READOUT, 1),
+    7: (READOUT, 0),
+    8: (EXPOSURE, 1),
+    9: (EXPOSURE, 0),
+}
 
 T = TypeVar("T")
 
@@ -32,12 +54,12 @@ class _Packet(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Aedat4Recording(EventsOnly):
-    """An .aedat4 file; see `Recording`. Of several event streams it is the one with the lowest number."""
+    """An .aedat4 file; see `Recording`. Of several streams of one kind it is the one with the lowest number."""
 
     path: Path
     name: str
     sensor: Sensor
-    stream_id: int
+    numbers: Mapping[str, int]  # of the stream of each kind that the file has
     endless: bool = False
 
     @classmethod
@@ -69,7 +91,14 @@ class Aedat4Recording(EventsOnly):
         except InvalidField:
             raise MissingGeometry(path) from None
         name = path.name if len(ids) == 1 else f"{path.name} (stream {ids[0]}, the first of {len(ids)} event streams)"
-        return cls(path, name, sensor, ids[0])
+        kinds = ((_KINDS.get(streams[key]["type"]), key) for key in sorted(streams, reverse=True))
+        numbers = {kind: key for kind, key in kinds if kind}
+        return cls(path, name, sensor, numbers)
+
+    @property
+    def streams(self) -> tuple[str, ...]:
+        """Those that its header names."""
+        return tuple(kind for kind in _KINDS.values() if kind in self.numbers)
 
     def chunks(self) -> Iterator[Events]:
         """All events from the beginning; see `Recording`. Times are unix time [us]; other streams are skipped.
@@ -79,22 +108,83 @@ class Aedat4Recording(EventsOnly):
                 before it; it names the byte where that packet begins.
         """
         not_before_us = None
-        for start, records in self._event_packets():
-            events = Events.from_records(records)
+        for start, packet in self._packets("events"):
+            events = Events.from_records(packet["events"])
             try:
                 check_events(events, self.sensor, not_before_us)
             except (EventOutsideSensor, TimeBackwards) as error:
-                yield from in_chunks(_whole(events, self.sensor, not_before_us))
+                yield from in_chunks(whole(events, self.sensor, not_before_us))
                 raise BrokenRecording(self.path, f"byte {start}", f"in this packet, {error.message}") from None
             yield from in_chunks(events)
             not_before_us = int(events.t[-1]) if events.n else not_before_us
 
-    def _event_packets(self) -> Iterator[tuple[int, Any]]:
-        """Where in the file each packet of the event stream begins, and its records (N,).
+    def imu(self) -> Iterator[Imu]:
+        """All samples; see `Recording`. In the unit's own axes, for the file does not tell how it is mounted.
+
+        DV writes deg/s and g. At rest and upright a DAVIS346 shows about -9.8 m/s2 in y, as the optical frame would.
+
+        Raises:
+            BrokenRecording: as `chunks`.
+        """
+        not_before_us = None
+        for start, packet in self._packets("imu"):
+            rows = packet["imus"]
+            t = rows["t"].astype(np.int64)
+            not_before_us = self._ordered(start, t, not_before_us)
+            accel, gyro = (np.stack([rows[f"{kind}_{axis}"] for axis in "xyz"], -1) for kind in _UNITS)
+            if t.size:
+                yield Imu(t, accel.astype(np.float64) * G_M_S2, np.radians(gyro.astype(np.float64)))
+
+    def triggers(self) -> Iterator[Triggers]:
+        """All edges; see `Recording`. Beside the camera's input (channel EXTERNAL) DV marks the frames as edges too.
+
+        The edges of one packet are sorted; marks of a reset clock are left out.
+
+        Raises:
+            BrokenRecording: as `chunks`.
+        """
+        not_before_us = None
+        for start, packet in self._packets("triggers"):
+            rows = packet["triggers"][np.isin(packet["triggers"]["source"], list(_EDGES))]
+            rows = rows[np.argsort(rows["t"], kind="stable")]
+            t = rows["t"].astype(np.int64)
+            not_before_us = self._ordered(start, t, not_before_us)
+            edges = np.array([_EDGES[source] for source in rows["source"].tolist()], np.uint8).reshape(-1, 2)
+            if t.size:
+                yield Triggers(t, edges[:, 0].copy(), edges[:, 1].copy())
+
+    def frames(self) -> Iterator[Frame]:
+        """All images; see `Recording`. A frame smaller than the sensor comes as it is.
+
+        Raises:
+            BrokenRecording: as `chunks`.
+        """
+        not_before_us = None
+        for start, packet in self._packets("frames"):
+            frame = packet["frame"]
+            t_us = int(frame["exposure_begin_t"])
+            not_before_us = self._ordered(start, np.array([t_us]), not_before_us)
+            yield Frame(
+                t_us, np.ascontiguousarray(frame["pixels"][..., :3] if frame["pixels"].ndim == 3 else frame["pixels"])
+            )
+
+    def _ordered(self, start: int, t: NDArray[np.int64], not_before_us: int | None) -> int | None:
+        """The last of these times [us], after a look whether they and what was before them run forwards."""
+        if not t.size:
+            return not_before_us
+        if (np.diff(t) < 0).any() or (not_before_us is not None and t[0] < not_before_us):
+            raise BrokenRecording(self.path, f"byte {start}", "in this packet time runs backwards")
+        return int(t[-1])
+
+    def _packets(self, kind: str) -> Iterator[tuple[int, Any]]:
+        """Where in the file each packet of the stream of this kind begins, and what the decoder makes of it.
 
         The decoder tells neither where it stands nor where it failed, and believes every length; so the packet headers
         are walked and checked ahead of it.
         """
+        wanted = self.numbers.get(kind)
+        if wanted is None:
+            return
         with self.path.open("rb") as file:
             at, end = _read_header(self.path, file)
             size = file.seek(0, 2)
@@ -114,8 +204,8 @@ class Aedat4Recording(EventsOnly):
                 if not decoded or not packet:  # only frames were left, of a kind that the decoder passes over
                     return
                 at = packet.stop
-                if packet.stream == self.stream_id:
-                    yield packet.start, decoded["events"]
+                if packet.stream == wanted:
+                    yield packet.start, decoded
 
 
 def _read_header(path: Path, file: BinaryIO) -> tuple[int, int]:
@@ -174,12 +264,3 @@ def _find(file: BinaryIO, at: int, size: int, stream: int) -> _Packet | None:
     while packet is not None and packet.stream != stream:
         packet = _packet(file, packet.stop, size)
     return packet
-
-
-def _whole(events: Events, sensor: Sensor, not_before_us: int | None) -> Events:
-    """The events before the first that is outside the sensor or out of order."""
-    good = (events.x < sensor.width) & (events.y < sensor.height)
-    good[1:] &= events.t[1:] >= events.t[:-1]
-    if not_before_us is not None:
-        good[0] &= events.t[0] >= not_before_us
-    return events.span(0, int(good.argmin()))

@@ -95,7 +95,9 @@ class SqliteBag:
         with _connected(self.path) as connection:
             if since_ns is not None:
                 query = "SELECT min(id) FROM messages WHERE timestamp >= ?"
-                (found,) = _checked(self.path, 0, lambda: connection.execute(query, (since_ns,)).fetchone())
+                (found,) = _checked(
+                    self.path, 0, lambda: connection.execute(query, (min(since_ns, (1 << 63) - 1),)).fetchone()
+                )
                 first = found if found is not None else 1 << 62
             query = (
                 "SELECT m.id, t.name, m.timestamp, m.data FROM messages m JOIN topics t ON t.id = m.topic_id "
@@ -106,6 +108,8 @@ class SqliteBag:
                 number, topic, log_ns, data = row
                 done = int(number)
                 where = f"message {number}"
+                if not isinstance(data, bytes) or not isinstance(log_ns, int):
+                    raise BrokenRecording(self.path, where, "it is no message")
                 yield BagMessage(topic, log_ns, where, unpacked(self.path, where, data))
 
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from neurove_core.io.errors import BrokenRecording
-from neurove_core.io.recording import CHUNK_EVENTS, in_chunks
+from neurove_core.io.recording import CHUNK_EVENTS, in_chunks, whole
 from protocol.errors import EventOutsideSensor, TimeBackwards
 from protocol.events import Events, Sensor, check_events
 
@@ -23,34 +23,45 @@ def checked(path: Path, pieces: Iterator[tuple[str, Events]], sensor: Sensor) ->
         BrokenRecording: a piece has an event that is outside the sensor or earlier than the one before it, or `pieces`
             raises it; everything before was handed out.
     """
-    waiting: list[Events] = []
-    broken: BrokenRecording | None = None
     not_before_us: int | None = None
+    for batch, broken in _batches(pieces):
+        events = Events.join([piece for _, piece in batch])
+        try:
+            check_events(events, sensor, not_before_us)
+        except (EventOutsideSensor, TimeBackwards):
+            yield from in_chunks(whole(events, sensor, not_before_us))
+            raise _fault(path, batch, sensor, not_before_us) from None
+        yield from in_chunks(events)
+        if broken is not None:
+            raise broken
+        not_before_us = int(events.t[-1]) if events.n else not_before_us
+
+
+def _batches(
+    pieces: Iterator[tuple[str, Events]],
+) -> Iterator[tuple[list[tuple[str, Events]], BrokenRecording | None]]:
+    """Pieces, some _ENOUGH events at a time, and with the last of them what ended them early."""
+    batch: list[tuple[str, Events]] = []
+    n = 0
     try:
-        for where, events in pieces:
-            good, why = _up_to_the_first_fault(events, sensor, not_before_us)
-            if good.n:
-                waiting.append(good)
-                not_before_us = int(good.t[-1])
-            if why:
-                raise BrokenRecording(path, where, f"in this piece, {why}")
-            if sum(one.n for one in waiting) >= _ENOUGH:
-                yield from in_chunks(Events.join(waiting))
-                waiting = []
+        for piece in pieces:
+            batch.append(piece)
+            n += piece[1].n
+            if n >= _ENOUGH:
+                yield batch, None
+                batch, n = [], 0
     except BrokenRecording as error:
-        broken = error
-    yield from in_chunks(Events.join(waiting))
-    if broken is not None:
-        raise broken
+        yield batch, error
+        return
+    yield batch, None
 
 
-def _up_to_the_first_fault(events: Events, sensor: Sensor, not_before_us: int | None) -> tuple[Events, str]:
-    try:
-        check_events(events, sensor, not_before_us)
-    except (EventOutsideSensor, TimeBackwards) as error:
-        good = (events.x < sensor.width) & (events.y < sensor.height)
-        good[1:] &= events.t[1:] >= events.t[:-1]
-        if not_before_us is not None:
-            good[0] &= events.t[0] >= not_before_us
-        return events.span(0, int(good.argmin())), error.message
-    return events, ""
+def _fault(path: Path, batch: list[tuple[str, Events]], sensor: Sensor, not_before_us: int | None) -> BrokenRecording:
+    """Which of these pieces is bad, and why: one of them is."""
+    for where, events in batch:
+        try:
+            check_events(events, sensor, not_before_us)
+        except (EventOutsideSensor, TimeBackwards) as error:
+            return BrokenRecording(path, where, f"in this piece, {error.message}")
+        not_before_us = int(events.t[-1]) if events.n else not_before_us
+    raise AssertionError("no piece is bad alone, so the whole can not be")

@@ -4,49 +4,39 @@ The records are walked here, for the `mcap` package reads a file without an end 
 say at which byte it failed; the few records of the index are parsed by it.
 """
 
-import struct
 import zlib
 from collections.abc import Collection, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO, Final, NamedTuple, Self
+from typing import Any, BinaryIO, NamedTuple, Self
 
 from neurove_core.extras import MissingExtra
 from neurove_core.io.bag_files import MAX_RECORD_BYTES, BagMessage, type_name, unpacked
 from neurove_core.io.errors import BrokenRecording, UnknownSource
+from neurove_core.io.mcap_records import (
+    CHANNEL,
+    CHUNK,
+    CHUNK_HEAD,
+    DATA_END,
+    FOOTER,
+    HEADER,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_HEAD,
+    METADATA,
+    RECORD,
+    SCHEMA,
+    Channel,
+    ChunkIndex,
+    Found,
+    NoSummary,
+    bad_record,
+    length_at,
+    note,
+    summary,
+)
 from neurove_core.io.recording import SUPPORTED
-
-MAGIC: Final = b"\x89MCAP0\r\n"
-_HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _CHUNK_INDEX, _METADATA, _DATA_END = 1, 2, 3, 4, 5, 6, 8, 0xC, 15
-_RECORD = struct.Struct("<BQ")  # opcode, length of what follows
-_MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time [ns]
-_CHUNK_HEAD = struct.Struct("<QQQII")  # first and last log time [ns], size [bytes], crc, length of compression's name
-_FOOTER_BYTES = _RECORD.size + 20 + len(MAGIC)
-
-
-class Channel(NamedTuple):
-    """What the messages of one channel are."""
-
-    topic: str
-    schema: str
-    encoding: str  # of messages, such as `cdr`
-
-
-class ChunkIndex(NamedTuple):
-    """One chunk, as the index at the end of the file tells it."""
-
-    start: int  # byte of its record
-    end_ns: int  # last log time in it
-    channels: frozenset[int]
-
-
-@dataclass(slots=True)
-class _Found:
-    """What a walk has learned so far."""
-
-    channels: dict[int, Channel] = field(default_factory=dict)
-    schemas: dict[int, str] = field(default_factory=dict)
 
 
 class Record(NamedTuple):
@@ -79,15 +69,15 @@ class McapFile:
         with path.open("rb") as file:
             if file.read(len(MAGIC)) != MAGIC:
                 raise UnknownSource(path, SUPPORTED, "the file does not begin as MCAP does")
-            head = _RECORD.unpack(file.read(_RECORD.size).ljust(_RECORD.size, b"\0"))
-            if head[0] != _HEADER or not 4 <= head[1] <= 1 << 16:
+            head = RECORD.unpack(file.read(RECORD.size).ljust(RECORD.size, b"\0"))
+            if head[0] != HEADER or not 4 <= head[1] <= 1 << 16:
                 raise UnknownSource(path, SUPPORTED, "the file has no MCAP header")
             body = file.read(head[1])
             profile = body[4 : 4 + int.from_bytes(body[:4], "little")].decode("utf-8", "replace")
             try:
-                found, chunks, metadata = _summary(file)
-            except _NoSummary:
-                found, chunks, metadata = _Found(), (), {}
+                found, chunks, metadata = summary(file)
+            except NoSummary:
+                found, chunks, metadata = Found(), (), {}
         if not found.channels:
             self = cls(path, profile, {}, (), {})
             try:
@@ -134,15 +124,15 @@ class McapFile:
             start = self.path.stat().st_size if last else self.chunks[first_chunk].start
             if last:
                 return
-        return (yield from self._walk(_Found(dict(self.channels)), wanted, {}, start))
+        return (yield from self._walk(Found(dict(self.channels)), wanted, {}, start))
 
     def first_in_chunk(self, topic: str, chunk: int) -> Record | None:
         """The first message of a topic in one chunk of the index."""
         with self.path.open("rb") as file:
             at = self.chunks[chunk].start
-            file.seek(at + _RECORD.size)
-            body, whole = _body(self.path, file, at, _length(file, at))
-            return next(_in_chunk(self.path, at, body, _Found(dict(self.channels)), {topic}, whole), None)
+            file.seek(at + RECORD.size)
+            body, whole = _body(self.path, file, at, length_at(file, at))
+            return next(_in_chunk(self.path, at, body, Found(dict(self.channels)), {topic}, whole), None)
 
     def chunks_of(self, topic: str) -> list[int]:
         """Numbers of the chunks that hold messages of a topic; all, where the index does not tell."""
@@ -150,39 +140,30 @@ class McapFile:
         return [i for i, chunk in enumerate(self.chunks) if not chunk.channels or ids & chunk.channels]
 
     def _walk(
-        self, found: _Found, wanted: Collection[str], metadata: dict[str, dict[str, str]], start: int = len(MAGIC)
+        self, found: Found, wanted: Collection[str], metadata: dict[str, dict[str, str]], start: int = len(MAGIC)
     ) -> Iterator[Record]:
         with self.path.open("rb") as file:
             size = file.seek(0, 2)
             at = file.seek(start)
             while True:
-                head = file.read(_RECORD.size)
-                if len(head) < _RECORD.size:
+                head = file.read(RECORD.size)
+                if len(head) < RECORD.size:
                     raise BrokenRecording(self.path, f"byte {at}", "the file ends before its records do")
-                opcode, length = _RECORD.unpack(head)
-                if opcode in (_DATA_END, _FOOTER):
+                opcode, length = RECORD.unpack(head)
+                if opcode in (DATA_END, FOOTER):
                     return
-                if opcode in (_CHUNK, _MESSAGE, _SCHEMA, _CHANNEL, _METADATA):
+                if opcode in (CHUNK, MESSAGE, SCHEMA, CHANNEL, METADATA):
                     body, whole = _body(self.path, file, at, length)
-                    if opcode == _CHUNK:
+                    if opcode == CHUNK:
                         yield from _in_chunk(self.path, at, body, found, wanted, whole)
                     elif whole and (record := _taken(self.path, f"byte {at}", opcode, body, found, wanted, metadata)):
                         yield record
                     if not whole:
                         raise BrokenRecording(self.path, f"byte {at}", "the file ends within this record")
-                after = at + _RECORD.size + length
+                after = at + RECORD.size + length
                 if after > size:
                     raise BrokenRecording(self.path, f"byte {at}", "the file ends within this record")
                 at = file.seek(after)
-
-
-class _NoSummary(Exception):
-    """The file has no index at its end."""
-
-
-def _length(file: BinaryIO, at: int) -> int:
-    file.seek(at)
-    return int(_RECORD.unpack(file.read(_RECORD.size))[1])
 
 
 def _body(path: Path, file: BinaryIO, at: int, length: int) -> tuple[bytes, bool]:
@@ -193,16 +174,14 @@ def _body(path: Path, file: BinaryIO, at: int, length: int) -> tuple[bytes, bool
     return body, len(body) == length
 
 
-def _in_chunk(
-    path: Path, at: int, body: bytes, found: _Found, wanted: Collection[str], whole: bool
-) -> Iterator[Record]:
+def _in_chunk(path: Path, at: int, body: bytes, found: Found, wanted: Collection[str], whole: bool) -> Iterator[Record]:
     """The messages of one chunk; of one that was cut, those that are whole."""
     where = f"byte {at}"
-    if len(body) < _CHUNK_HEAD.size:
+    if len(body) < CHUNK_HEAD.size:
         raise BrokenRecording(path, where, "the file ends within this chunk's head")
-    _, _, size, crc, name = _CHUNK_HEAD.unpack_from(body)
-    start = _CHUNK_HEAD.size + name + 8
-    compression = body[_CHUNK_HEAD.size : start - 8].decode("ascii", "replace")
+    _, _, size, crc, name = CHUNK_HEAD.unpack_from(body)
+    start = CHUNK_HEAD.size + name + 8
+    compression = body[CHUNK_HEAD.size : start - 8].decode("ascii", "replace")
     if size > MAX_RECORD_BYTES:
         raise BrokenRecording(path, where, f"a chunk of {size} bytes; at most {MAX_RECORD_BYTES} are read")
     data, why = _plain(compression, body[start:], size)
@@ -212,14 +191,14 @@ def _in_chunk(
         why = "this chunk's checksum is wrong"  # which of its messages is bad nobody knows
         data = b""
     inside = 0
-    while inside + _RECORD.size <= len(data):
-        opcode, length = _RECORD.unpack_from(data, inside)
-        stop = inside + _RECORD.size + length
+    while inside + RECORD.size <= len(data):
+        opcode, length = RECORD.unpack_from(data, inside)
+        stop = inside + RECORD.size + length
         if stop > len(data):
             why = why or "a record reaches over the end of this chunk"
             break
         place = f"byte {inside} of the chunk at {where}"
-        record = _taken(path, place, opcode, data[inside + _RECORD.size : stop], found, wanted, {})
+        record = _taken(path, place, opcode, data[inside + RECORD.size : stop], found, wanted, {})
         if record:
             yield record
         inside = stop
@@ -270,106 +249,24 @@ def _taken(
     where: str,
     opcode: int,
     body: bytes,
-    found: _Found,
+    found: Found,
     wanted: Collection[str],
     metadata: dict[str, dict[str, str]],
 ) -> Record | None:
     """The message of this record, if it is one of a wanted topic; of another kind what it tells is noted."""
-    if opcode == _MESSAGE:
-        if len(body) < _MESSAGE_HEAD.size:
+    if opcode == MESSAGE:
+        if len(body) < MESSAGE_HEAD.size:
             raise BrokenRecording(path, where, "a message without a head")
-        number, _, log_ns, publish_ns = _MESSAGE_HEAD.unpack_from(body)
+        number, _, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(body)
         channel = found.channels.get(number)
         if channel is None:
             raise BrokenRecording(path, where, f"a message of channel {number}, which was never described")
         if channel.topic not in wanted:
             return None
-        return Record(channel, log_ns, publish_ns, where, body[_MESSAGE_HEAD.size :])
-    if opcode in (_SCHEMA, _CHANNEL, _METADATA):
+        return Record(channel, log_ns, publish_ns, where, body[MESSAGE_HEAD.size :])
+    if opcode in (SCHEMA, CHANNEL, METADATA):
         try:
-            _note(opcode, body, found, metadata)
-        except _bad_record() as error:
+            note(opcode, body, found, metadata)
+        except bad_record() as error:
             raise BrokenRecording(path, where, f"this record can not be read: {error}") from None
     return None
-
-
-def _note(opcode: int, body: bytes, found: _Found, metadata: dict[str, dict[str, str]]) -> None:
-    records, stream = _parser(body)
-    if opcode == _SCHEMA:
-        schema = records.Schema.read(stream)
-        found.schemas[schema.id] = schema.name
-    elif opcode == _CHANNEL:
-        channel = records.Channel.read(stream)
-        schema_name = found.schemas.get(channel.schema_id, "")
-        found.channels.setdefault(channel.id, Channel(channel.topic, schema_name, channel.message_encoding))
-    else:
-        one = records.Metadata.read(stream)
-        metadata[one.name] = dict(one.metadata)
-
-
-def _parser(body: bytes) -> tuple[Any, Any]:
-    try:
-        from mcap import records
-        from mcap.data_stream import ReadDataStream
-    except ModuleNotFoundError:
-        raise MissingExtra("mcap", "recordings") from None
-    return records, ReadDataStream(BytesIO(body))
-
-
-def _bad_record() -> tuple[type[Exception], ...]:
-    from mcap.exceptions import McapError
-
-    return (McapError, struct.error, ValueError, IndexError, OSError, OverflowError)
-
-
-def _summary(file: BinaryIO) -> tuple[_Found, tuple[ChunkIndex, ...], dict[str, dict[str, str]]]:
-    """What the index at the end of the file tells.
-
-    Raises:
-        _NoSummary: there is none, or it is garbled.
-    """
-    size = file.seek(0, 2)
-    file.seek(max(0, size - _FOOTER_BYTES))
-    tail = file.read()
-    if len(tail) < _FOOTER_BYTES or not tail.endswith(MAGIC) or tail[0] != _FOOTER:
-        raise _NoSummary
-    (start,) = struct.unpack_from("<Q", tail, _RECORD.size)
-    stop = size - _FOOTER_BYTES
-    if not 0 < start <= stop or stop - start > MAX_RECORD_BYTES:
-        raise _NoSummary
-    file.seek(start)
-    data = file.read(stop - start)
-    found, chunks, metadata = _Found(), [], []
-    at = 0
-    while at + _RECORD.size <= len(data):
-        opcode, length = _RECORD.unpack_from(data, at)
-        body = data[at + _RECORD.size : at + _RECORD.size + length]
-        at += _RECORD.size + length
-        try:
-            if opcode in (_SCHEMA, _CHANNEL):
-                _note(opcode, body, found, {})
-            elif opcode == _CHUNK_INDEX:
-                records, stream = _parser(body)
-                chunk = records.ChunkIndex.read(stream)
-                ids = frozenset(chunk.message_index_offsets)
-                chunks.append(ChunkIndex(chunk.chunk_start_offset, chunk.message_end_time, ids))
-            elif opcode == _METADATA + 1:
-                records, stream = _parser(body)
-                metadata.append(records.MetadataIndex.read(stream).offset)
-        except _bad_record():
-            raise _NoSummary from None
-    if any(chunk.start >= start for chunk in chunks):
-        raise _NoSummary
-    return found, tuple(sorted(chunks)), _metadata(file, metadata)
-
-
-def _metadata(file: BinaryIO, places: list[int]) -> dict[str, dict[str, str]]:
-    told: dict[str, dict[str, str]] = {}
-    for at in places:
-        try:
-            length = _length(file, at)
-            if length <= MAX_RECORD_BYTES:
-                _note(_METADATA, file.read(length), _Found(), told)
-        except _bad_record():
-            raise _NoSummary from None
-    return told

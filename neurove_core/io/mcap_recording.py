@@ -120,6 +120,11 @@ class McapRecording(EventsOnly):
             name = record.channel.topic.removesuffix("/events")
             yield RecordedPacket(name, record.data, record.log_ns)
 
+    @property
+    def all_streams(self) -> tuple[str, ...]:
+        """Names of all streams in the file that have packets."""
+        return tuple(_streams(self.file))
+
     def cameras(self) -> dict[str, bytes]:
         """The last CameraInfo of each stream that has one, bit for bit."""
         topics = [f"{name}/camera" for name in _streams(self.file)]

@@ -8,28 +8,35 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core import kernels
+from neurove_core import evt
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
-from neurove_core.io.recording import BLOCK_BYTES, CHUNK_EVENTS, SUPPORTED, EventsOnly
+from neurove_core.io.recording import BLOCK_BYTES, CHUNK_EVENTS, SUPPORTED, EventsOnly, Triggers, room
 from protocol.errors import InvalidField
 from protocol.events import Events, Sensor
 
 HEADER_BYTES = 64 << 10  # a header is some 500 bytes; more than this is none
 
 Decode = Callable[[NDArray[Any], Any, int, int, Events], tuple[Any, int, int, int]]
+FindTriggers = Callable[[NDArray[Any], evt.TriggerState], tuple[evt.TriggerState, evt.Columns]]
 
 
 class Words(NamedTuple):
     """One word format: how wide a word is and what reads it."""
 
     dtype: np.dtype[Any]
+    known: NDArray[np.bool_]  # (16,) of the four bits that tell a word's type
     decode: Decode
     start: NamedTuple
+    triggers: FindTriggers
+
+
+def _known(*kinds: int) -> NDArray[np.bool_]:
+    return np.isin(np.arange(16), kinds)
 
 
 FORMATS = {
-    "EVT2": Words(np.dtype("<u4"), kernels.evt2_decode, kernels.Evt2State()),
-    "EVT3": Words(np.dtype("<u2"), kernels.evt3_decode, kernels.Evt3State()),
+    "EVT2": Words(np.dtype("<u4"), _known(*evt.EVT2_WORDS), evt.evt2_decode, evt.Evt2State(), evt.evt2_triggers),
+    "EVT3": Words(np.dtype("<u2"), _known(*evt.EVT3_WORDS), evt.evt3_decode, evt.Evt3State(), evt.evt3_triggers),
 }
 _FORMAT_OF_EVT = {"2.0": "EVT2", "2.1": "EVT21", "3.0": "EVT3"}
 
@@ -113,39 +120,66 @@ class PropheseeRecording(EventsOnly):
         return cls(path, sensor, FORMATS[header.format], header.size)
 
     @property
+    def streams(self) -> tuple[str, ...]:
+        """Events and triggers: whether any trigger came shows when they are read."""
+        return ("events", "triggers")
+
+    @property
     def name(self) -> str:
         """The file's name."""
         return self.path.name
 
     def chunks(self) -> Iterator[Events]:
-        """All events from the beginning; see `Recording`. Triggers and monitoring words are skipped.
+        """All events from the beginning; see `Recording`. Other words are skipped.
 
         Raises:
             BrokenRecording: a word is cut, of no known type, or holds an event outside the sensor; it names the byte.
         """
-        dtype, decode, state = self.words
+        dtype, _, decode, state, _ = self.words
         at = self.header_bytes
         with self.path.open("rb") as file:
             file.seek(at)
             while block := file.read(BLOCK_BYTES):
                 words = np.frombuffer(block, dtype, len(block) // dtype.itemsize)
                 while words.size:
-                    out = _room(CHUNK_EVENTS)
+                    out = room(CHUNK_EVENTS)
                     state, read, n, verdict = decode(words, state, self.sensor.width, self.sensor.height, out)
                     if n:
                         yield out.span(0, n)
                     at += read * dtype.itemsize
-                    if verdict != kernels.OK:
+                    if verdict != evt.OK:
                         raise BrokenRecording(self.path, f"byte {at}", self._why(verdict, int(words[read]), out, n))
                     words = words[read:]
                 if len(block) % dtype.itemsize:
                     raise BrokenRecording(self.path, f"byte {at}", "the file ends within a word")
 
-    def _why(self, verdict: int, word: int, out: Events, n: int) -> str:
-        if verdict == kernels.OUTSIDE:
-            return f"an event at x={out.x[n]} y={out.y[n]} lies outside the sensor {self.sensor}"
+    def triggers(self) -> Iterator[Triggers]:
+        """All edges on the trigger inputs; see `Recording`. Their times are of the clock of the events.
+
+        Raises:
+            BrokenRecording: a word is cut or of no known type; it names the byte.
+        """
+        dtype, known, _, _, find = self.words
+        at, state = self.header_bytes, evt.TriggerState()
+        with self.path.open("rb") as file:
+            file.seek(at)
+            while block := file.read(BLOCK_BYTES):
+                words = np.frombuffer(block, dtype, len(block) // dtype.itemsize)
+                good = known[words >> (8 * dtype.itemsize - 4)]
+                n = words.size if good.all() else int(good.argmin())
+                state, columns = find(words[:n], state)
+                if columns[0].size:
+                    yield Triggers(*columns)
+                at += n * dtype.itemsize
+                if n < words.size:
+                    raise BrokenRecording(self.path, f"byte {at}", self._unknown(int(words[n])))
+                if len(block) % dtype.itemsize:
+                    raise BrokenRecording(self.path, f"byte {at}", "the file ends within a word")
+
+    def _unknown(self, word: int) -> str:
         return f"0x{word:0{2 * self.words.dtype.itemsize}x} is of no known word type"
 
-
-def _room(n: int) -> Events:
-    return Events(np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8))
+    def _why(self, verdict: int, word: int, out: Events, n: int) -> str:
+        if verdict == evt.OUTSIDE:
+            return f"an event at x={out.x[n]} y={out.y[n]} lies outside the sensor {self.sensor}"
+        return self._unknown(word)

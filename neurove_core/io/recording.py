@@ -2,12 +2,14 @@
 
 from abc import abstractmethod
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.geometry import Poses, Twists
+from neurove_core.io.errors import UnknownSource
 from protocol.camera import CameraInfo
 from protocol.events import Events, Sensor
 
@@ -19,10 +21,13 @@ BLOCK_BYTES: Final = 4 << 20
 
 SUPPORTED: Final = (
     "FILE.aedat4 (DV)",
-    "FILE.raw (Prophesee EVT2, EVT3)",
+    "FILE.aedat (jAER's AEDAT 2.0)",
+    "FILE.raw (Prophesee EVT2, EVT3), FILE.dat (Prophesee DAT)",
+    "FILE.es (Event Stream)",
     "FILE.mcap (our own, of `neurove record` and `neurove convert`)",
     "FILE.bag (ROS 1), FILE.db3, FILE.mcap or their folder (ROS 2)",
-    "a folder with events.txt, or FILE.txt (Event Camera Dataset)",
+    "a folder with events.txt, a FILE.zip with one, or FILE.txt (Event Camera Dataset)",
+    "FILE.h5, FILE.hdf5 (MVSEC, DSEC, M3ED)",
     "sim://SCENE?trajectory=...&seed=... (built-in simulator)",
     "pattern:// (built-in)",
 )
@@ -162,3 +167,29 @@ def later(chunks: Iterator[Events], t_us: int) -> Iterator[Events]:
         first = int(chunk.t.searchsorted(t_us))
         if first < chunk.n:
             yield chunk.span(first, chunk.n)
+
+
+def refuse_topic(source: str | Path, topic: str | None) -> None:
+    """Refuse a choice among event streams where there is one stream only.
+
+    Raises:
+        UnknownSource: a topic is given.
+    """
+    if topic is not None:
+        raise UnknownSource(source, SUPPORTED, f"it has one event stream and no topic {topic!r}")
+
+
+def whole(events: Events, sensor: Sensor, not_before_us: int | None) -> Events:
+    """The events before the first that is outside the sensor or out of order."""
+    if not events.n:
+        return events
+    good = (events.x < sensor.width) & (events.y < sensor.height)
+    good[1:] &= events.t[1:] >= events.t[:-1]
+    if not_before_us is not None:
+        good[0] &= events.t[0] >= not_before_us
+    return events.span(0, events.n if good.all() else int(good.argmin()))
+
+
+def room(n: int) -> Events:
+    """Columns for a decoder to write this many events into."""
+    return Events(np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8))

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core import kernels
-from neurove_core.io.recording import CHUNK_EVENTS, Triggers
+from neurove_core.io.recording import CHUNK_EVENTS, Triggers, room
 from neurove_core.io.ros_messages import DVS, BadMessage, EventMessage
-from neurove_core.kernels_libcaer import WORD_EVENTS, LibcaerState, libcaer_decode, signed
+from neurove_core.kernels_libcaer import WORD_EVENTS, LibcaerState, libcaer_decode
 from protocol.events import Events, Sensor
 
 ENCODINGS: Final = ("evt3", "libcaer", "libcaer_cmp", "mono")
@@ -23,6 +23,7 @@ UNIX_TIME: Final = ("libcaer", "libcaer_cmp", DVS)
 _EVT3_PERIOD_US = 1 << 24
 _LIBCAER_PERIOD_US = 1 << 31
 _MICROSECOND = 1000  # [ns]
+_WORDS = CHUNK_EVENTS // WORD_EVENTS  # decoded at once
 
 
 class Anchor(NamedTuple):
@@ -45,6 +46,7 @@ class Decoder:
         self._anchor = anchor
         self._seq: int | None = None
         self._evt3 = kernels.Evt3State()
+        self._triggers = kernels.TriggerState()
         self._libcaer = LibcaerState()
         self._shift_us: int | None = 0 if anchor is None else None  # None: to be found, after a gap
 
@@ -54,10 +56,10 @@ class Decoder:
         Raises:
             BadMessage: after the events before the first that can not be used.
         """
-        gap = self._seq is not None and message.seq not in (self._seq + 1, -1)
-        self._seq = message.seq
-        if gap:  # what the camera said last of row, column and time is not known
-            self._evt3, self._libcaer, self._shift_us = kernels.Evt3State(), LibcaerState(), None
+        self._heed_a_gap(message)
+        yield from self._decoded(message)
+
+    def _decoded(self, message: EventMessage) -> Iterator[Events]:
         match message.encoding:
             case "evt3":
                 yield from self._of_evt3(message)
@@ -71,23 +73,31 @@ class Decoder:
                 raise BadMessage(f"its encoding is {other!r}; known are {', '.join(ENCODINGS)}")
 
     def triggers(self, message: EventMessage) -> Iterator[Triggers]:
-        """The trigger edges of the next message, which only `evt3` has."""
+        """The trigger edges of the next message, which only `evt3` has; call this or `events` of a message.
+
+        Raises:
+            BadMessage: some word of it can not be used.
+        """
         if message.encoding != "evt3":
             return
-        words = _words(message)
-        before = self._evt3
-        for _ in self.events(message):
+        self._heed_a_gap(message)
+        for _ in self._decoded(message):  # the clock goes on by the events, and a bad word is told
             pass
-        shift_us = self._shift_us
-        if shift_us is not None:
-            found = trigger_edges(words, before)
-            if found.t.size:
-                yield found._replace(t=found.t + shift_us)
+        self._triggers, (t, channel, level) = kernels.evt3_triggers(_words(message), self._triggers)
+        if t.size:
+            yield Triggers(t + self._shift(message, int(t[0])), channel, level)
+
+    def _heed_a_gap(self, message: EventMessage) -> None:
+        """After lost messages it is not known what the camera said last of row, column and time."""
+        if self._seq is not None and message.seq not in (self._seq + 1, -1):
+            self._evt3, self._triggers, self._shift_us = kernels.Evt3State(), kernels.TriggerState(), None
+            self._libcaer = LibcaerState()
+        self._seq = message.seq
 
     def _of_evt3(self, message: EventMessage) -> Iterator[Events]:
-        words = _words(message)
+        words, done = _words(message), 0
         while words.size:
-            out = _room(min(CHUNK_EVENTS, max(words.size * kernels.VECTOR_EVENTS, kernels.VECTOR_EVENTS)))
+            out = room(min(CHUNK_EVENTS, max(words.size * kernels.VECTOR_EVENTS, kernels.VECTOR_EVENTS)))
             width, height = self._sensor.width, self._sensor.height
             self._evt3, read, n, verdict = kernels.evt3_decode(words, self._evt3, width, height, out)
             if n:
@@ -95,29 +105,35 @@ class Decoder:
             if verdict == kernels.OUTSIDE:
                 raise BadMessage(f"an event at x={out.x[n]} y={out.y[n]} lies outside the sensor {self._sensor}")
             if verdict != kernels.OK:
-                raise BadMessage(f"its word {read}, 0x{int(words[read]):04x}, is of no known type")
-            words = words[read:]
+                raise BadMessage(f"its word {done + read}, 0x{int(words[read]):04x}, is of no known type")
+            words, done = words[read:], done + read
 
     def _counted_on(self, events: Events, message: EventMessage) -> Events:
-        """The same events on one clock with those before: after a gap the clock may have wrapped unseen."""
-        t0_us = int(events.t[0])
+        """The same events on one clock with those before."""
+        shift_us = self._shift(message, int(events.t[0]))
+        self._anchor = Anchor(message.stamp_ns, int(events.t[0]) + shift_us)
+        return events._replace(t=events.t + shift_us) if shift_us else events
+
+    def _shift(self, message: EventMessage, t0_us: int) -> int:
+        """What the clock has wrapped unseen [us]: in a gap, by the stamps of the messages before and after it."""
         if self._shift_us is None and self._anchor is not None:
             away_us = (message.stamp_ns - self._anchor.stamp_ns) // _MICROSECOND
             self._shift_us = round((self._anchor.t_us + away_us - t0_us) / _EVT3_PERIOD_US) * _EVT3_PERIOD_US
-        shift_us = self._shift_us or 0
-        self._anchor = Anchor(message.stamp_ns, t0_us + shift_us)
-        return events._replace(t=events.t + shift_us) if shift_us else events
+        return self._shift_us or 0
 
     def _of_libcaer_cmp(self, message: EventMessage) -> Iterator[Events]:
         base_us, width, height = message.time_base_ns // _MICROSECOND, self._sensor.width, self._sensor.height
+        self._libcaer = self._libcaer._replace(high=0, low=0)
         words = _words(message)
-        out = _room(words.size * WORD_EVENTS)
-        self._libcaer, read, n, verdict = libcaer_decode(words, self._libcaer, base_us, width, height, out)
-        yield out.span(0, n)
-        if verdict == kernels.OUTSIDE:
-            raise BadMessage(f"an event at x={out.x[n]} y={out.y[n]} lies outside the sensor {self._sensor}")
-        if verdict != kernels.OK:
-            raise BadMessage(f"its word {read}, 0x{int(words[read]):04x}, is of no known type")
+        for first in range(0, words.size, _WORDS):
+            part = words[first : first + _WORDS]
+            out = room(part.size * WORD_EVENTS)
+            self._libcaer, read, n, verdict = libcaer_decode(part, self._libcaer, base_us, width, height, out)
+            yield out.span(0, n)
+            if verdict == kernels.OUTSIDE:
+                raise BadMessage(f"an event at x={out.x[n]} y={out.y[n]} lies outside the sensor {self._sensor}")
+            if verdict != kernels.OK:
+                raise BadMessage(f"its word {first + read}, 0x{int(part[read]):04x}, is of no known type")
 
 
 def _words(message: EventMessage) -> NDArray[np.uint16]:
@@ -152,49 +168,6 @@ def _libcaer(message: EventMessage) -> Events:
 def _mono(message: EventMessage) -> Events:
     """8 bytes an event: time after the message's time base [ns], x, y with the polarity in bit 15."""
     rows = _rows(message, [("dt", "<u4"), ("x", "<u2"), ("y", "<u2")])
-    t = (message.time_base_ns + rows["dt"].astype(np.int64)) // _MICROSECOND
+    base_us, rest_ns = divmod(message.time_base_ns, _MICROSECOND)  # as a whole it may not fit a signed number
+    t = base_us + (rest_ns + rows["dt"].astype(np.int64)) // _MICROSECOND
     return Events.from_columns(t, rows["x"].copy(), rows["y"] & 0x7FFF, rows["y"] >> 15)
-
-
-def trigger_edges(words: NDArray[np.uint16], state: kernels.Evt3State) -> Triggers:
-    """The trigger words (0xA: channel in bits 8 to 11, level in bit 0) among EVT3 words, and when they came.
-
-    Args:
-        words: (N,) words as the camera wrote them.
-        state: of the decoder before them.
-    """
-    out = Triggers(np.empty(words.size, np.int64), np.empty(words.size, np.uint8), np.empty(words.size, np.uint8))
-    n = _edges(words, state.timed, state.high, state.low, out.t, out.channel, out.level)
-    return Triggers(out.t[:n], out.channel[:n], out.level[:n])
-
-
-@kernels.compiled
-def _edges(
-    words: NDArray[np.uint16],
-    timed: int,
-    high: int,
-    low: int,
-    t: NDArray[np.int64],
-    channel: NDArray[np.uint8],
-    level: NDArray[np.uint8],
-) -> int:  # pragma: no cover (machine code)
-    n = 0
-    for i in range(words.size):
-        word = signed(words[i])
-        kind, value = word >> 12, word & 0xFFF
-        if kind == 0x6:
-            low = value
-        elif kind == 0x8:
-            step = (value - high + kernels.STEP_BACK) % 4096 - kernels.STEP_BACK
-            if not timed:
-                high, low, timed = value, 0, 1
-            elif step:
-                high, low = high + step, 0
-        elif kind == 0xA and timed:
-            t[n], channel[n], level[n] = (high << 12) + low, (value >> 8) & 0xF, value & 1
-            n += 1
-    return n
-
-
-def _room(n: int) -> Events:
-    return Events(np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8))

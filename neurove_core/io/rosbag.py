@@ -8,7 +8,8 @@ from typing import Final, Self, TypeVar
 
 import numpy as np
 
-from neurove_core.geometry import Poses
+from neurove_core import geometry
+from neurove_core.geometry import Poses, Twists
 from neurove_core.io import ros_messages
 from neurove_core.io.bag_files import BagFile, BagFolder, BagMessage, SqliteBag, in_recorded_order
 from neurove_core.io.checked import checked
@@ -107,6 +108,7 @@ class RosbagRecording(EventsOnly):
             "imu": self._beside(IMU_TYPE) is not None,
             "triggers": self.first.encoding == "evt3",
             "poses": self._beside(*POSE_TYPES) is not None,
+            "twists": self._beside(*POSE_TYPES) is not None,
         }
         return ("events", *(name for name, here in held.items() if here))
 
@@ -224,6 +226,8 @@ class RosbagRecording(EventsOnly):
     def poses(self) -> Poses | None:
         """The geometry_msgs/PoseStamped or nav_msgs/Odometry topic nearest by name, of whatever body that tracks.
 
+        Of poses within one microsecond the first is kept: trackers send some twice.
+
         Raises:
             BrokenRecording: as `chunks`; or an orientation is no rotation.
         """
@@ -235,12 +239,14 @@ class RosbagRecording(EventsOnly):
         samples: list[ros_messages.PoseSample] = []
         for message in self.bag.messages((topic,)):
             sample = self._read(message, read)
-            if samples and sample.stamp_ns < samples[-1].stamp_ns:
-                raise BrokenRecording(self.path, message.where, "time runs backwards")
-            if not abs(float(np.linalg.norm(sample.orientation)) - 1) < 1e-2:  # so written that nan fails
-                raise BrokenRecording(
-                    self.path, message.where, f"orientation {sample.orientation} is no unit quaternion"
-                )
+            if samples and sample.stamp_ns // 1000 <= samples[-1].stamp_ns // 1000:
+                if sample.stamp_ns < samples[-1].stamp_ns:
+                    raise BrokenRecording(self.path, message.where, "time runs backwards")
+                continue
+            length = float(np.linalg.norm(sample.orientation))
+            if not (abs(length - 1) < 1e-2 and np.isfinite(sample.position_m).all()):  # so written that nan fails
+                why = f"position {sample.position_m} and orientation {sample.orientation} are no pose"
+                raise BrokenRecording(self.path, message.where, why)
             samples.append(sample)
         if not samples:
             return None
@@ -248,6 +254,11 @@ class RosbagRecording(EventsOnly):
         orientation = np.array([sample.orientation for sample in samples])
         orientation /= np.linalg.norm(orientation, axis=1, keepdims=True)
         return Poses(t, np.array([sample.position_m for sample in samples]), orientation)
+
+    def twists(self) -> Twists | None:
+        """How the tracked body moved, by its poses; None where these are too few. See `geometry.twists`."""
+        poses = self.poses()
+        return geometry.twists(poses) if poses is not None and poses.t.size > 1 else None
 
     def _beside(self, *types: str) -> str | None:
         """The topic of one of these types whose name has most in common with that of the events."""

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from neurove_core import kernels
+from neurove_core import evt, kernels
 from neurove_core.kernels import ILLEGAL, OK, OUTSIDE, VECTOR_EVENTS, Evt2State, Evt3State
 from protocol import Events, Sensor
 from tests.builders import make_events
@@ -274,6 +274,40 @@ def test_triggers_and_monitoring_words_make_no_event():
     words = evt3((TIME_HIGH, 0), (ADDR_Y, 1), (TRIGGER, 1), (OTHERS, 5), (7, 3), (0xF, 4), HIT)
     assert decode(EVT3, words)[2].n == 1
     assert decode(EVT2, evt2((8, 0), (TRIGGER, 1), (OTHERS, 5), (0xF, 4), (1, cd(0, 1, 1))))[2].n == 1
+
+
+def test_triggers_are_found_with_their_time_channel_and_level():
+    early = [(TRIGGER, 1), (TIME_LOW, 9)]
+    words = evt3(*early, (TIME_HIGH, 2), (TIME_LOW, 7), HIT, (TRIGGER, 1 << 8 | 1), (TIME_HIGH, 3), (TRIGGER, 1 << 8))
+    _, (t, channel, level) = evt.evt3_triggers(words, evt.TriggerState())
+    assert (t.tolist(), channel.tolist(), level.tolist()) == ([2 * 4096 + 7, 3 * 4096], [1, 1], [1, 0])
+    words = evt2((TRIGGER, 1), (8, 5), (TRIGGER, 63 << 22 | 17 << 8 | 1), (1, cd(63, 1, 1)))
+    _, (t, channel, level) = evt.evt2_triggers(words, evt.TriggerState())
+    assert (t.tolist(), channel.tolist(), level.tolist()) == ([5 * 64 + 63], [17], [1])
+
+
+@given(words=evt3_streams(), cuts=st.lists(st.integers(0, 200), max_size=6))
+def test_compiled_evt3_triggers_are_their_reference_however_the_words_are_cut(words, cuts):
+    assert_same_triggers(evt.evt3_triggers, evt.evt3_triggers_reference, np.split(words, sorted(cuts)), words)
+
+
+@given(words=evt2_streams(), cuts=st.lists(st.integers(0, 200), max_size=6))
+def test_compiled_evt2_triggers_are_their_reference_however_the_words_are_cut(words, cuts):
+    assert_same_triggers(evt.evt2_triggers, evt.evt2_triggers_reference, np.split(words, sorted(cuts)), words)
+
+
+def assert_same_triggers(
+    decode: Callable[..., Any], reference: Callable[..., Any], pieces: Sequence[NDArray[Any]], words: NDArray[Any]
+) -> None:
+    state, parts = evt.TriggerState(), []
+    for piece in pieces:
+        state, columns = decode(piece, state)
+        parts.append(columns)
+    want_state, want = reference(words, evt.TriggerState())
+    assert state == want_state
+    for got, column in zip(zip(*parts, strict=True), want, strict=True):
+        np.testing.assert_array_equal(np.concatenate(got), column)
+    assert (np.diff(want[0]) >= 0).all()
 
 
 @pytest.mark.parametrize("kind", [1, 9, 0xB, 0xC, 0xD])

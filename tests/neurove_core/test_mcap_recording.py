@@ -155,6 +155,19 @@ def test_nothing_stands_under_the_name_until_the_recording_is_whole(tmp_path):
     assert path.read_bytes() == before
 
 
+def test_what_a_killed_recorder_left_can_be_read_once_it_is_renamed(tmp_path):
+    packets = make_packets(300, n=4000)
+    writer = PacketWriter(tmp_path / "a.mcap")
+    for packet in packets:
+        writer.write("cam0", encode_packet(packet), 0)
+    (tmp_path / "left.mcap").write_bytes((tmp_path / "a.mcap.part").read_bytes())
+    writer.abandon()
+    events, error = read_broken(open_source(str(tmp_path / "left.mcap")))
+    assert error is not None
+    assert 600_000 < events.n < 1_200_000
+    assert_same(events, Events.join([packet.events for packet in packets]).span(0, events.n))
+
+
 def test_a_recording_that_was_cut_is_not_written_over(tmp_path):
     (tmp_path / "a.mcap.part").write_bytes(b"what a killed recorder left")
     with pytest.raises(NeuroVEError, match=r"a\.mcap\.part.*cut short"):

@@ -168,6 +168,13 @@ def test_triggers_have_the_time_level_and_channel_of_their_words(tmp_path):
     assert [(list(t), list(c), list(level)) for t, c, level in triggers] == [([8199], [6], [1]), ([8201], [3], [0])]
 
 
+def test_triggers_keep_to_the_clock_of_the_events_over_a_gap(tmp_path):
+    words = [evt3((TIME_HIGH, 2), (ADDR_Y, 0), (ADDR_X, 1), (TRIGGER, 1)), evt3((TIME_HIGH, 4), (TRIGGER, 0))]
+    path = evt3_bag(tmp_path, words, seqs=[0, 9], stamps_us=[8_192, (1 << 24) + 16_384 + 500])
+    triggers = list(open_source(str(path)).triggers())
+    assert [int(part.t[0]) for part in triggers] == [8_192, (1 << 24) + 16_384]
+
+
 def libcaer(low, x, y, p, valid=1):
     return np.array([(valid | p << 1 | y << 2 | x << 17, low)], [("data", "<u4"), ("t", "<i4")]).tobytes()
 
@@ -232,7 +239,7 @@ def test_imu_poses_and_lens_are_read_on_the_events_clock(tmp_path, ros):
     messages += [("/other/camera_info", STAMP_NS, camera_message(store, Sensor(9, 9)))]
     messages += [one for i in range(5000) for one in beside(store, i)]
     recording = open_source(str(ros_bags.write_bag(tmp_path / "a.bag", store, messages)))
-    assert recording.streams == ("events", "imu", "poses")
+    assert recording.streams == ("events", "imu", "poses", "twists")
     parts = list(recording.imu())
     t = np.concatenate([part.t for part in parts])
     np.testing.assert_array_equal(t, events.t[0] + np.arange(5000) * 1000)
@@ -243,6 +250,9 @@ def test_imu_poses_and_lens_are_read_on_the_events_clock(tmp_path, ros):
     np.testing.assert_array_equal(poses.t, t)
     np.testing.assert_allclose(poses.position_m[7], (7, 2, 3))
     np.testing.assert_allclose(poses.orientation[7], (0, 0, 0.6, 0.8))
+    twists = recording.twists()  # 1 m of x each ms, seen from a body turned by 73.7 degrees about z
+    assert twists is not None
+    np.testing.assert_allclose(twists.twist[2500], (280, -960, 0, 0, 0, 0), atol=1e-6)
     camera = recording.camera("cam3")
     assert camera is not None
     assert (camera.stream, camera.lens, camera.fx, camera.cy, camera.distortion[:2]) == (
@@ -252,6 +262,23 @@ def test_imu_poses_and_lens_are_read_on_the_events_clock(tmp_path, ros):
         23.5,
         (0.1, 0.2),
     )
+
+
+@pytest.mark.parametrize(
+    ("second", "why"),
+    [((STAMP_NS - 1, 1.0), "time runs backwards"), ((STAMP_NS + 10**6, 2.0), "are no pose")],
+)
+def test_a_pose_that_can_not_be_is_refused_and_one_that_came_twice_is_kept_once(tmp_path, second, why):
+    store, of = ros_bags.Store(2), ros_bags.Store(2).of
+    messages = list(in_packets(store, make_events(10)))
+    for ns, w in ((STAMP_NS, 1.0), (STAMP_NS, 1.0), second):
+        turn, point = of("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, w), of("geometry_msgs/msg/Point", 1.0, 2.0, 3.0)
+        messages.append(("/pose", ns, of(ros_bags.POSE, store.header(ns), of("geometry_msgs/msg/Pose", point, turn))))
+    with pytest.raises(BrokenRecording, match=f"message 4.*{why}"):
+        open_source(str(ros_bags.write_bag(tmp_path / "bad", store, messages))).poses()
+    poses = open_source(str(ros_bags.write_bag(tmp_path / "good", store, messages[:-1]))).poses()
+    assert poses is not None
+    assert poses.t.size == 1
 
 
 def test_odometry_gives_poses_too(tmp_path):

@@ -1,0 +1,120 @@
+"""Replay of our own recordings: the packets that were recorded, bit for bit, paced by their sensor's clock."""
+
+import math
+import threading
+import time
+from dataclasses import dataclass, field
+
+from neurove_core.io import BrokenRecording, McapRecording, RecordedPacket
+from neurove_core.io.mcap_recording import LIMITS
+from protocol.camera import SCHEMA as CAMERA_SCHEMA
+from protocol.errors import NeuroVEError
+from protocol.events import SCHEMA as EVENTS_SCHEMA
+from protocol.events import EventPacket, decode_packet
+from protocol.keys import Keys
+from service.driver import POLL_S, Summary
+from service.transport import Publisher, Transport
+
+
+@dataclass
+class _Pace:
+    """When packets of each stream are due: streams have clocks of their own, which are not compared."""
+
+    speed: float
+    began: float = 0.0  # on our monotonic clock
+    first_log_ns: int | None = None
+    clocks: dict[str, tuple[float, int, int]] = field(default_factory=dict)  # origin [s], its sensor time, newest [us]
+
+    def due(self, recorded: RecordedPacket, packet: EventPacket) -> tuple[float, float]:
+        """When a packet is due, on our monotonic clock, and how far into its stream that is [s]."""
+        t_us = int(packet.events.t[-1]) + 1 if packet.events.n else packet.t0_us
+        if self.first_log_ns is None:
+            self.began, self.first_log_ns = time.monotonic(), recorded.log_ns
+        if recorded.stream not in self.clocks:  # as much later than the first stream as it was received
+            later_s = max(0, recorded.log_ns - self.first_log_ns) / 1e9 / self.speed
+            self.clocks[recorded.stream] = (self.began + later_s, packet.t0_us, t_us)
+        origin, first_us, newest_us = self.clocks[recorded.stream]
+        if packet.t0_us < first_us or t_us < newest_us - 1_000_000:  # the driver was started anew
+            origin, first_us = time.monotonic(), packet.t0_us
+        self.clocks[recorded.stream] = (origin, first_us, t_us)
+        elapsed_s = (t_us - first_us) / 1e6
+        return origin + elapsed_s / self.speed, elapsed_s
+
+
+class Replay:
+    """Publishes what was recorded, under the names of its own streams.
+
+    Args:
+        recording: of ours.
+        only: the one stream to publish; None for all.
+        transport: an open session.
+        keys: of the deployment.
+    """
+
+    def __init__(self, recording: McapRecording, only: str | None, transport: Transport, keys: Keys) -> None:
+        self._recording, self._only = recording, only
+        self._transport, self._keys = transport, keys
+        names = [only] if only else recording.all_streams
+        self._publishers: dict[str, Publisher] = {
+            name: transport.publisher(keys.events(name), EVENTS_SCHEMA) for name in names
+        }
+        for name, payload in recording.cameras().items():
+            if name in self._publishers:
+                self._announce(keys.camera(name), payload)
+
+    def _announce(self, key: str, payload: bytes) -> None:
+        self._transport.answer(key, lambda _: payload)
+        self._transport.put(key, payload, CAMERA_SCHEMA)
+
+    @property
+    def label(self) -> str:
+        """The streams, for people."""
+        return ", ".join(self._publishers)
+
+    def wait_for_listener(self, timeout_s: float, stop: threading.Event) -> bool:
+        """Wait until somebody listens to every stream."""
+        deadline = time.monotonic() + timeout_s
+        while not all(publisher.matching for publisher in self._publishers.values()):
+            if time.monotonic() >= deadline or stop.wait(POLL_S):
+                return False
+        return True
+
+    def play(
+        self, stop: threading.Event, *, speed: float = 1.0, loop: bool = False, duration_s: float = math.inf
+    ) -> Summary:
+        """Publish the packets until the end, the duration, or the stop event.
+
+        A packet that can not be read is published where it stands, at once.
+
+        Args:
+            stop: ends it early.
+            speed: sensor seconds per second; infinity sends as fast as it reads.
+            loop: must be False: what was recorded would repeat its numbers and its times.
+            duration_s: sensor time to play [s].
+        """
+        if loop:
+            raise ValueError("a replay can not loop")
+        sent = Summary(0, 0, None, None, None)
+        pace = _Pace(speed)
+        try:
+            for recorded in self._recording.packets(self._only):
+                packet = _read(recorded)
+                if packet is not None:
+                    due, elapsed_s = pace.due(recorded, packet)
+                    if elapsed_s > duration_s or stop.wait(max(0.0, due - time.monotonic())):
+                        break
+                    first_us = packet.t0_us if sent.first_us is None else sent.first_us
+                    last_us = int(packet.events.t[-1]) if packet.events.n else sent.last_us
+                    sent = sent._replace(events=sent.events + packet.events.n, first_us=first_us, last_us=last_us)
+                self._publishers[recorded.stream].put(recorded.payload)
+                sent = sent._replace(packets=sent.packets + 1)
+        except BrokenRecording as error:
+            return sent._replace(broken=error)
+        return sent
+
+
+def _read(recorded: RecordedPacket) -> EventPacket | None:
+    try:
+        return decode_packet(recorded.payload, LIMITS)
+    except NeuroVEError:
+        return None

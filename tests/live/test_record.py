@@ -1,0 +1,161 @@
+import json
+import signal
+import threading
+
+import pytest
+
+from neurove_core.io import McapRecording, PacketWriter, open_source
+from protocol import CameraInfo
+from protocol.events import decode_packet, encode_packet
+from protocol.keys import Keys
+from service.recorder import Recorder
+from tests.builders import make_packets
+from tests.live.conftest import client, free_endpoint, neurove, running, wait_until
+from tests.live.test_feed import start_router
+
+pytestmark = pytest.mark.live
+
+CAMERA = CameraInfo(stream="left", width=64, height=48, lens="pinhole", fx=50.0, fy=50.0, cx=31.5, cy=23.5)
+
+
+@pytest.fixture(scope="module")
+def router():
+    endpoint = free_endpoint()
+    process = start_router(endpoint)
+    with client(endpoint):
+        yield endpoint
+    process.kill()
+    process.wait()
+
+
+class Listener:
+    """Every packet and camera that is published."""
+
+    def __init__(self, transport):
+        self.payloads, self.cameras = [], {}
+        transport.subscribe(
+            Keys().events(), lambda key, payload, _: self.payloads.append((Keys().stream_of(key), payload))
+        )
+        transport.subscribe(
+            Keys().camera(), lambda key, payload, _: self.cameras.update({Keys().stream_of(key): payload})
+        )
+
+
+def test_what_was_driven_is_recorded_bit_for_bit_and_replayed_bit_for_bit(router, tmp_path):
+    file = tmp_path / "traffic.mcap"
+    with client(router) as transport:
+        heard = Listener(transport)
+        with running("record", "--connect", router, "--out", str(file), "--json") as recorder:
+            wait_until(lambda: file.with_name("traffic.mcap.part").exists())
+            driven = neurove(
+                "drive", "pattern://?seed=4", "--connect", router, "--duration", "0.6", "--wait", "20", "--json"
+            )
+            sent = json.loads(driven.stdout)
+            assert sent["packets"] == 150
+            wait_until(lambda: len(heard.payloads) == 150)
+            code, out, err = recorder.end(signal.SIGINT)
+        assert (code, err) == (0, "")
+        told = json.loads(out)["streams"]["cam0"]
+        assert (told["packets"], told["events"], told["missing"], told["dropped"]) == (150, sent["events"], 0, 0)
+
+        recording = open_source(str(file))
+        assert isinstance(recording, McapRecording)
+        assert [(stream, payload) for stream, payload, _ in recording.packets()] == heard.payloads
+        assert recording.cameras() == heard.cameras
+        assert sum(chunk.n for chunk in recording.chunks()) == sent["events"]
+
+        before, heard.payloads = heard.payloads, []
+        replayed = neurove("drive", str(file), "--connect", router, "--wait", "20")
+        assert replayed.stdout.startswith("cam0: 150 packets")
+        wait_until(lambda: len(heard.payloads) == 150)
+        assert heard.payloads == before
+
+
+def two_streams(path):
+    packets = [("left", encode_packet(one)) for one in make_packets(25, stream="left", n=50)]
+    packets += [("right", encode_packet(one)) for one in make_packets(25, stream="right", n=60, start_us=10**9)]
+    packets.insert(30, ("left", b"no packet"))
+    with PacketWriter(path) as writer:
+        writer.camera(CAMERA.encode())
+        for i, (stream, payload) in enumerate(packets):
+            writer.write(stream, payload, 10**18 + i * 10**5)
+    return packets
+
+
+def test_a_replay_keeps_all_streams_or_the_one_picked_and_encodes_anew_under_another_name(router, tmp_path):
+    packets = two_streams(tmp_path / "two.mcap")
+    file = str(tmp_path / "two.mcap")
+    with client(router) as transport:
+        heard = Listener(transport)
+        assert neurove("drive", file, "--connect", router, "--wait", "20").returncode == 0
+        wait_until(lambda: len(heard.payloads) == 51)
+        assert [one for one in heard.payloads if one[0] == "left"] == [one for one in packets if one[0] == "left"]
+        assert [one for one in heard.payloads if one[0] == "right"] == [one for one in packets if one[0] == "right"]
+        assert heard.cameras == {"left": CAMERA.encode()}
+
+        heard.payloads = []
+        neurove("drive", file, "--topic", "right", "--connect", router, "--wait", "20")
+        wait_until(lambda: len(heard.payloads) == 25)
+        assert heard.payloads == [one for one in packets if one[0] == "right"]
+
+        heard.payloads = []
+        neurove("drive", file, "--topic", "right", "--stream", "front", "--connect", router, "--wait", "20")
+        wait_until(lambda: len(heard.payloads) > 24)
+        assert {stream for stream, _ in heard.payloads} == {"front"}
+        assert sum(decode_packet(payload).events.n for _, payload in heard.payloads) == 25 * 60
+    looped = neurove("drive", file, "--loop", "--connect", router)
+    assert looped.returncode == 2
+    assert "give --stream NAME" in looped.stderr
+
+
+def test_a_recorder_counts_what_is_missing_and_keeps_what_can_not_be_read(router, tmp_path):
+    file = tmp_path / "gaps.mcap"
+    with client(router) as transport:
+        transport.answer(Keys().camera("left"), lambda _: CAMERA.encode())
+        publisher = transport.publisher(Keys().events("left"), "application/msgpack")
+        other = transport.publisher(Keys().events("right"), "application/msgpack")
+        record = ("record", "--connect", router, "--out", str(file), "--stream", "left", "--duration", "3")
+        with running(*record, "--json") as recorder:
+            wait_until(lambda: publisher.matching)
+            for packet in make_packets(10, stream="left"):
+                if packet.seq not in (3, 4, 7):
+                    publisher.put(encode_packet(packet))
+            publisher.put(b"no packet")
+            assert not other.matching
+            out, _ = recorder.child.communicate(timeout=20)
+        told = json.loads(out)["streams"]
+    assert recorder.child.returncode == 1
+    assert {name: told["left"][name] for name in ("packets", "missing", "refused", "dropped")} == {
+        "packets": 8, "missing": 3, "refused": 1, "dropped": 0,
+    }  # fmt: skip
+    assert list(told) == ["left"]
+    assert McapRecording.open(file).cameras() == {"left": CAMERA.encode()}
+
+
+def test_what_the_queue_can_not_hold_is_dropped_and_counted(router, tmp_path):
+    packets = make_packets(20, stream="left", n=100)
+    payloads = [encode_packet(packet) for packet in packets]
+    cap = sum(map(len, payloads[:5]))
+    with client(router) as transport, client(router) as other, PacketWriter(tmp_path / "a.mcap") as writer:
+        recorder = Recorder(writer, transport, Keys(), queue_bytes=cap)
+        heard = Listener(transport)
+        publisher = other.publisher(Keys().events("left"), "application/msgpack")
+        wait_until(lambda: publisher.matching)
+        for payload in payloads:
+            publisher.put(payload)
+        wait_until(lambda: len(heard.payloads) == 20)  # all before the first is written
+        stop = threading.Event()
+        stop.set()
+        account = recorder.run(stop, 1.0)["left"]
+    assert (account.packets, account.dropped, account.events) == (5, 15, 500)
+    assert [payload for _, payload, _ in McapRecording.open(tmp_path / "a.mcap").packets()] == payloads[:5]
+
+
+def test_a_recording_is_not_written_over_and_silence_leaves_no_file(router, tmp_path):
+    (tmp_path / "old.mcap").write_bytes(b"dear")
+    refused = neurove("record", "--connect", router, "--out", str(tmp_path / "old.mcap"))
+    assert (refused.returncode, "not written over" in refused.stderr) == (2, True)
+    silent = neurove("record", "--connect", router, "--out", str(tmp_path / "new.mcap"), "--duration", "0.3")
+    assert (silent.returncode, silent.stderr.count("\n")) == (1, 1)
+    assert "nothing was recorded" in silent.stderr
+    assert [one.name for one in tmp_path.iterdir()] == ["old.mcap"]
