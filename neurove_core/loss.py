@@ -29,7 +29,8 @@ def group_loss(error: Tensor) -> Tensor:
     >>> float(group_loss(torch.tensor([[3.0, 4.0, 0.0], [0.0, 0.0, 0.0]])))
     1.25
     """
-    return 0.5 * torch.linalg.vector_norm(error, dim=-1).mean()
+    lengths: Tensor = torch.linalg.vector_norm(error, dim=-1)
+    return 0.5 * lengths.mean()
 
 
 def scaled_sum(linear: Tensor, angular: Tensor, balance: Balance, decay: float) -> tuple[Tensor, Balance]:

@@ -65,9 +65,7 @@ def augment(
     return counts, twists
 
 
-def mirrored(
-    counts: NDArray[np.uint8], twists: NDArray[np.float32]
-) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+def mirrored(counts: NDArray[np.uint8], twists: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """What a camera in a mirrored world would see: x runs the other way; vx, wy and wz change their sign.
 
     The angular velocity is an axial vector: in a mirror across x its x component stays and the others turn around.

@@ -15,6 +15,8 @@ CONFIGS: Final = Path(__file__).parent / "configs"
 Span = tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]]
 """Least and greatest value that is drawn."""
 
+Shares = dict[str, Annotated[float, Field(ge=0)]]
+
 
 class DataConfig(Config):
     """What is simulated: each sequence draws its own scene, way, camera, mount and pixels (domain randomisation)."""
@@ -23,14 +25,17 @@ class DataConfig(Config):
     seconds: float = Field(6.0, gt=0, le=600, description="Length of each.")
     seed: int = Field(1_000_000, ge=0, lt=900_000_000, description="Sequence i has the scene and the way of seed + i.")
     motion_px: float = Field(1.5, ge=0.1, le=4, description="Most motion of a pixel between two of its renders.")
-    scenes: dict[str, Annotated[float, Field(ge=0)]] = {"street": 0.74, "corridor": 0.1, "room": 0.16}
-    cameras: dict[str, Annotated[float, Field(ge=0)]] = {
-        "davis346-half": 0.35,
-        "davis240c": 0.03,
-        "pinhole:172x130": 0.05,
-        "pinhole:128x96": 0.35,
-        "pinhole:86x65": 0.22,
-    }
+    scenes: Shares = Field({"street": 0.74, "corridor": 0.1, "room": 0.16}, description="Share of each scene.")
+    cameras: Shares = Field(
+        {
+            "davis346-half": 0.35,
+            "davis240c": 0.03,
+            "pinhole:172x130": 0.05,
+            "pinhole:128x96": 0.35,
+            "pinhole:86x65": 0.22,
+        },
+        description="Share of each camera; small ones are quickly simulated.",
+    )
     hfov_deg: Span = Field((55.0, 95.0), description="Field of view of a pinhole that is named without one.")
     height_m: Span = Field((0.3, 2.5), description="Of the camera above the ground, log-uniform.")
     pitch_deg: Span = Field((0.0, 12.0), description="How far the camera looks down, uniform.")
@@ -73,7 +78,9 @@ class RecipeConfig(Config):
     noisy: float = Field(0.25, ge=0, le=1, description="Share of segments with random events added.")
     noise_max: float = Field(0.1, ge=0, le=10, description="Most of these, per cell and bin.")
     regained: float = Field(0.25, ge=0, le=1, description="Share of segments whose counts are scaled.")
-    gain: Span = Field((0.5, 4.0), description="By how much, log-uniform: pixels per cell are as many as the sensor has.")
+    gain: Span = Field(
+        (0.5, 4.0), description="By how much, log-uniform: pixels per cell are as many as the sensor has."
+    )
     checkpoint_s: float = Field(120.0, ge=0, description="A checkpoint is written so often [s], and at the end.")
 
     @model_validator(mode="after")

@@ -13,7 +13,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import safetensors
@@ -126,9 +126,9 @@ def sequence_of(simulation: Simulation, config: ModelConfig) -> Sequence:
 def true_twists(trajectory: Moving, count: int, config: ModelConfig) -> NDArray[np.float64]:
     """Mean exact twist (count, n, 6) [m/s, rad/s] of each bin of the first windows of a trajectory."""
     bins = count * config.window.bins
-    t_s = (np.arange(bins * _SAMPLES) + 0.5) * (config.window.bin_us / _SAMPLES * 1e-6)
-    twist = trajectory.twist(t_s)
-    return twist.reshape(count, config.window.bins, _SAMPLES, 6).mean(axis=2)
+    t_s = (np.arange(bins * _SAMPLES, dtype=np.float64) + 0.5) * (config.window.bin_us / _SAMPLES * 1e-6)
+    twist: NDArray[np.float64] = trajectory.twist(t_s).reshape(count, config.window.bins, _SAMPLES, 6).mean(axis=2)
+    return twist
 
 
 class Cache:
@@ -188,7 +188,7 @@ def save(sequence: Sequence, path: Path) -> None:
     """Write a sequence's file; it is whole or it is not there."""
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
-        arrays = {"counts": sequence.counts, "twists": sequence.twists}
+        arrays: dict[str, NDArray[Any]] = {"counts": sequence.counts, "twists": sequence.twists}
         safetensors.numpy.save_file(arrays, part, {"height_m": repr(sequence.height_m), "name": sequence.name})
         part.replace(path)
     finally:
@@ -206,12 +206,12 @@ class Sequences:
     """
 
     def __init__(self, paths: list[Path]) -> None:
-        self._files = []
+        self._files: list[Any] = []
         self.twists: list[NDArray[np.float32]] = []  # each (T, n, 6)
         self.height_m: list[float] = []
         for path in paths:
             try:
-                file = safetensors.safe_open(path, "numpy")  # type: ignore[no-untyped-call]  # has no types
+                file: Any = safetensors.safe_open(path, "numpy")
                 about = file.metadata()
                 twists, height_m = file.get_tensor("twists"), float(about["height_m"])
                 shape = file.get_slice("counts").get_shape()

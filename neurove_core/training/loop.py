@@ -1,4 +1,4 @@
-"""The loop: segments of many streams, truncated backpropagation through time, Adam; recipe L of research/velocity.md."""
+"""The loop: segments of many streams, truncated backpropagation through time, Adam (research/velocity.md, recipe L)."""
 
 import json
 import math
@@ -17,7 +17,7 @@ from neurove_core.loss import group_loss, scaled_sum
 from neurove_core.network import NetworkState
 from neurove_core.training.batches import Segment, draw
 from neurove_core.training.config import RecipeConfig, TrainingConfig
-from neurove_core.training.data import Cache, Sequences
+from neurove_core.training.data import Cache
 from neurove_core.training.run import Run, write_whole
 
 CHECKPOINT: Final = "checkpoint.safetensors"
@@ -111,7 +111,7 @@ def learn(run: Run, segment: Segment) -> list[_Losses]:
         linear, angular = errors(run, answers, segment, chunk)
         loss, run.balance = scaled_sum(linear, angular, run.balance, recipe.balance_decay)
         run.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
+        loss.backward()  # type: ignore[no-untyped-call]  # torch's own
         torch.nn.utils.clip_grad_norm_(run.network.parameters(), recipe.clip_norm)
         run.optimiser.step()
         run.step += 1

@@ -27,7 +27,6 @@ _KEY = "neurove_run"
 _SYMMETRIC = [0, 4, 5]  # vx wy wz: as often to one side as to the other, for half of what is seen is mirrored
 
 
-
 @dataclass
 class Run:
     """All that a run carries from one segment to the next."""
@@ -83,9 +82,9 @@ class Run:
             BadModel: it is missing, broken, or of another configuration.
         """
         try:
-            with safetensors.safe_open(path, "pt") as file:  # type: ignore[no-untyped-call]  # has no types
+            with safetensors.safe_open(path, "pt") as file:
                 about = json.loads(file.metadata()[_KEY])
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  # no mapping
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
         except (OSError, KeyError, TypeError, ValueError, safetensors.SafetensorError) as error:
             raise BadModel(path.name, f"no checkpoint to go on from: {error}") from None
         _same_config(path, about["config"], config.model_dump(mode="json"))
