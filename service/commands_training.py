@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from service.arguments import command
+from service.arguments import command, sensor_size
 
 
 def train(args: argparse.Namespace) -> int:
@@ -36,6 +36,66 @@ def train(args: argparse.Namespace) -> int:
     told = {"bundle": str(path), "bytes": path.stat().st_size, "run": str(out / loop.RUN_JSON)}
     print(json.dumps(told) if args.json else f"wrote {path}, {told['bytes']:,} bytes")
     return 0
+
+
+def evaluate(args: argparse.Namespace) -> int:
+    """How far a model's estimates lie from the truth: RMSE and RE as in the paper, per axis and per group."""
+    import torch
+
+    from neurove_core import evaluation, geometry, models
+    from neurove_core.estimator import Estimator
+    from neurove_core.io import open_source, read_poses
+
+    torch.set_num_threads(1)
+    estimator = Estimator(models.find(args.model))
+    estimator.warm_up()
+    given = geometry.twists(read_poses(args.truth)) if args.truth else None
+    judged = []
+    for source in args.recordings:
+        recording = open_source(source, args.sensor, args.topic)
+        truth = given or (None if recording.endless else recording.twists())
+        if truth is None:
+            why = "it never ends: say how many seconds" if recording.endless else "it holds no truth: give --truth FILE"
+            raise evaluation.NoTruth(f"{source}: {why}", source=source)
+        judged.append(evaluation.judge(evaluation.answer(estimator, recording), truth))
+    told = {"model": estimator.bundle.info.model_dump(), **evaluation.report(judged)}
+    print(json.dumps(told) if args.json else "\n".join(_table(told)))
+    if args.plot:
+        from neurove_core.evaluation_plots import plot
+
+        for one in judged:
+            for file in plot(one, args.plot):
+                print(f"wrote {file}", file=sys.stderr)
+    return 0
+
+
+def _table(told: dict[str, Any]) -> Iterator[str]:
+    """The report for people."""
+    yield f"{told['model']['name']} ({told['model']['digest'][:12]}), {told['windows']} windows"
+    yield f"{'':24} {'v_l RE':>7} {'RMSE m/s':>9} {'v_a RE':>7} {'RMSE deg/s':>10}  R2 v_l, v_a"
+    rows = [(told["model"]["name"], told), ("zero velocity", told["zero"]), ("mean of the truth", told["mean"])]
+    each = [(one["name"], one) for one in told["recordings"]] if len(told["recordings"]) > 1 else []
+    for name, row in [*rows, *each]:
+        errors = f"{_number(row['re_v_l'], 7)} {row['rmse_v_l_m_s']:9.3f} {_number(row['re_v_a'], 7)}"
+        explained = f"{_number(row['r2_v_l'], 6)} {_number(row['r2_v_a'], 6)}"
+        yield f"{name[:24]:24} {errors} {row['rmse_v_a_deg_s']:10.2f}  {explained}"
+    floors, without = told["re_floors"], (told["re_v_l_unfloored"], told["re_v_a_unfloored"])
+    yield f"RE counts truths above {floors['v_l_m_s']} m/s and {floors['v_a_rad_s']} rad/s"
+    yield f"without these floors it is {_number(without[0], 0)} and {_number(without[1], 0)}"
+    yield ""
+    yield f"{'axis':6} {'RMSE':>8} {'median':>8} {'bias':>8} {'spread':>8} {'correlation':>11}"
+    for axis, row in told["per_axis"].items():
+        unit = "deg_s" if axis[0] == "w" else "m_s"
+        numbers = [_number(row[f"{name}_{unit}"], 8) for name in ("rmse", "median_error", "bias", "spread")]
+        yield f"{axis:6} {' '.join(numbers)} {_number(row['correlation'], 11)}  {unit.replace('_s', '/s')}"
+    latency = told["latency_ms"]
+    yield f"firing rate {told['firing_rate']:.3f}; a window takes {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"
+    if not told["scaled"]:
+        yield "linear part: for a camera 1 m above the ground, because the recording does not say how high it is"
+
+
+def _number(value: float | None, width: int) -> str:
+    return f"{'-' if value is None else format(value, '.3f'):>{width}}"
 
 
 @contextlib.contextmanager
@@ -73,3 +133,10 @@ def add(commands: Any) -> None:
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in OUT, if there is one")
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes that simulate; default 1")
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads that learn; default 1")
+    parser = command(commands, "evaluate", evaluate)
+    parser.add_argument("model", metavar="BUNDLE", help="a bundle's file, `default` or `untrained`")
+    parser.add_argument("recordings", nargs="+", metavar="RECORDING", help="with truth, such as sim://street?seconds=8")
+    parser.add_argument("--truth", type=Path, metavar="FILE", help="poses of the camera, on the recording's clock")
+    parser.add_argument("--sensor", type=sensor_size, metavar="WxH", help="sensor size, where the recording lacks it")
+    parser.add_argument("--topic", metavar="T", help="which of several event streams, where the recording has names")
+    parser.add_argument("--plot", type=Path, metavar="DIR", help="write truth and estimate over time there")
