@@ -29,10 +29,10 @@ def test_drive_watch_health_models_and_activate_work_together(node):
         lines = [json.loads(line) for line in watched.stdout.splitlines()]
         assert len(lines) == 5
         assert all(len(line["twists"]) == 5 and len(line["twists"][0]) == 6 for line in lines)
-        assert all("untrained" in line["flags"] for line in lines)
+        assert not any("untrained" in line["flags"] for line in lines)
         people = neurove("watch", "--connect", node, "--count", "1").stdout
         assert people.startswith("cam1 ")
-        assert "model=untrained" in people
+        assert "model=default" in people
 
         (health,) = json.loads(neurove("health", "--connect", node, "--json").stdout)
         assert health["streams"][0]["stream"] == "cam1"
@@ -48,7 +48,7 @@ def test_drive_watch_health_models_and_activate_work_together(node):
         assert "active" in models
         assert "foreign.safetensors" in models
         (told,) = json.loads(neurove("models", "--connect", node, "--json").stdout)
-        assert told["previous"]["name"] == "untrained"
+        assert told["previous"]["name"] == "default"
 
         code, out, _ = driver.end(signal.SIGINT)
         assert code == 0
@@ -59,7 +59,7 @@ def test_activating_what_is_not_there_is_refused_by_the_node(node):
     refused = neurove("activate", "../foreign", "--connect", node)
     assert refused.returncode == 1
     assert refused.stderr.count("\n") == 1
-    assert "model='../foreign': not on this node; available: untrained, other" in refused.stderr
+    assert "model='../foreign': not on this node; available: default, untrained, other" in refused.stderr
     assert "not a safetensors file" in neurove("activate", "foreign", "--connect", node).stderr
 
 
@@ -106,9 +106,9 @@ def test_the_demo_accounts_for_every_packet_event_and_window(tmp_path):
     assert told["packets_received"] + sum(told["lost"].values()) == told["packets_sent"]
     assert told["estimates"] == told["windows"] > 0
     assert told["sensor"] == {"width": 173, "height": 130}
-    assert (told["model"], told["trained"]) == ("untrained", False)
+    assert (told["model"], told["trained"]) == ("default", True)
     assert 0 < told["latency_ms"]["p50"] <= told["latency_ms"]["p95"] <= told["latency_ms"]["p99"]
-    assert "UNTRAINED" in picture.read_text()
+    assert "UNTRAINED" not in picture.read_text()
 
 
 def test_the_demo_plays_a_real_recording_and_tells_people_what_came_of_it():
