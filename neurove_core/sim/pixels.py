@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from neurove_core.config import Config
-from neurove_core.kernels import compiled
+from neurove_core.sim.compile import exact
 from protocol.errors import InvalidField, TimeBackwards
 from protocol.events import Events, Sensor
 
@@ -134,7 +134,7 @@ def low_pass(cutoff_hz: float, span_us: float) -> tuple[float, float, float]:
     return kept, 1 - kept - new, new
 
 
-@compiled
+@exact
 def find_crossings(
     made: Mismatch,
     state: PixelState,
@@ -236,7 +236,7 @@ def add_noise(pixels: Pixels, start_us: int, stop_us: int, found: Found) -> Foun
     )
 
 
-@compiled
+@exact
 def put_in_order(
     found: Found, start_us: int, span_us: int, refractory_us: int, last_us: NDArray[np.int64]
 ) -> Found:  # pragma: no cover (machine code)

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from neurove_core.geometry import distort
+from neurove_core.geometry import Poses, distort
 from neurove_core.io import UnknownSource, open_source
 from neurove_core.io.recording import CHUNK_EVENTS
 from neurove_core.rotations import exp, matrix_of
@@ -22,6 +22,7 @@ from neurove_core.sim.trajectory import (
     Mounted,
     Trajectory,
     driving,
+    from_poses,
     hand_held,
     parse_trajectory,
     rotation,
@@ -31,6 +32,7 @@ from neurove_core.sim.trajectory import (
 from protocol import Events, Sensor
 from protocol.errors import InvalidField
 from protocol.events import check_events
+from tests.recordings import shared
 
 SMALL = named_camera("pinhole:86x65:75")
 TRAJECTORIES = {
@@ -372,3 +374,26 @@ def test_a_picture_of_a_film_appears_whole_or_not_at_all(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["street.png"]
     with pytest.raises(InvalidField):
         draw(simulation, tmp_path / "no" / "street.png", 1.0)
+
+
+# --- against a real recording ---------------------------------------------------------------------------------------
+
+
+def test_a_simulated_slider_has_the_statistics_of_the_real_one():
+    real = Events.join(list(open_source(str(shared("slider_depth/events_chunk.txt"))).chunks()))
+    rows = np.loadtxt(shared("slider_depth/groundtruth.txt"))
+    poses = Poses((rows[:, 0] * 1e6).astype(np.int64), rows[:, 1:4], rows[:, 4:8])
+    camera = named_camera("davis240c-slider", height_m=0.3, pitch_deg=0)
+    simulated = everything(simulate("wall", from_poses(poses), camera, seed=0, seconds=0.17))
+    for name, value in statistics(real).items():
+        assert 0.5 < statistics(simulated)[name] / value < 2, name
+
+
+def statistics(events: Events) -> dict[str, float]:
+    """Rate per pixel [Hz], share of ON, and quartiles of the time between two events of a pixel [us]."""
+    pixel = events.y.astype(np.int64) * 240 + events.x
+    order = np.lexsort((events.t, pixel))
+    between = np.diff(events.t[order])[np.diff(pixel[order]) == 0]
+    quartiles = dict(zip(("q25", "q50", "q75"), np.percentile(between, [25, 50, 75]).tolist(), strict=True))
+    rate_hz = events.n / (int(events.t[-1] - events.t[0]) * 1e-6) / (240 * 180)
+    return quartiles | {"rate": rate_hz, "on": float(events.p.mean()), "off": float(1 - events.p.mean())}
