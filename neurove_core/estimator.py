@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from neurove_core import windows
 from neurove_core.bundle import PER_HEIGHT, Bundle
 from neurove_core.encoding import to_spikes
+from neurove_core.engine import Engine
 from neurove_core.geometry import lookup_table
 from neurove_core.network import NetworkState
 from neurove_core.windows import Window, WindowsState
@@ -62,6 +63,7 @@ class Estimator:
         self.bundle = bundle
         self.config = bundle.config
         self.network = bundle.network.eval().requires_grad_(requires_grad=False)
+        self._engine = Engine(self.network)
         self._offset, self._scale = bundle.offset.double().numpy(), bundle.scale.double().numpy()
 
     def initial_state(self, sensor: Sensor, camera: CameraInfo | None = None) -> StreamState:
@@ -146,8 +148,8 @@ class Estimator:
 
     @torch.inference_mode()
     def _step(self, counts: NDArray[np.uint8], state: NetworkState) -> tuple[NDArray[np.float64], NetworkState]:
-        spikes = to_spikes(torch.from_numpy(counts), self.config.network.encoding)
-        twists, state = self.network(spikes[None, None], state)
+        spikes = to_spikes(torch.from_numpy(counts)[None, None], self.config.network.encoding)
+        twists, state = self._engine(spikes, state)
         return twists[0, 0].double().numpy() * self._scale + self._offset, state
 
     def _estimate(self, window: Window, twists: NDArray[np.float64], age: int) -> WindowEstimate:

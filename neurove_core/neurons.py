@@ -115,7 +115,7 @@ def lif_scan(currents: Tensor, state: LIFState, params: LIFParams) -> tuple[Tens
     steps (scan.py); else, or inside `plain()`, it is `lif_scan_reference`. Spikes and state are the same bit for bit.
     """
     trained = torch.is_grad_enabled() and (currents.requires_grad or state.v.requires_grad)
-    if not _PLAIN.get() and scan.fits(currents, state.v) and (params.surrogate == "rectangular" or not trained):
+    if not is_plain() and scan.fits(currents, state.v) and (params.surrogate == "rectangular" or not trained):
         spikes, v = scan.scan(currents, state.v, params.decay, params.v_th, params.surrogate_width)
         return spikes, LIFState(v)
     return lif_scan_reference(currents, state, params)
@@ -141,6 +141,11 @@ def plain() -> Iterator[None]:
         yield
     finally:
         _PLAIN.reset(token)
+
+
+def is_plain() -> bool:
+    """Whether the caller runs inside `plain()`."""
+    return _PLAIN.get()
 
 
 class LTCParams(NamedTuple):

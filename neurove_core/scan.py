@@ -55,6 +55,26 @@ def scan(currents: Tensor, v: Tensor, decay: float, v_th: float, width: float) -
     return spikes, after
 
 
+def scan_in_place(maps: Tensor, v: Tensor, decay: float, v_th: float) -> tuple[Tensor, Tensor]:
+    """The same for maps of a convolution, without gradients: their memory becomes that of the spikes.
+
+    Args:
+        maps: currents (T * B, C, H, W), channels last, float32 or float64; used up.
+        v: potentials after the reset of the step before (B, C, H, W), left as they are.
+        decay: per step.
+        v_th: firing threshold.
+
+    Returns:
+        spikes (T * B, C, H, W) and the potentials after the last reset, both channels last.
+    """
+    rows = maps.permute(0, 2, 3, 1).contiguous()  # no copy where channels are last
+    after = v.permute(0, 2, 3, 1).clone(memory_format=torch.contiguous_format)
+    neurons = after.numpy().reshape(-1)
+    kind = neurons.dtype.type
+    _in_place(rows.numpy().reshape(-1, neurons.size), neurons, kind(decay), kind(v_th))
+    return rows.permute(0, 3, 1, 2), after.permute(0, 3, 1, 2)
+
+
 class _Scan(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -161,3 +181,19 @@ def _backward(
                 u = pull[i] * slope + carried[i] * kept
                 out[i] = u
                 carried[i] = decay * u
+
+
+@compiled
+def _in_place(currents: Array, v: Array, decay: Any, v_th: Any) -> None:  # pragma: no cover (machine code)
+    steps, n = currents.shape
+    one, none = v.dtype.type(1), v.dtype.type(0)
+    for start in range(0, n, _BLOCK):
+        stop = min(start + _BLOCK, n)
+        v_now = v[start:stop]
+        for t in range(steps):
+            current = currents[t, start:stop]
+            for i in range(stop - start):
+                u = decay * v_now[i] + current[i]
+                fired = one if u - v_th >= none else none
+                current[i] = fired
+                v_now[i] = u * (one - fired)

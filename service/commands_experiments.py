@@ -1,4 +1,4 @@
-"""The commands of models and experiments, which need no service: model, reproduce, bench."""
+"""The commands of models and experiments, which need no service: model, reproduce."""
 
 import argparse
 import json
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from protocol.errors import InvalidField
-from service.arguments import BAD_NEWS, command
+from service.arguments import command, commit
 
 
 def new_model(args: argparse.Namespace) -> int:
@@ -57,7 +57,7 @@ def reproduce_sine(args: argparse.Namespace) -> int:
     from neurove_core.experiments import sine_report
 
     models, seeds = args.models.split(","), range(args.seed, args.seed + args.seeds)
-    command, commit = shlex.join(["neurove", *sys.argv[1:]]), _commit()
+    typed, made_by = shlex.join(["neurove", *sys.argv[1:]]), commit()
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
         tasks: dict[tuple[str, int], Any] = {}
@@ -73,7 +73,7 @@ def reproduce_sine(args: argparse.Namespace) -> int:
         for run in sine_report.reproduce(models, seeds, changes=dict(args.set), quick=args.quick, progress=progress):
             runs.append(run)
             if args.out:
-                files |= dict.fromkeys(sine_report.save_run(runs, args.out, command=command, commit=commit))
+                files |= dict.fromkeys(sine_report.save_run(runs, args.out, command=typed, commit=made_by))
     if args.out:
         files |= dict.fromkeys(sine_report.save(runs, args.out))
     figures = [run.figures for run in runs]
@@ -84,23 +84,6 @@ def reproduce_sine(args: argparse.Namespace) -> int:
     return 0
 
 
-def bench_sine(args: argparse.Namespace) -> int:
-    """The fused recurrence of the sine experiment against plain PyTorch steps."""
-    import torch
-
-    from neurove_core.bench import sine
-
-    torch.set_num_threads(1)
-    rows = sine.compare()
-    if args.json:
-        print(json.dumps([row._asdict() for row in rows]))
-    else:
-        for row in rows:
-            agree = "equal answers" if row.equal else "DIFFERENT ANSWERS"
-            print(f"{row.name}: {row.ratio:.1f} times as fast as {row.peer} ({agree})")
-    return 0 if all(row.equal for row in rows) else BAD_NEWS
-
-
 def _assignment(text: str) -> tuple[str, str]:
     field, separator, value = text.partition("=")
     if not separator:
@@ -108,24 +91,10 @@ def _assignment(text: str) -> tuple[str, str]:
     return field, value
 
 
-def _commit() -> str:
-    """The commit of the code that runs, with a + where it was changed since; or the version of the package."""
-    import importlib.metadata
-    import subprocess
-
-    git = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"]
-    try:
-        return subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        return importlib.metadata.version("neurove")
-
-
 def add(commands: Any) -> None:
     """Add these commands to the parser."""
     _add_model(commands)
     _add_reproduce(commands)
-    bench = commands.add_parser("bench", help="Speed, as ratios of one run.").add_subparsers(required=True)
-    command(bench, "sine", bench_sine)
 
 
 def _add_model(commands: Any) -> None:

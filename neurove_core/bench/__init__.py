@@ -15,7 +15,22 @@ class Row(NamedTuple):
     peer_ms: float
     ratio: float  # the peer's time over ours
     share_of_limit: float | None  # of what the same run measured as this machine's limit, where there is one
-    equal: bool  # whether the answers agree
+    equal: bool | None  # whether the answers agree; None where the peer computes something else by design
+
+
+def rows(name: str, times: dict[str, float], equal: dict[str, bool | None], limit_ms: float | None = None) -> list[Row]:
+    """One row for each peer, the fastest peer first.
+
+    Args:
+        name: of the benchmark.
+        times: as `interleaved` gives them: `ours`, the peers, and what else was measured.
+        equal: of each peer.
+        limit_ms: what the limit of this machine would take, measured in the same run.
+    """
+    ours = times["ours"]
+    share = limit_ms / ours if limit_ms else None
+    peers = sorted(equal, key=lambda peer: times[peer])
+    return [Row(name, ours, peer, times[peer], times[peer] / ours, share, equal[peer]) for peer in peers]
 
 
 def interleaved(runs: dict[str, Callable[[], object]], rounds: int, warm_up: int = 2) -> dict[str, float]:

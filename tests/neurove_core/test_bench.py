@@ -1,12 +1,21 @@
 """The benchmarks compare like with like; how fast is not a test's business."""
 
-from neurove_core.bench import interleaved, sine
+import importlib.util
+
+import pytest
+
+from neurove_core.bench import Row, chart, ingest, interleaved, machine, rows, sine, window
+from neurove_core.config import ModelConfig
+
+QUICK = {"quick": True, "with_peers": True}
+PEERS = {"spikingjelly": "spikingjelly", "snntorch": "snnTorch"}
+INSTALLED = {name for module, name in PEERS.items() if importlib.util.find_spec(module)}
 
 
 def test_the_fused_recurrence_and_plain_steps_give_the_same_answers():
-    rows = sine.compare(rounds=1)
-    assert [row.name for row in rows] == ["sine forward", "sine forward and backward"]
-    assert all(row.equal and row.ratio == row.peer_ms / row.ours_ms for row in rows)
+    found = sine.compare(rounds=1)
+    assert [row.name for row in found] == ["sine forward", "sine forward and backward"]
+    assert all(row.equal and row.ratio == row.peer_ms / row.ours_ms for row in found)
 
 
 def test_every_round_runs_all_in_turn():
@@ -14,3 +23,54 @@ def test_every_round_runs_all_in_turn():
     times = interleaved({name: lambda name=name: calls.append(name) for name in "ab"}, rounds=2, warm_up=1)
     assert calls == ["a", "b"] * 3
     assert set(times) == {"a", "b"}
+
+
+@pytest.mark.parametrize("compare", [window.window, window.train, ingest.end_to_end])
+def test_what_is_timed_gives_equal_answers_and_peers_that_are_not_installed_are_named(compare):
+    missing: list[str] = []
+    found = compare(1, missing, **QUICK)
+    assert any("PyTorch, plain" in row.peer for row in found)
+    assert all(row.equal is not False for row in found)
+    assert all(row.equal for row in found if "snnTorch" not in row.peer)
+    for module, name in PEERS.items():
+        assert (name in INSTALLED) == any(name in row.peer for row in found)
+        assert (name in INSTALLED) != any(line.startswith(module) for line in missing)
+
+
+@pytest.mark.parametrize("compare", [ingest.ingest, ingest.decode])
+def test_counts_and_decoded_events_equal_those_of_the_reference(compare):
+    found = compare(1, [], quick=True, with_peers=False)
+    assert found
+    assert all(row.equal for row in found)
+
+
+def test_streams_in_turn_and_in_a_batch_are_answered_alike():
+    found = window.streams(1, quick=True)
+    assert {row.peer for row in found} == {"one stream", "batch of 8"}
+    assert all(row.equal for row in found)
+
+
+def test_rows_come_with_the_fastest_peer_first_and_the_share_of_the_limit():
+    found = rows("a", {"ours": 2.0, "slow": 8.0, "fast": 4.0, "limit": 1.0}, {"slow": True, "fast": None}, limit_ms=1.0)
+    assert found == [Row("a", 2.0, "fast", 4.0, 2.0, 0.5, None), Row("a", 2.0, "slow", 8.0, 4.0, 0.5, True)]
+
+
+def test_the_work_of_a_window_is_that_of_its_layers():
+    config = ModelConfig()  # 86x65, n = 5, channels 16 32 64 64, 128 features, two cells of 128
+    convolutions = 9 * (10 * 16 * 33 * 43 + 16 * 32 * 17 * 22 + 32 * 64 * 9 * 11 + 64 * 64 * 5 * 6)
+    dense = 64 * 5 * 6 * 128 + 2 * 9 * 128 * 128 + 128 * 30
+    assert machine.flops(config) == 2 * (convolutions + dense)
+
+
+def test_a_result_is_stamped_with_commit_threads_and_versions():
+    stamp = machine.stamp("abc123")
+    assert all(part in stamp for part in ("commit abc123", "1 thread", "torch", "numba"))
+
+
+def test_a_chart_has_a_bar_for_each_row(tmp_path):
+    found = rows("a", {"ours": 2.0, "slow": 8.0, "fast": 4.0}, {"slow": True, "fast": None})
+    png, svg = chart.save(found, "stamp", tmp_path / "speed.png")
+    assert [png.name, svg.name] == ["speed.png", "speed.svg"]
+    text = svg.read_text()
+    assert png.stat().st_size > 1000
+    assert "<svg" in text

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from neurove_core.encoding import to_spikes
+from neurove_core.encoding import to_spikes, to_spikes_reference
 
 ALL_COUNTS = torch.arange(256, dtype=torch.uint8)
 
@@ -24,3 +24,15 @@ def test_every_cell_is_encoded_by_itself_in_place_as_float32(encoding):
     assert spikes.dtype == torch.float32
     assert torch.equal(spikes, to_spikes(ALL_COUNTS, encoding)[counts.long()])
     assert not spikes[counts == 0].any()
+
+
+@pytest.mark.parametrize("encoding", ["binary", "log1p"])
+@pytest.mark.parametrize("shape", [(4, 5, 6), (2, 3, 4, 5, 6), (1, 1, 10, 65, 86), (256,), (2, 128)])
+def test_the_compiled_encoding_is_the_plain_one_and_lays_channels_last(shape, encoding):
+    counts = torch.randint(0, 256, shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    spikes = to_spikes(counts, encoding)
+    assert torch.equal(spikes, to_spikes_reference(counts, encoding))
+    if len(shape) >= 3:
+        assert spikes.movedim(-3, -1).is_contiguous()
+    mirrored = counts.flip(-1).transpose(-1, -2) if len(shape) > 1 else counts.flip(-1)
+    assert torch.equal(to_spikes(mirrored, encoding), to_spikes_reference(mirrored, encoding))

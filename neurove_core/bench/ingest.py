@@ -1,0 +1,252 @@
+"""From events to counts, from events to an estimate, from a camera's words to events."""
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from neurove_core import bundle, io
+from neurove_core.bench import Row, interleaved, peers, rows, window
+from neurove_core.config import ModelConfig
+from neurove_core.encoding import to_spikes_reference
+from neurove_core.estimator import Estimator
+from neurove_core.geometry import lookup_table
+from neurove_core.kernels import compiled, count_events, count_events_reference
+from neurove_core.network import NeuroVE
+from neurove_core.neurons import plain
+from protocol import Events, Sensor
+
+SENSOR = Sensor(346, 260)
+BINS, DURATION_US = 10, 50_000
+
+
+def ingest(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool) -> list[Row]:
+    """Events of one window to counts [2n, H, W] of a DAVIS346; the limit is to add to cells that are already known."""
+    found: list[Row] = []
+    for n in (5_000,) if quick else (100_000, 1_000_000):
+        events = draw(n)
+        known = _cells(events)
+        runs: dict[str, Callable[[], Any]] = {
+            "ours": _counted(count_events, events),
+            "numpy": _counted(count_events_reference, events),
+        }
+        if with_peers:
+            runs |= _counting_peers(events, missing)
+        expected = runs["ours"]()
+        equal: dict[str, bool | None] = {
+            name: bool(np.array_equal(np.minimum(run(), 255), expected)) for name, run in runs.items() if name != "ours"
+        }
+        if "tonic" in equal:
+            equal["tonic"] = None  # it cuts the bins at other times, and drops the last events
+        times = interleaved({**runs, "limit": _increments(known)}, rounds)
+        found += rows(f"ingest {n:.0e} events, 346x260, n=10", times, equal, times["limit"])
+    return found
+
+
+def _counted(count: Callable[..., int], events: Events) -> Callable[[], NDArray[np.uint8]]:
+    pixels = np.arange(SENSOR.height * SENSOR.width, dtype=np.int32).reshape(SENSOR.height, SENSOR.width)
+
+    def run() -> NDArray[np.uint8]:
+        into = np.zeros((2 * BINS, SENSOR.height, SENSOR.width), np.uint8)
+        count(events, 0, DURATION_US // BINS, pixels, into)
+        return into
+
+    return run
+
+
+def _increments(known: NDArray[np.uint32]) -> Callable[[], None]:
+    """To add to cells that are known: what is left of counting when all else costs nothing."""
+
+    def run() -> None:
+        _increment(known, np.zeros(2 * BINS * SENSOR.height * SENSOR.width, np.uint8))
+
+    return run
+
+
+def end_to_end(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool) -> list[Row]:
+    """Events of one window to its estimate, 1e5 events of a DAVIS346, from rest."""
+    found: list[Row] = []
+    shapes = {"tiny": window.TINY} if quick else {"shipped": window.SHIPPED, "reference, T=1": window.REFERENCE}
+    events = draw(5_000 if quick else 100_000)
+    tonic = peers.load("tonic.functional", missing) if with_peers else None
+    for name, config in shapes.items():
+        estimator = Estimator(bundle.untrained(0, config))
+        network = estimator.network
+        others = peers.networks(network, missing) if with_peers else {}
+        runs: dict[str, Callable[[], Any]] = {"ours": _estimated(estimator, events)}
+        for peer, theirs in {"PyTorch, plain": network, **others}.items():
+            runs[f"numpy and {peer}"] = _in_steps(_numpy_counts(config, events), theirs)
+        if tonic is not None and "snnTorch" in others:
+            runs["tonic and snnTorch"] = _in_steps(_tonic_counts(tonic, config, events), others["snnTorch"])
+        expected = runs["ours"]()
+        equal: dict[str, bool | None] = {
+            peer: None if "snnTorch" in peer else bool(np.allclose(run(), expected, rtol=1e-3, atol=1e-4))
+            for peer, run in runs.items()
+            if peer != "ours"
+        }
+        found += rows(f"events to estimate, {events.n:.0e} events, {name}", interleaved(runs, rounds), equal)
+    return found
+
+
+def _estimated(estimator: Estimator, events: Events) -> Callable[[], NDArray[Any]]:
+    def run() -> NDArray[Any]:
+        return estimator.push(events, estimator.initial_state(SENSOR), DURATION_US).estimates[0].twists
+
+    return run
+
+
+def _in_steps(counts: Callable[[], NDArray[np.uint8]], network: NeuroVE) -> Callable[[], NDArray[Any]]:
+    """Counts to a network's input to its answer, in plain PyTorch or a peer's neurons, from rest."""
+    rest, encoding = network.initial_state(1), network.config.network.encoding
+
+    @torch.inference_mode()
+    def run() -> NDArray[Any]:
+        spikes = to_spikes_reference(torch.from_numpy(counts()), encoding)
+        with plain():
+            twists: NDArray[Any] = network(spikes[None, None], rest)[0][0, 0].numpy()
+        return twists
+
+    return run
+
+
+def _numpy_counts(config: ModelConfig, events: Events) -> Callable[[], NDArray[np.uint8]]:
+    lut = lookup_table(config.canonical, SENSOR, None)
+    shape = (2 * config.window.bins, config.canonical.height, config.canonical.width)
+
+    def run() -> NDArray[np.uint8]:
+        counts = np.zeros(shape, np.uint8)
+        count_events_reference(events, 0, config.window.bin_us, lut, counts)
+        return counts
+
+    return run
+
+
+def _tonic_counts(tonic: Any, config: ModelConfig, events: Events) -> Callable[[], NDArray[np.uint8]]:
+    """Its frames, of events that are on the network's grid already: scaling is not timed."""
+    grid, bins = config.canonical, config.window.bins
+    fields, cell = _structured(events), lookup_table(grid, SENSOR, None)[events.y, events.x]
+    fields["x"], fields["y"] = cell % grid.width, cell // grid.width
+
+    def run() -> NDArray[np.uint8]:
+        frames: NDArray[Any] = tonic.to_frame_numpy(fields, (grid.width, grid.height, 2), n_time_bins=bins)
+        return frames.reshape(2 * bins, grid.height, grid.width).astype(np.uint8)
+
+    return run
+
+
+def decode(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool) -> list[Row]:
+    """An EVT3 file of a Prophesee camera to events."""
+    events = draw(5_000 if quick else 1_000_000, Sensor(1280, 720))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "recording.raw"
+        header = b"% evt 3.0\n% format EVT3;height=720;width=1280\n% geometry 1280x720\n% end\n"
+        path.write_bytes(header + _evt3(events).tobytes())
+
+        def ours() -> list[Events]:
+            return list(io.open_source(str(path)).chunks())
+
+        runs: dict[str, Callable[[], Any]] = {"ours": ours}
+        equal: dict[str, bool | None] = {}
+        faery = peers.load("faery", missing) if with_peers else None
+        if faery is not None:
+
+            def theirs() -> list[Any]:
+                return list(faery.events_stream_from_file(path))
+
+            runs["faery"] = theirs
+            equal["faery"] = _same_events(theirs(), ours())
+        times = interleaved(runs, rounds)
+        if not equal:  # nobody to compare with: our own figure alone
+            times["written"], equal["written"] = times["ours"], _same_events([_structured(events)], ours())
+        return rows(f"decode EVT3, {events.n:.0e} events", times, equal)
+
+
+def draw(n: int, sensor: Sensor = SENSOR) -> Events:
+    """An edge that sweeps over the sensor in one window, with noise: where events are, others are."""
+    rng = np.random.default_rng(0)
+    t = np.sort(rng.integers(0, DURATION_US, n))
+    x = (t * sensor.width / DURATION_US + rng.normal(0, sensor.width / 12, n)).astype(np.int64) % sensor.width
+    return Events.from_columns(t, x, rng.integers(0, sensor.height, n), rng.integers(0, 2, n))
+
+
+def _counting_peers(events: Events, missing: peers.Missing) -> dict[str, Callable[[], Any]]:
+    runs: dict[str, Callable[[], Any]] = {}
+    tonic = peers.load("tonic.functional", missing)
+    if tonic is not None:
+        runs["tonic"] = _tonic_frames(tonic, _structured(events))
+    if (dv := peers.load("dv_processing", missing)) is not None:
+        runs["dv-processing"] = _dv(dv, events)
+    return runs
+
+
+def _tonic_frames(tonic: Any, fields: NDArray[Any]) -> Callable[[], Any]:
+    shape = (2 * BINS, SENSOR.height, SENSOR.width)
+    size = (SENSOR.width, SENSOR.height, 2)
+    return lambda: tonic.to_frame_numpy(fields, size, n_time_bins=BINS).reshape(shape)
+
+
+def _dv(dv: Any, events: Events) -> Callable[[], Any]:
+    """An accumulator for each channel; its store is filled beforehand, for Python fills it event by event."""
+    store = dv.EventStore()
+    for t, x, y, p in zip(*(column.tolist() for column in events), strict=True):
+        store.push_back(t, x, y, bool(p))
+    accumulators = []
+    for _ in range(2 * BINS):
+        one = dv.Accumulator((SENSOR.width, SENSOR.height))
+        one.setDecayFunction(dv.Accumulator.Decay.NONE)
+        one.setEventContribution(1.0)
+        one.setNeutralPotential(0.0)
+        one.setMinPotential(0.0)
+        one.setMaxPotential(255.0)
+        one.setIgnorePolarity(True)
+        accumulators.append(one)
+
+    def run() -> NDArray[np.uint8]:
+        out = np.empty((2 * BINS, SENSOR.height, SENSOR.width), np.uint8)
+        for index, accumulator in enumerate(accumulators):
+            first = index // 2 * DURATION_US // BINS
+            accumulator.clear()
+            accumulator.accept(dv.polarityFilter(store.sliceTime(first, first + DURATION_US // BINS), bool(index % 2)))
+            out[index] = accumulator.generateFrame().image
+        return out
+
+    return run
+
+
+def _structured(events: Events) -> NDArray[Any]:
+    fields = np.empty(events.n, [("t", "<u8"), ("x", "<u2"), ("y", "<u2"), ("p", "?")])
+    fields["t"], fields["x"], fields["y"], fields["p"] = events.t, events.x, events.y, events.p > 0
+    return fields
+
+
+def _cells(events: Events) -> NDArray[np.uint32]:
+    channel = 2 * (events.t // (DURATION_US // BINS)) + events.p
+    return ((channel * SENSOR.height + events.y) * SENSOR.width + events.x).astype(np.uint32)
+
+
+@compiled
+def _increment(where: NDArray[np.uint32], counts: NDArray[np.uint8]) -> None:  # pragma: no cover (machine code)
+    for i in range(where.size):
+        counts[where[i]] += np.uint8(1)
+
+
+def _evt3(events: Events) -> NDArray[np.uint16]:
+    """Words of single events: TIME_HIGH, TIME_LOW and ADDR_Y only where they change, ADDR_X for each event."""
+    t, y = events.t, events.y.astype(np.int64)
+    words = np.stack([0x8000 | t >> 12, 0x6000 | t & 0xFFF, y, 0x2000 | events.p.astype(np.int64) << 11 | events.x])
+    said = np.ones(words.shape, np.bool_)
+    said[0, 1:] = np.diff(t >> 12) != 0
+    said[1, 1:] = np.diff(t) != 0
+    said[2, 1:] = np.diff(y) != 0
+    return words.T[said.T].astype("<u2")
+
+
+def _same_events(theirs: list[Any], ours: list[Events]) -> bool:
+    columns = [np.concatenate([getattr(events, name) for events in ours]) for name in ("t", "x", "y", "p")]
+    read = np.concatenate(theirs)
+    names = ("t", "x", "y", "p" if "p" in (read.dtype.names or ()) else "on")
+    return all(np.array_equal(read[name], column) for name, column in zip(names, columns, strict=True))

@@ -1,0 +1,118 @@
+"""The peers' neurons in our network: same weights, same input, their LIF layers as their users run them.
+
+They come with the extra `bench`, except spikingjelly, which would pull another torch:
+`pip install --no-deps spikingjelly` and `pip install loguru`. What is not installed is named and left out.
+"""
+
+import copy
+import importlib
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from neurove_core.network import NeuroVE, SpikingBlock
+from neurove_core.neurons import LIFState
+
+Missing = list[str]
+"""Names of peers that could not be loaded, and why."""
+
+
+def load(name: str, missing: Missing) -> Any | None:
+    """A peer's module; None, and a line in `missing`, where it is not installed or does not load."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # a peer's deprecations are not ours
+            return importlib.import_module(name)
+    except ImportError as error:
+        missing.append(f"{name.partition('.')[0]} ({error})")
+        return None
+
+
+def networks(network: NeuroVE, missing: Missing) -> dict[str, NeuroVE]:
+    """Our network with each peer's neurons, by the peer's name; run them inside `neurons.plain()`."""
+    made = {
+        "spikingjelly": _with_neurons(network, _spikingjelly(missing), stepwise=False),
+        "snnTorch": _with_neurons(network, _snntorch(missing), stepwise=True),
+    }
+    return {name: peer for name, peer in made.items() if peer is not None}
+
+
+Neurons = Callable[[SpikingBlock], tuple[Callable[[Tensor], Tensor], Callable[[], None]]]
+"""Of one block: currents to spikes, and back to rest."""
+
+
+class PeerBlock(nn.Module):
+    """A block of our network with a peer's neurons; they begin each sequence at rest.
+
+    Args:
+        block: ours, whose weights it shares.
+        neurons: the peer's.
+        stepwise: whether the peer's users loop over time, or hand over all steps at once.
+    """
+
+    def __init__(self, block: SpikingBlock, neurons: Neurons, *, stepwise: bool) -> None:
+        super().__init__()
+        self.conv, self.norm = block.conv, block.norm
+        self._fire, self._rest = neurons(block)
+        self._stepwise = stepwise
+
+    def forward(self, spikes: Tensor, state: LIFState) -> tuple[Tensor, LIFState]:
+        """As SpikingBlock.forward; the state goes through unseen."""
+        self._rest()
+        if self._stepwise:
+            return torch.stack([self._fire(self.norm(self.conv(x))) for x in spikes]), state
+        current: Tensor = self.norm(self.conv(spikes.flatten(0, 1)))
+        return self._fire(current.view(*spikes.shape[:2], *current.shape[1:])), state
+
+
+def features(network: NeuroVE, spikes: Tensor) -> Tensor:
+    """Spikes (T * B, C, H', W') of a network's last map, from rest."""
+    state = network.initial_state(spikes.shape[1])
+    for block, membrane in zip(network.blocks, state.membranes, strict=True):
+        spikes, _ = block(spikes, membrane)
+    return spikes.flatten(0, 1)
+
+
+def _with_neurons(network: NeuroVE, neurons: Neurons | None, *, stepwise: bool) -> NeuroVE | None:
+    if neurons is None:
+        return None
+    peer = copy.deepcopy(network)
+    blocks = [block for block in peer.blocks if isinstance(block, SpikingBlock)]
+    peer.blocks = nn.ModuleList(PeerBlock(block, neurons, stepwise=stepwise) for block in blocks)
+    return peer
+
+
+def _spikingjelly(missing: Missing) -> Neurons | None:
+    module = load("spikingjelly.activation_based.neuron", missing)
+    if module is None:
+        return None
+    surrogates = importlib.import_module("spikingjelly.activation_based.surrogate")
+
+    def neurons(block: SpikingBlock) -> tuple[Callable[[Tensor], Tensor], Callable[[], None]]:
+        node = module.LIFNode(
+            tau=1 / (1 - block.lif.decay),
+            decay_input=False,
+            v_threshold=block.lif.v_th,
+            v_reset=0.0,
+            surrogate_function=surrogates.Rect(alpha=1 / block.lif.surrogate_width),
+            detach_reset=True,
+            step_mode="m",
+        )
+        return node, node.reset
+
+    return neurons
+
+
+def _snntorch(missing: Missing) -> Neurons | None:
+    module = load("snntorch", missing)
+    if module is None:
+        return None
+
+    def neurons(block: SpikingBlock) -> tuple[Callable[[Tensor], Tensor], Callable[[], None]]:
+        leaky = module.Leaky(beta=block.lif.decay, threshold=block.lif.v_th, reset_mechanism="zero", init_hidden=True)
+        return leaky, leaky.reset_mem
+
+    return neurons

@@ -1,0 +1,160 @@
+"""One window through the network, one training step, and many streams on one core."""
+
+import copy
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from neurove_core import bundle
+from neurove_core.bench import Row, interleaved, machine, peers, rows
+from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
+from neurove_core.engine import Engine
+from neurove_core.network import NetworkState, NeuroVE
+from neurove_core.neurons import plain
+
+REFERENCE = ModelConfig(
+    window=WindowConfig(bins=10),
+    canonical=CanonicalConfig(width=173, height=130),
+    network=NetworkConfig(channels=(32, 64, 128, 256), features=256, hidden=256),
+)
+"""The network that research measured its peers with: 1.9 GFLOP a window at T = 8, a DAVIS346 at half its size."""
+
+SHIPPED = ModelConfig()
+
+TINY = ModelConfig(canonical=CanonicalConfig(width=24, height=16), network=NetworkConfig(channels=(4, 8), features=16))
+"""For --quick: does it run, and are the answers equal."""
+
+
+def window(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool) -> list[Row]:
+    """Latency of a window: the reference network with T = 8, and the shipped one as the service runs it, T = 1."""
+    shapes = {"tiny, T=3": (TINY, 3)} if quick else {"reference, T=8": (REFERENCE, 8), "shipped, T=1": (SHIPPED, 1)}
+    found: list[Row] = []
+    for name, (config, steps) in shapes.items():
+        network = _network(config)
+        spikes, rest = draw(config, steps), network.initial_state(1)
+        engine = Engine(network)
+        others = peers.networks(network, missing) if with_peers else {}
+        runs: dict[str, Callable[[], object]] = {"ours": lambda e=engine, s=spikes, r=rest: e(s, r)}  # type: ignore[misc]
+        for peer, theirs in {"PyTorch, plain": network, **others}.items():
+            runs[peer] = _plainly(theirs, spikes, rest)
+        with torch.inference_mode():
+            fired = engine.features(spikes, rest)[0]
+            equal: dict[str, bool | None] = {"PyTorch, plain": _agree(engine, network, spikes, rest)}
+            with plain():
+                for peer, theirs in others.items():
+                    fires_alike = bool(torch.equal(peers.features(theirs, spikes), fired))
+                    equal[peer] = None if peer == "snnTorch" else fires_alike
+            times = interleaved({**runs, "peak": machine.peak()}, rounds)
+        limit_ms = times["peak"] * steps * machine.flops(config) / machine.PEAK_FLOPS
+        found += rows(f"window {name}", times, equal, limit_ms)
+    return found
+
+
+def train(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool) -> list[Row]:
+    """A training step, forward, backward and Adam: the reference network, T = 8, batch 4; the shipped one, T = 16."""
+    shapes = {"tiny, T=3": (TINY, 3)} if quick else {"reference, T=8": (REFERENCE, 8), "shipped, T=16": (SHIPPED, 16)}
+    found: list[Row] = []
+    for name, (config, steps) in shapes.items():
+        network = _network(config).requires_grad_().train()
+        spikes = draw(config, steps, batch=4)
+        others = peers.networks(network, missing) if with_peers else {}
+        ours = _TrainingStep(network, spikes)
+        runs: dict[str, Callable[[], object]] = {"ours": ours}
+        steps_of = {
+            peer: _TrainingStep(theirs, spikes) for peer, theirs in {"PyTorch, plain": network, **others}.items()
+        }
+        losses = {}
+        for peer, step in steps_of.items():
+            with plain():
+                losses[peer] = step.loss()
+            runs[peer] = _inside_plain(step)
+        loss = ours.loss()
+        equal: dict[str, bool | None] = {
+            peer: None if peer == "snnTorch" else abs(value - loss) < 1e-4 * abs(loss) for peer, value in losses.items()
+        }
+        found += rows(f"training step {name}, batch 4", interleaved(runs, rounds, warm_up=1), equal)
+    return found
+
+
+def streams(rounds: int, *, quick: bool) -> list[Row]:
+    """Eight streams on one core: one after the other, and their windows in one batch; milliseconds per window."""
+    config = TINY if quick else SHIPPED
+    network = _network(config)
+    engine = Engine(network)
+    inputs = [draw(config, 1, seed=seed) for seed in range(8)]
+    states = [network.initial_state(1) for _ in inputs]
+    together, joint = torch.cat(inputs, dim=1), network.initial_state(8)
+
+    def in_turn() -> None:
+        for index, spikes in enumerate(inputs):
+            states[index] = engine(spikes, states[index])[1]
+
+    def alone() -> None:
+        for _ in inputs:
+            states[0] = engine(inputs[0], states[0])[1]
+
+    times = interleaved({"ours": in_turn, "one stream": alone, "batch of 8": lambda: engine(together, joint)}, rounds)
+    batch, _ = engine(together, joint)
+    each = torch.cat([engine(spikes, network.initial_state(1))[0] for spikes in inputs], dim=1)
+    equal = bool(torch.allclose(batch, each, rtol=1e-3, atol=1e-4))
+    per_window = {name: value / len(inputs) for name, value in times.items()}
+    return rows("8 streams in turn, shipped, per window", per_window, {"one stream": True, "batch of 8": equal})
+
+
+def draw(config: ModelConfig, steps: int, batch: int = 1, seed: int = 1) -> Tensor:
+    """Input (T, B, 2n, H, W) as counts of a window are encoded, channels last as the encoding lays it."""
+    shape = (steps, batch, 2 * config.window.bins, config.canonical.height, config.canonical.width)
+    counts = torch.poisson(torch.full(shape, 0.3), generator=torch.Generator().manual_seed(seed))
+    return counts.log1p().movedim(2, -1).contiguous().movedim(-1, 2)
+
+
+def _network(config: ModelConfig) -> NeuroVE:
+    return bundle.untrained(0, config).network.eval().requires_grad_(requires_grad=False)
+
+
+def _plainly(network: NeuroVE, spikes: Tensor, state: NetworkState) -> Callable[[], object]:
+    def run() -> object:
+        with plain():
+            return network(spikes, state)
+
+    return run
+
+
+def _inside_plain(run: Callable[[], object]) -> Callable[[], object]:
+    def plainly() -> object:
+        with plain():
+            return run()
+
+    return plainly
+
+
+def _agree(engine: Engine, network: NeuroVE, spikes: Tensor, rest: NetworkState) -> bool:
+    """Whether the engine fires as its plain form, bit for bit, and the network answers alike in the first window."""
+    fired = engine.features(spikes, rest)[0]
+    with plain():
+        same = torch.equal(engine.features(spikes, rest)[0], fired)
+        expected = network(spikes[:1], rest)[0]
+    return bool(same and torch.allclose(engine(spikes[:1], rest)[0], expected, rtol=1e-3, atol=1e-4))
+
+
+class _TrainingStep:
+    """One step of training a copy of a network towards zero velocity."""
+
+    def __init__(self, network: NeuroVE, spikes: Tensor) -> None:
+        self._network, self._spikes = copy.deepcopy(network), spikes
+        self._rest = self._network.initial_state(spikes.shape[1])
+        self._optimizer = torch.optim.Adam(self._network.parameters(), lr=1e-4)
+
+    def loss(self) -> float:
+        """Before the step."""
+        with torch.no_grad():
+            return float(self._error())
+
+    def __call__(self) -> None:
+        self._optimizer.zero_grad()
+        self._error().backward()  # type: ignore[no-untyped-call]  # torch's own
+        self._optimizer.step()
+
+    def _error(self) -> Tensor:
+        return torch.mean((self._network(self._spikes, self._rest)[0] - 0.5).square())

@@ -1,0 +1,270 @@
+"""NeuroVE as the service runs it: the norms folded into the weights, each part in its fastest form, same state.
+
+    Engine(network)(spikes, state) -> (twists, state)
+
+is what the network in evaluation mode computes, up to rounding: folding a norm moves the last bits of a current, and a
+spike that hangs on them. What holds bit for bit is tested against the engine inside `neurons.plain()`: the same folded
+weights through `lif_step`, `aslstm_step` and `readout_step`. State goes to and fro between all of them.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn.functional import linear
+
+from neurove_core import scan
+from neurove_core.activations import fused, sigmoid, tanh
+from neurove_core.cells import ASLSTM, ASLSTMParams, ASLSTMState, aslstm_step, readout_step
+from neurove_core.convolution import Convolution, convolution
+from neurove_core.network import NetworkState, NeuroVE, SpikingBlock
+from neurove_core.neurons import LIFParams, LIFState, diffuse, is_plain, lif_scan_reference
+
+Array = NDArray[np.float32]
+
+
+class Folded(NamedTuple):
+    """One layer of weights with the norm that follows it inside."""
+
+    weight: Tensor
+    bias: Tensor
+
+
+class Engine:
+    """The inference of one network; holds no stream's state and is safe to share between threads.
+
+    Args:
+        network: in float32 on the CPU; its weights are copied, later changes of them are not seen.
+    """
+
+    def __init__(self, network: NeuroVE) -> None:
+        self._bins = network.bins
+        blocks = [block for block in network.blocks if isinstance(block, SpikingBlock)]
+        net, grid = network.config.network, network.config.canonical
+        sizes = [(grid.height, grid.width), *network.map_sizes()]
+        with torch.no_grad():
+            self._lif: LIFParams = blocks[0].lif
+            self._convolutions = [_convolution(block, *size) for block, size in zip(blocks, sizes, strict=False)]
+            self._project = _projection(network, net.channels[-1], *sizes[-1])
+            self._readout = Folded(network.readout.weight.detach().clone(), network.readout.bias.detach().clone())
+            self._kappa = float(torch.sigmoid(network.kappa_logit))
+            cells = [cell for cell in network.cells if isinstance(cell, ASLSTM)]
+            self._params = [_copied(cell.params()) for cell in cells]
+            self._d_space = network.d_space.detach().clone()
+        self._weights = _flattened(self._project, self._params, self._d_space, self._readout)
+        self._constants = np.array([net.alpha, net.v_th, self._kappa], np.float32)
+
+    @torch.inference_mode()
+    def __call__(self, spikes: Tensor, state: NetworkState) -> tuple[Tensor, NetworkState]:
+        """Velocities of T consecutive windows, and the state after them.
+
+        Args:
+            spikes: (T, B, 2n, H, W), any layout; channels last is read as it lies.
+            state: of these B streams, the network's or the engine's.
+
+        Returns:
+            twists (T, B, n, 6) in scaled units and the next state, as NeuroVE.forward.
+        """
+        steps, batch = spikes.shape[:2]
+        x, membranes = self.features(spikes, state)
+        rows = x.permute(0, 2, 3, 1).reshape(steps * batch, -1)  # as it lies in memory
+        twists, cells, y = (self._plain_cells if is_plain() else self._fused_cells)(rows, steps, state)
+        return twists.view(steps, batch, self._bins, 6), NetworkState(membranes, cells, y)
+
+    @torch.inference_mode()
+    def features(self, spikes: Tensor, state: NetworkState) -> tuple[Tensor, tuple[LIFState, ...]]:
+        """Spikes (T * B, C, H', W') of the last map of the feature extractor alone, and its membranes after them."""
+        x = spikes.flatten(0, 1).contiguous(memory_format=torch.channels_last)
+        fire = self._plain_fire if is_plain() else self._fused_fire
+        membranes = []
+        for convolve, membrane in zip(self._convolutions, state.membranes, strict=True):
+            x, after = fire(convolve(x), membrane.v)
+            membranes.append(LIFState(after))
+        return x, tuple(membranes)
+
+    def _fused_fire(self, currents: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        return scan.scan_in_place(currents, v, self._lif.decay, self._lif.v_th)
+
+    def _plain_fire(self, currents: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        spikes, after = lif_scan_reference(currents.view(-1, *v.shape), LIFState(v), self._lif)
+        return spikes.flatten(0, 1), after.v
+
+    def _fused_cells(
+        self, rows: Tensor, steps: int, state: NetworkState
+    ) -> tuple[Tensor, tuple[ASLSTMState, ...], Tensor]:
+        carried = torch.stack([field for cell in state.cells for field in cell])  # (3 L, B, N): c, v, s of each layer
+        y = state.readout.clone()
+        answers = torch.empty(steps, *y.shape)
+        features = self._project.bias.numel()
+        _cells(rows.numpy(), self._weights, features, self._constants, carried.numpy(), y.numpy(), answers.numpy())
+        fields = carried.unbind()
+        return answers, tuple(ASLSTMState(*fields[i : i + 3]) for i in range(0, len(fields), 3)), y
+
+    def _plain_cells(
+        self, rows: Tensor, steps: int, state: NetworkState
+    ) -> tuple[Tensor, tuple[ASLSTMState, ...], Tensor]:
+        y, cells, answers = state.readout, list(state.cells), []
+        for z in linear(rows, *self._project).view(steps, rows.shape[0] // steps, -1):
+            for index, params in enumerate(self._params):
+                cells[index] = aslstm_step(z, cells[index], params)
+                z = diffuse(cells[index].s, cells[index].v, self._d_space[index])
+            y = readout_step(z, y, *self._readout, self._kappa)
+            answers.append(y)
+        return torch.stack(answers), tuple(cells), y
+
+
+def folded(weight: Tensor, norm: nn.BatchNorm1d | nn.BatchNorm2d) -> Folded:
+    """Weights whose first axis a norm in evaluation mode follows, with that norm inside.
+
+    gamma (w x - mean) / sqrt(var + eps) + beta = (w k) x + (beta - mean k), k = gamma / sqrt(var + eps); in float64,
+    so that folding itself adds one rounding.
+    """
+    mean, variance, gamma, beta = (
+        tensor.double()
+        for tensor in (norm.running_mean, norm.running_var, norm.weight, norm.bias)
+        if tensor is not None
+    )
+    k = gamma / torch.sqrt(variance + norm.eps)
+    scaled = weight.double() * k.view(-1, *[1] * (weight.dim() - 1))
+    return Folded(scaled.to(weight.dtype), (beta - mean * k).to(weight.dtype))
+
+
+def _convolution(block: SpikingBlock, rows: int, columns: int) -> Convolution:
+    return convolution(*folded(block.conv.weight, block.norm), rows, columns)
+
+
+def _projection(network: NeuroVE, channels: int, rows: int, columns: int) -> Folded:
+    """The projection for maps that are flattened with their channels last."""
+    weight, bias = folded(network.project.weight, network.project_norm)
+    return Folded(weight.view(-1, channels, rows, columns).permute(0, 2, 3, 1).flatten(1).contiguous(), bias)
+
+
+def _copied(params: ASLSTMParams) -> ASLSTMParams:
+    w_x, w_v, b, d_time = (tensor.detach().clone() for tensor in (params.w_x, params.w_v, params.b, params.d_time))
+    return ASLSTMParams(w_x, w_v, b, d_time, params.alpha, params.v_th)
+
+
+def _flattened(project: Folded, cells: list[ASLSTMParams], d_space: Tensor, readout: Folded) -> Array:
+    """All weights of the compiled pass in one vector, in the order in which `_cells` takes them off it.
+
+    Matrices are transposed, so that a row is what one input gives to all outputs; one array is handed over in a few
+    microseconds, twenty would take longer than a layer.
+    """
+    tensors = [project.weight.T, project.bias]
+    for params, d in zip(cells, d_space, strict=True):
+        tensors += [params.w_x.T, params.w_v.T, params.b, params.d_time, d]
+    tensors += [readout.weight.T, readout.bias]
+    return torch.cat([tensor.reshape(-1) for tensor in tensors]).numpy()
+
+
+# --- the compiled pass from the last map to the answers ---------------------------------------------------------------
+
+
+@fused
+def _add_product(x, w, out):  # type: ignore[no-untyped-def]  # compiled for its arguments
+    """Out (R, J) += x (R, I) w (I, J), four rows of w at a time, each read once for all R; rows of zeros cost nothing.
+
+    Every out[r, j] is summed in the order of I, whatever the width of the machine's vectors.
+    """
+    rows, inputs = x.shape
+    whole = inputs - inputs % 4
+    for i in range(0, whole, 4):
+        w0, w1, w2, w3 = w[i], w[i + 1], w[i + 2], w[i + 3]
+        for r in range(rows):
+            x0, x1, x2, x3 = x[r, i], x[r, i + 1], x[r, i + 2], x[r, i + 3]
+            if x0 == 0 and x1 == 0 and x2 == 0 and x3 == 0:
+                continue
+            y = out[r]
+            for j in range(y.size):
+                y[j] += x0 * w0[j] + x1 * w1[j] + x2 * w2[j] + x3 * w3[j]
+    for i in range(whole, inputs):
+        for r in range(rows):
+            y, xi, wi = out[r], x[r, i], w[i]
+            for j in range(y.size):
+                y[j] += xi * wi[j]
+
+
+@fused
+def _matrix(weights, at, rows, columns):  # type: ignore[no-untyped-def]  # compiled for its arguments
+    """The next matrix of the vector of weights, and where the one after it begins."""
+    end = at + rows * columns
+    return weights[at:end].reshape(rows, columns), end
+
+
+@fused
+def _rows_of(bias, rows):  # type: ignore[no-untyped-def]  # compiled for its arguments
+    """Rows of a bias, to add products to."""
+    out = np.empty((rows, bias.size), bias.dtype)
+    for r in range(rows):
+        for j in range(bias.size):  # assigning a whole row would take seconds to compile
+            out[r, j] = bias[j]
+    return out
+
+
+@fused
+def _layer(x, weights, at, c, v, s, alpha, v_th):  # type: ignore[no-untyped-def]  # compiled for its arguments
+    """One ASLSTM layer over a sequence: inputs (T * B, I) to what goes up (T * B, N); c, v, s (B, N) move on."""
+    rows, inputs = x.shape
+    batch, hidden = c.shape
+    one, none = c.dtype.type(1), c.dtype.type(0)
+    w_x, at = _matrix(weights, at, inputs, 5 * hidden)
+    w_v, at = _matrix(weights, at, hidden, 4 * hidden)
+    b_x, at = _matrix(weights, at, 1, 5 * hidden)
+    diffusion, at = _matrix(weights, at, 2, hidden)
+    d_time, d_space = diffusion[0], diffusion[1]
+    from_x = _rows_of(b_x[0], rows)
+    _add_product(x, w_x, from_x)
+    up = np.empty((rows, hidden), c.dtype)
+    gates, tc = np.empty((batch, 4 * hidden), c.dtype), np.empty((batch, hidden), c.dtype)
+    for first in range(0, rows, batch):
+        for b in range(batch):
+            for j in range(4 * hidden):
+                gates[b, j] = from_x[first + b, j]
+        _add_product(v, w_v, gates)
+        for b in range(batch):
+            for j in range(2 * hidden, 3 * hidden):
+                gates[b, j] += gates[b, j]  # tanh(g) = 2 sigmoid(2 g) - 1: one pass for all gates
+        sigmoid(gates, one, True)
+        for b in range(batch):
+            for j in range(hidden):
+                g = gates[b, 2 * hidden + j] + gates[b, 2 * hidden + j] - one
+                c[b, j] = gates[b, hidden + j] * c[b, j] + gates[b, j] * g
+                tc[b, j] = c[b, j]
+        tanh(tc, True)
+        for b in range(batch):
+            for j in range(hidden):
+                h = gates[b, 3 * hidden + j] * tc[b, j]
+                u = alpha * (one - s[b, j]) * h + from_x[first + b, 4 * hidden + j] + d_time[j] * v[b, j]
+                fired = one if u - v_th >= none else none
+                v[b, j] = u
+                s[b, j] = fired
+                up[first + b, j] = fired + d_space[j] * u
+    return up, at
+
+
+@fused
+def _cells(rows, weights, features, constants, carried, y, answers):  # type: ignore[no-untyped-def]  # compiled for its arguments
+    """From the last map's spikes (T * B, cells of it) to answers (T, B, 6n).
+
+    The carried c, v, s of each layer (3 L, B, N) and the potentials y (B, 6n) of the readout move on in place.
+    """
+    steps, batch, outputs = answers.shape
+    layers, _, hidden = carried.shape
+    alpha, v_th, kappa = constants
+    project, at = _matrix(weights, 0, rows.shape[1], features)
+    bias, at = _matrix(weights, at, 1, features)
+    x = _rows_of(bias[0], steps * batch)
+    _add_product(rows, project, x)
+    for layer in range(0, layers, 3):
+        x, at = _layer(x, weights, at, carried[layer], carried[layer + 1], carried[layer + 2], alpha, v_th)
+    readout, at = _matrix(weights, at, hidden, outputs)
+    bias, at = _matrix(weights, at, 1, outputs)
+    from_x = _rows_of(bias[0], steps * batch)
+    _add_product(x, readout, from_x)
+    for t in range(steps):
+        for b in range(batch):
+            for k in range(outputs):
+                y[b, k] = kappa * y[b, k] + from_x[t * batch + b, k]
+                answers[t, b, k] = y[b, k]

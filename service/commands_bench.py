@@ -1,0 +1,77 @@
+"""The command bench: how fast this is on this machine, as ratios of one run."""
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from service.arguments import BAD_NEWS, command, commit
+
+if TYPE_CHECKING:
+    from neurove_core.bench import Row
+
+ALL = ("ingest", "window", "end-to-end", "train", "streams", "decode", "sine")
+
+
+def bench(args: argparse.Namespace) -> int:
+    """Speed, ours and the peers' in one process: the same input, interleaved, and the answers compared."""
+    import torch
+
+    from neurove_core.bench import chart, machine
+
+    torch.set_num_threads(1)
+    stamp = machine.stamp(commit())
+    print(stamp, file=sys.stderr)
+    found: list[Row] = []
+    missing: list[str] = []
+    for name in args.what or ALL:
+        for row in _rows(name, args, missing):
+            found.append(row)
+            if not args.json:
+                print(_sentence(row), flush=True)
+    if missing:
+        print(f"not measured, for they could not be loaded: {'; '.join(dict.fromkeys(missing))}", file=sys.stderr)
+    if args.json:
+        print(json.dumps([row._asdict() for row in found]))
+    if args.plot:
+        for file in chart.save(found, stamp, args.plot):
+            print(f"wrote {file}", file=sys.stderr)
+    return BAD_NEWS if any(row.equal is False for row in found) else 0
+
+
+def _rows(name: str, args: argparse.Namespace, missing: list[str]) -> Iterator["Row"]:
+    from neurove_core.bench import ingest, sine, window
+
+    options = {"quick": args.quick, "with_peers": args.peers}
+    run: dict[str, Callable[[], list[Row]]] = {
+        "ingest": lambda: ingest.ingest(_rounds(args, 21), missing, **options),
+        "window": lambda: window.window(_rounds(args, 15), missing, **options),
+        "end-to-end": lambda: ingest.end_to_end(_rounds(args, 15), missing, **options),
+        "train": lambda: window.train(_rounds(args, 3), missing, **options),
+        "streams": lambda: window.streams(_rounds(args, 21), quick=args.quick),
+        "decode": lambda: ingest.decode(_rounds(args, 9), missing, **options),
+        "sine": lambda: sine.compare(_rounds(args, 9)),
+    }
+    yield from run[name]()
+
+
+def _rounds(args: argparse.Namespace, usual: int) -> int:
+    return 1 if args.quick else usual
+
+
+def _sentence(row: "Row") -> str:
+    agree = {True: "equal answers", False: "DIFFERENT ANSWERS", None: "another computation by design"}[row.equal]
+    share = "" if row.share_of_limit is None else f", {row.share_of_limit:.0%} of this machine's limit"
+    against = f"{row.ratio:.2f} times as fast as {row.peer} ({row.peer_ms:.3g} ms; {agree})"
+    return f"{row.name}: {row.ours_ms:.3g} ms{share}; {against}"
+
+
+def add(commands: Any) -> None:
+    """Add the command to the parser."""
+    parser = command(commands, "bench", bench)
+    parser.add_argument("what", nargs="*", choices=[*ALL, []], metavar="WHAT", help=f"of {', '.join(ALL)}; default all")
+    parser.add_argument("--peers", action="store_true", help="measure the peers of the extra `bench` too")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="a chart, as FILE.png and FILE.svg")
+    parser.add_argument("--quick", action="store_true", help="tiny and once: are answers equal? Its times mean nothing")

@@ -1,0 +1,164 @@
+"""The engine computes what its plain form computes, and what the network computes up to the norms' rounding."""
+
+import logging
+from itertools import chain
+
+import pytest
+import torch
+from torch import Tensor
+
+from neurove_core import bundle, convolution
+from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
+from neurove_core.engine import Engine
+from neurove_core.network import NetworkState, NeuroVE
+from neurove_core.neurons import plain
+
+STEPS = 6
+SMALL = ModelConfig(
+    window=WindowConfig(duration_us=10_000, bins=2),
+    canonical=CanonicalConfig(width=19, height=14),
+    network=NetworkConfig(channels=(6, 8), features=13, hidden=11, cells=3, v_th=0.4),
+)
+SHIPPED = ModelConfig(network=NetworkConfig(v_th=0.4))
+each_shape = pytest.mark.parametrize("config", [SMALL, SHIPPED], ids=["small", "shipped"])
+
+
+def make_network(config: ModelConfig, seed: int = 0) -> NeuroVE:
+    return bundle.untrained(seed, config).network.requires_grad_(requires_grad=False)
+
+
+def make_spikes(config: ModelConfig, batch: int = 1, steps: int = STEPS, seed: int = 1) -> Tensor:
+    shape = (steps, batch, 2 * config.window.bins, config.canonical.height, config.canonical.width)
+    return torch.poisson(torch.full(shape, 0.4), generator=torch.Generator().manual_seed(seed)).log1p()
+
+
+def tensors_of(state: NetworkState) -> list[Tensor]:
+    return [*chain(*state.membranes, *state.cells), state.readout]
+
+
+def assert_fire_alike(state: NetworkState, expected: NetworkState) -> None:
+    """Every membrane equal bit for bit; the cells' spikes equal, all else of them to the rounding of long sums."""
+    for membrane, other in zip(state.membranes, expected.membranes, strict=True):
+        assert torch.equal(membrane.v, other.v)
+        assert 0 < (other.v == 0).double().mean() < 1
+    for cell, other_cell in zip(state.cells, expected.cells, strict=True):
+        assert torch.equal(cell.s, other_cell.s)
+    for one, other_one in zip(tensors_of(state), tensors_of(expected), strict=True):
+        torch.testing.assert_close(one, other_one, rtol=1e-4, atol=1e-5)
+
+
+@each_shape
+@pytest.mark.parametrize("batch", [1, 3])
+@pytest.mark.parametrize("seed", range(3))
+def test_spikes_of_the_engine_and_of_its_plain_form_are_equal_bit_for_bit(seed, batch, config):
+    engine, spikes = Engine(make_network(config, seed)), make_spikes(config, batch, seed=seed)
+    start = make_network(config, seed).initial_state(batch)
+    twists, state = engine(spikes, start)
+    with plain():
+        expected, expected_state = engine(spikes, start)
+    assert_fire_alike(state, expected_state)
+    torch.testing.assert_close(twists, expected, rtol=1e-4, atol=1e-5)
+
+
+@each_shape
+@torch.no_grad()
+def test_folding_the_norms_moves_answers_by_rounding_and_hardly_a_spike(config):
+    network, spikes = make_network(config), make_spikes(config, batch=2)
+    twists, state = Engine(network)(spikes, network.initial_state(2))
+    expected, expected_state = network(spikes, network.initial_state(2))
+    for membrane, other in zip(state.membranes, expected_state.membranes, strict=True):
+        assert ((membrane.v == 0) != (other.v == 0)).double().mean() < 5e-3  # one spike that flips moves others
+    torch.testing.assert_close(twists[0], expected[0], rtol=1e-4, atol=1e-5)  # later ones depend on the spikes above
+
+
+@torch.no_grad()
+def test_a_stream_may_go_over_from_the_network_to_the_engine_and_back():
+    network, spikes = make_network(SHIPPED), make_spikes(SHIPPED)
+    engine = Engine(network)
+    whole, last = engine(spikes, network.initial_state(1))
+    answers, state = [], network.initial_state(1)
+    for index, window in enumerate(spikes):
+        twists, state = (network, engine)[index % 2](window[None], state)
+        answers.append(twists)
+    torch.testing.assert_close(torch.cat(answers), whole, rtol=1e-3, atol=1e-4)
+    for one, other in zip(tensors_of(state), tensors_of(last), strict=True):
+        assert one.shape == other.shape
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-4)
+
+
+@each_shape
+def test_window_by_window_equals_the_whole_sequence(config):
+    network, spikes = make_network(config), make_spikes(config, batch=2)
+    engine = Engine(network)
+    whole, last = engine(spikes, network.initial_state(2))
+    answers, state = [], network.initial_state(2)
+    for window in spikes:
+        twists, state = engine(window[None], state)
+        answers.append(twists)
+    torch.testing.assert_close(torch.cat(answers), whole, rtol=1e-4, atol=1e-5)
+    for one, other in zip(tensors_of(state), tensors_of(last), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
+
+
+def test_the_layout_of_the_input_does_not_matter():
+    network, spikes = make_network(SMALL), make_spikes(SMALL)
+    engine = Engine(network)
+    expected, _ = engine(spikes, network.initial_state(1))
+    laid_out = spikes.movedim(2, -1).contiguous().movedim(-1, 2)
+    assert torch.equal(engine(laid_out, network.initial_state(1))[0], expected)
+
+
+def test_running_an_engine_changes_neither_the_state_it_was_given_nor_its_input():
+    network, spikes = make_network(SMALL), make_spikes(SMALL)
+    engine = Engine(network)
+    _, carried = engine(spikes[:3], network.initial_state(1))
+    before = [tensor.clone() for tensor in (*tensors_of(carried), spikes)]
+    once, again = engine(spikes[3:], carried)[0], engine(spikes[3:], carried)[0]
+    assert torch.equal(once, again)
+    assert all(torch.equal(a, b) for a, b in zip((*tensors_of(carried), spikes), before, strict=True))
+
+
+def test_an_engine_is_of_its_own_weights_and_does_not_see_the_network_change():
+    network, spikes = make_network(SMALL), make_spikes(SMALL)
+    engine = Engine(network)
+    expected, _ = engine(spikes, network.initial_state(1))
+    for tensor in network.state_dict().values():
+        tensor.zero_()
+    assert torch.equal(engine(spikes, network.initial_state(1))[0], expected)
+
+
+def test_a_membrane_that_is_not_finite_stays_in_the_state_where_a_check_finds_it():
+    network = make_network(SMALL)
+    spikes = make_spikes(SMALL)
+    spikes[0, 0, 0, 0, 0] = float("nan")
+    assert not Engine(network)(spikes, network.initial_state(1))[1].finite()
+
+
+@pytest.mark.parametrize("broken", ["missing", "raises", "wrong"])
+def test_where_the_packed_convolution_cannot_be_trusted_the_plain_one_serves_and_it_is_said_once(
+    broken, monkeypatch, caplog
+):
+    operators = torch.ops.mkldnn
+    network, spikes = make_network(SMALL), make_spikes(SMALL)
+    expected, _ = Engine(network)(spikes, network.initial_state(1))
+
+    class Broken:
+        @staticmethod
+        def default(x, weight, bias, *_):
+            if broken == "raises":
+                raise RuntimeError("no such primitive")
+            return torch.nn.functional.conv2d(x, weight.to_dense(), bias, stride=2, padding=1) + 0.1
+
+    class Operators:
+        _reorder_convolution_weight = operators._reorder_convolution_weight
+
+    if broken != "missing":
+        Operators._convolution_pointwise = Broken
+    convolution.forget_warnings()
+    monkeypatch.setattr(torch.ops, "mkldnn", Operators)
+    with caplog.at_level(logging.WARNING):
+        engine = Engine(network)
+    twists, _ = engine(spikes, network.initial_state(1))
+    torch.testing.assert_close(twists, expected, rtol=1e-3, atol=1e-4)
+    assert len(caplog.records) == 1
+    assert "packed convolutions are off" in caplog.text

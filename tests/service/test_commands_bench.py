@@ -1,0 +1,36 @@
+"""neurove bench: rows for people and for machines, and wrong words refused."""
+
+import json
+
+import pytest
+
+from service.cli import main
+
+
+def test_bench_as_json_is_a_list_of_rows_and_says_on_which_machine(capsys):
+    assert main(["bench", "ingest", "decode", "--quick", "--json"]) == 0
+    out, err = capsys.readouterr()
+    found = json.loads(out)
+    assert set(found[0]) == {"name", "ours_ms", "peer", "peer_ms", "ratio", "share_of_limit", "equal"}
+    assert all(row["equal"] for row in found)
+    assert "commit" in err
+
+
+def test_bench_for_people_is_a_sentence_per_row_and_a_chart(capsys, tmp_path):
+    assert main(["bench", "streams", "--quick", "--plot", str(tmp_path / "speed.png")]) == 0
+    out, _ = capsys.readouterr()
+    assert "times as fast as one stream" in out
+    assert {path.name for path in tmp_path.iterdir()} == {"speed.png", "speed.svg"}
+
+
+def test_peers_that_are_not_installed_are_named(capsys, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "faery", None)  # as if it were not installed
+    assert main(["bench", "decode", "--quick", "--peers"]) == 0
+    assert "faery" in capsys.readouterr().err
+
+
+def test_an_unknown_benchmark_is_refused(capsys):
+    with pytest.raises(SystemExit) as refused:
+        main(["bench", "cooking"])
+    assert refused.value.code == 2
+    assert "cooking" in capsys.readouterr().err
