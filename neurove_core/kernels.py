@@ -7,6 +7,8 @@ same in plain Python or numpy, written for reading; tests hold the two together 
 Here is the binning; the decoders of Prophesee words live in `evt.py`, and are named here too.
 """
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
