@@ -164,24 +164,33 @@ def _flattened(project: Folded, cells: list[ASLSTMParams], d_space: Tensor, read
 
 @fused
 def _add_product(x, w, out):  # type: ignore[no-untyped-def]  # compiled for its arguments
-    """Out (R, J) += x (R, I) w (I, J), four rows of w at a time, each read once for all R; rows of zeros cost nothing.
+    """Out (R, J) += x (R, I) w (I, J), four rows of w at a time, each read once for all R.
 
-    Every out[r, j] is summed in the order of I, whatever the width of the machine's vectors.
+    Rows of w that no x asks for are not read: where weights come from far memory, that is most of the time. Every
+    out[r, j] is summed in the order of I, whatever the width of the machine's vectors.
     """
     rows, inputs = x.shape
-    whole = inputs - inputs % 4
-    for i in range(0, whole, 4):
-        w0, w1, w2, w3 = w[i], w[i + 1], w[i + 2], w[i + 3]
+    active = np.empty(inputs, np.int64)
+    found = 0
+    for i in range(inputs):
+        asked = False
         for r in range(rows):
-            x0, x1, x2, x3 = x[r, i], x[r, i + 1], x[r, i + 2], x[r, i + 3]
-            if x0 == 0 and x1 == 0 and x2 == 0 and x3 == 0:
-                continue
-            y = out[r]
+            asked |= x[r, i] != 0
+        active[found] = i
+        found += asked
+    whole = found - found % 4
+    for n in range(0, whole, 4):
+        i0, i1, i2, i3 = active[n], active[n + 1], active[n + 2], active[n + 3]
+        w0, w1, w2, w3 = w[i0], w[i1], w[i2], w[i3]
+        for r in range(rows):
+            y, x0, x1, x2, x3 = out[r], x[r, i0], x[r, i1], x[r, i2], x[r, i3]
             for j in range(y.size):
                 y[j] += x0 * w0[j] + x1 * w1[j] + x2 * w2[j] + x3 * w3[j]
-    for i in range(whole, inputs):
+    for n in range(whole, found):
+        i = active[n]
+        wi = w[i]
         for r in range(rows):
-            y, xi, wi = out[r], x[r, i], w[i]
+            y, xi = out[r], x[r, i]
             for j in range(y.size):
                 y[j] += xi * wi[j]
 

@@ -93,8 +93,12 @@ def end_to_end(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: 
 
 
 def _estimated(estimator: Estimator, events: Events) -> Callable[[], NDArray[Any]]:
+    rest = estimator.initial_state(
+        SENSOR
+    )  # its network state and look-up table, as a stream has them; no window is open
+
     def run() -> NDArray[Any]:
-        return estimator.push(events, estimator.initial_state(SENSOR), DURATION_US).estimates[0].twists
+        return estimator.push(events, rest, DURATION_US).estimates[0].twists
 
     return run
 

@@ -142,3 +142,17 @@ def test_inside_plain_every_step_is_autograds_and_outside_it_is_not():
     with plain():
         assert "Stack" in recorded()
     assert "Stack" not in recorded()
+
+
+def test_half_precision_currents_of_autocast_are_scanned_as_the_float32_that_plain_steps_make_of_them():
+    currents, v = make_currents()
+    leaf = currents.bfloat16().requires_grad_()
+    spikes, state = lif_scan(leaf, LIFState(v), PARAMS)
+    expected, expected_state = lif_scan_reference(leaf, LIFState(v), PARAMS)
+    assert "Stack" not in type(spikes.grad_fn).__name__
+    assert torch.equal(spikes, expected)
+    assert torch.equal(state.v, expected_state.v)
+    spikes.sum().backward()
+    assert leaf.grad is not None
+    assert leaf.grad.dtype == torch.bfloat16
+    assert leaf.grad.any()
