@@ -10,7 +10,7 @@ import os
 import struct
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, Literal, Self
 
 import safetensors.torch
 import torch
@@ -29,6 +29,10 @@ MAX_BYTES = 256 << 20
 MAX_HEADER_BYTES = 1 << 20
 MAX_TENSORS = 4096
 
+LinearUnit = Literal["m/s", "1/s per m of height"]
+METRIC: Final[LinearUnit] = "m/s"
+PER_HEIGHT: Final[LinearUnit] = "1/s per m of height"
+
 _KEY = "neurove"
 _OFFSET, _SCALE = "output.offset", "output.scale"
 
@@ -41,6 +45,9 @@ class Header(Config):
     trained: bool
     provenance: str = Field(max_length=1000, description="One line: how this model was made.")
     config: ModelConfig
+    linear_unit: LinearUnit = Field(
+        METRIC, description="Of the linear part: m/s, or to be multiplied by the camera's height above the ground [m]."
+    )
 
 
 @dataclass(frozen=True)
@@ -52,8 +59,9 @@ class Bundle:
     provenance: str
     config: ModelConfig
     network: NeuroVE
-    offset: Tensor  # (6): twist = network output * scale + offset, in m/s and rad/s
+    offset: Tensor  # (6): twist = network output * scale + offset, in linear_unit and rad/s
     scale: Tensor  # (6)
+    linear_unit: LinearUnit = METRIC
     digest: str = ""  # sha256 of the bundle's bytes, hex
 
     @property
@@ -70,7 +78,13 @@ class Bundle:
 
     def to_bytes(self) -> bytes:
         """The bundle as the bytes of its file."""
-        header = Header(name=self.name, trained=self.trained, provenance=self.provenance, config=self.config)
+        header = Header(
+            name=self.name,
+            trained=self.trained,
+            provenance=self.provenance,
+            config=self.config,
+            linear_unit=self.linear_unit,
+        )
         tensors = {**_stored(self.network), _OFFSET: self.offset, _SCALE: self.scale}
         return safetensors.torch.save(tensors, {_KEY: header.model_dump_json()})
 
@@ -134,6 +148,7 @@ def from_bytes(data: bytes, name: str) -> Bundle:
         network=network.eval(),
         offset=offset,
         scale=scale,
+        linear_unit=header.linear_unit,
         digest=hashlib.sha256(data).hexdigest(),
     )
 

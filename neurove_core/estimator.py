@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from neurove_core import windows
-from neurove_core.bundle import Bundle
+from neurove_core.bundle import PER_HEIGHT, Bundle
 from neurove_core.encoding import to_spikes
 from neurove_core.engine import Engine
 from neurove_core.geometry import lookup_table
@@ -34,7 +34,7 @@ class WindowEstimate(NamedTuple):
 
     start_us: int
     end_us: int
-    twists: NDArray[np.float64]  # (n, 6): vx vy vz [m/s], wx wy wz [rad/s], optical frame, one row per bin
+    twists: NDArray[np.float64]  # (n, 6): vx vy vz [m/s], wx wy wz [rad/s], optical frame, one row per bin; see push
     events: int
     first: bool  # the state began in this window
     settled: bool
@@ -82,6 +82,9 @@ class Estimator:
     def push(self, events: Events, state: StreamState, horizon_us: int) -> Answer:
         """Take a packet's events and answer every window that they complete.
 
+        A model whose linear part is per metre of camera height is told in m/s by the height of the stream's camera;
+        where that is not known, as if it were 1 m.
+
         Args:
             events: ordered, on the stream's sensor.
             state: of the stream; used up by this call.
@@ -95,7 +98,7 @@ class Estimator:
             if end_us is not None and window.start_us != end_us:
                 network, age, recent = self.network.initial_state(), 0, ()
             twists, network = self._step(window.counts, network)
-            estimates.append(self._estimate(window, twists, age))
+            estimates.append(self._estimate(window, twists * self._metres(state.camera), age))
             age += 1
             recent = (*recent, window.counts)[max(0, len(recent) + 1 - self.config.settle_windows) :]
             end_us = window.start_us + self.config.window.duration_us
@@ -137,6 +140,11 @@ class Estimator:
             finite = all(np.isfinite(estimate.twists).all() for estimate in answer.estimates)
             if not (finite and state.network.finite()):  # a membrane of nan never fires: the answer would not show it
                 raise BadModel(self.bundle.name, "it computes numbers that are not finite")
+
+    def _metres(self, camera: CameraInfo | None) -> NDArray[np.float64]:
+        """What a twist (6) is multiplied by, to have its linear part in m/s."""
+        height_m = camera.height_m if camera is not None and self.bundle.linear_unit == PER_HEIGHT else None
+        return np.array([height_m or 1.0] * 3 + [1.0] * 3)
 
     @torch.inference_mode()
     def _step(self, counts: NDArray[np.uint8], state: NetworkState) -> tuple[NDArray[np.float64], NetworkState]:

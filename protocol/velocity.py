@@ -20,7 +20,7 @@ class Flag(StrEnum):
 
     UNTRAINED = "untrained"  # the model was never trained: the numbers mean nothing
     UNCALIBRATED = "uncalibrated"  # no CameraInfo: the sensor was scaled plainly onto the canonical camera
-    UNSCALED = "unscaled"  # no camera height: the linear part is up to scale
+    UNSCALED = "unscaled"  # no camera height: the linear part is up to scale, given as for 1 m
     SETTLING = "settling"  # the recurrent state is younger than the model's settling time
     RESET = "reset"  # the state began anew in this window
     SENSOR_CHANGED = "sensor_changed"  # and it did because the stream's geometry or CameraInfo changed

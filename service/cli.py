@@ -12,7 +12,14 @@ from collections.abc import Sequence
 
 from protocol.control import PeerError
 from protocol.errors import NeuroVEError
-from service import commands_asking, commands_bench, commands_experiments, commands_recordings, commands_running
+from service import (
+    commands_asking,
+    commands_bench,
+    commands_experiments,
+    commands_recordings,
+    commands_running,
+    commands_training,
+)
 from service.arguments import BAD_NEWS, WRONG_USAGE, Command
 
 
@@ -48,6 +55,7 @@ def _parser() -> argparse.ArgumentParser:
     commands_running.add(commands)
     commands_asking.add(commands)
     commands_recordings.add(commands)
+    commands_training.add(commands)
     commands_experiments.add(commands)
     commands_bench.add(commands)
     return parser

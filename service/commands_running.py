@@ -23,7 +23,7 @@ from service.arguments import (
 from service.config import ServiceConfig, load
 from service.lifecycle import stop_on_signals
 
-DEFAULT_SOURCE = "sim://"
+DEFAULT_SOURCE = "sim://street?camera=pinhole:86x65:75"  # small, so that it is simulated faster than it is played
 _DEFAULT_DEMO_S = 20.0
 _STREAM = "cam0"
 
@@ -161,7 +161,9 @@ def _add_demo(commands: Any) -> None:
     add_source(parser, nargs="?", default=DEFAULT_SOURCE)
     parser.add_argument("--duration", type=seconds, metavar="S", help="seconds of the source to play")
     parser.add_argument("--rate", type=speed, default=1.0, metavar="R", help="sensor seconds per second, or max")
-    parser.add_argument("--model", metavar="FILE", help="bundle to serve")
+    parser.add_argument(
+        "--model", metavar="FILE", help="bundle to serve, or the name of a built-in model; default `default`"
+    )
     parser.add_argument("--screenshot", metavar="FILE", help="write the last table as SVG")
 
 

@@ -82,7 +82,7 @@ class ServiceConfig(_Settings):
     )
     listen: Endpoints = Field((DEFAULT_ENDPOINT,), description="Endpoints to listen on; in client mode none.")
     connect: Endpoints = Field((), validate_default=True, description="Endpoints to connect to, such as a router's.")
-    model: str = Field("untrained", min_length=1, description="Active model at start: its name, or a bundle's file.")
+    model: str = Field("default", min_length=1, description="Active model at start: its name, or a bundle's file.")
     models_dir: Path | None = Field(None, description="Folder of the bundles that may be activated.")
     queue_s: float = Field(1.0, gt=0, le=60, description="Packets that wait longer are dropped, oldest first [s].")
     queue_mib: int = Field(64, ge=1, le=4096, description="Most bytes waiting per stream [MiB].")

@@ -1,11 +1,10 @@
 """ModelSlot: the active estimator, the one before, and the models that may take its place."""
 
-import functools
 import threading
 from pathlib import Path
 from typing import NamedTuple
 
-from neurove_core import bundle
+from neurove_core import bundle, models
 from neurove_core.bundle import Bundle
 from neurove_core.estimator import Estimator
 from protocol.control import ModelInfo
@@ -14,7 +13,6 @@ from service import logs
 
 log = logs.get(__name__)
 
-BUILT_IN = "untrained"
 _MIN_DIGEST = 8
 
 
@@ -36,7 +34,7 @@ class ModelSlot:
     """Holds the active model; replaces it whole, and only by one that was loaded, checked and warm.
 
     Args:
-        model: name of a model in the folder, `untrained`, or the path of a bundle's file.
+        model: name of a built-in model or of one in the folder, or the path of a bundle's file.
         models_dir: folder of bundles that may be activated.
 
     Raises:
@@ -47,7 +45,7 @@ class ModelSlot:
         self._models_dir = models_dir
         self._changing = threading.Lock()
         self.previous: Bundle | None = None
-        self._given = _built_in()
+        self._given = models.built_in()[0]
         path = Path(model)
         self._given = bundle.load(path) if path.suffix == bundle.SUFFIX else self._find(model)
         self._active = Serving(_warm(self._given), 0)
@@ -58,7 +56,7 @@ class ModelSlot:
         return self._active
 
     def available(self) -> Available:
-        """The built-in model, the one given at start, and every bundle of the folder, read anew."""
+        """The built-in models, the one given at start, and every bundle of the folder, read anew."""
         bundles, unreadable = self._bundles()
         return Available(tuple(found.info for found in bundles), unreadable)
 
@@ -98,7 +96,7 @@ class ModelSlot:
         raise UnknownModel(model, tuple(one.name for one in bundles))
 
     def _bundles(self) -> tuple[list[Bundle], dict[str, str]]:
-        bundles = [_built_in(), self._given]
+        bundles = [*models.built_in(), self._given]
         unreadable = {}
         for path in sorted(self._models_dir.glob(f"*{bundle.SUFFIX}")) if self._models_dir else ():
             try:
@@ -106,11 +104,6 @@ class ModelSlot:
             except BadModel as error:
                 unreadable[path.name] = error.message.partition(": ")[2]
         return list({one.digest: one for one in bundles}.values()), unreadable
-
-
-@functools.cache
-def _built_in() -> Bundle:
-    return bundle.untrained(name=BUILT_IN)
 
 
 def _warm(model: Bundle) -> Estimator:

@@ -274,10 +274,11 @@ class Stream:
         return estimate
 
     def _flags(self, window: WindowEstimate, serving: Serving) -> tuple[str, ...]:
+        camera = self._camera_of(self.sensor) if self.sensor is not None else None
         conditions = {
             Flag.UNTRAINED: not serving.estimator.bundle.trained,
-            Flag.UNCALIBRATED: not self.calibrated,
-            Flag.UNSCALED: self.camera is None or self.camera.height_m is None,
+            Flag.UNCALIBRATED: camera is None,
+            Flag.UNSCALED: camera is None or camera.height_m is None,
             Flag.RESET: window.first,
             Flag.SETTLING: not window.settled,
             Flag.LOW_ACTIVITY: window.low_activity,

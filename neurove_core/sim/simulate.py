@@ -82,6 +82,7 @@ class Simulation(EventsOnly):
     seed: int
     duration_s: float  # infinite for one without end
     following: Callable[[int], Moving] | None = None  # the trajectories that come after the first, by number from 1 on
+    motion_px: float = MOTION_PX  # training trades a little of each event's time for speed with more than the usual
 
     @property
     def name(self) -> str:
@@ -230,7 +231,7 @@ class _Film:
         row, column = self._rays.tile_row + 1, self._rays.tile_column + 1
         grid[row, column] = speeds
         around = np.max([grid[row + i, column + j] for i in (-1, 0, 1) for j in (-1, 0, 1)], axis=0)
-        needed = around * (stop_us - start_us) * 1e-6 / MOTION_PX
+        needed = around * (stop_us - start_us) * 1e-6 / self._simulation.motion_px
         steps = next((steps for steps in GRIDS if steps >= needed.max()), GRIDS[-1])
         divisors = np.array([count for count in range(1, steps + 1) if steps % count == 0])
         return divisors[np.minimum(divisors.searchsorted(needed), divisors.size - 1)], steps

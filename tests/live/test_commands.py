@@ -29,10 +29,10 @@ def test_drive_watch_health_models_and_activate_work_together(node):
         lines = [json.loads(line) for line in watched.stdout.splitlines()]
         assert len(lines) == 5
         assert all(len(line["twists"]) == 5 and len(line["twists"][0]) == 6 for line in lines)
-        assert all("untrained" in line["flags"] for line in lines)
+        assert not any("untrained" in line["flags"] for line in lines)
         people = neurove("watch", "--connect", node, "--count", "1").stdout
         assert people.startswith("cam1 ")
-        assert "model=untrained" in people
+        assert "model=default" in people
 
         (health,) = json.loads(neurove("health", "--connect", node, "--json").stdout)
         assert health["streams"][0]["stream"] == "cam1"
@@ -48,7 +48,7 @@ def test_drive_watch_health_models_and_activate_work_together(node):
         assert "active" in models
         assert "foreign.safetensors" in models
         (told,) = json.loads(neurove("models", "--connect", node, "--json").stdout)
-        assert told["previous"]["name"] == "untrained"
+        assert told["previous"]["name"] == "default"
 
         code, out, _ = driver.end(signal.SIGINT)
         assert code == 0
@@ -59,7 +59,7 @@ def test_activating_what_is_not_there_is_refused_by_the_node(node):
     refused = neurove("activate", "../foreign", "--connect", node)
     assert refused.returncode == 1
     assert refused.stderr.count("\n") == 1
-    assert "model='../foreign': not on this node; available: untrained, other" in refused.stderr
+    assert "model='../foreign': not on this node; available: default, untrained, other" in refused.stderr
     assert "not a safetensors file" in neurove("activate", "foreign", "--connect", node).stderr
 
 
@@ -99,16 +99,16 @@ def test_a_router_without_a_service_is_no_service_either():
 
 def test_the_demo_accounts_for_every_packet_event_and_window(tmp_path):
     picture = tmp_path / "demo.svg"
-    shown = neurove("demo", "--duration", "2", "--json", "--screenshot", str(picture), timeout_s=180)
+    shown = neurove("demo", "pattern://", "--duration", "2", "--json", "--screenshot", str(picture), timeout_s=180)
     assert shown.returncode == 0, shown.stderr
     told = json.loads(shown.stdout)
     assert told["packets_sent"] == 500
     assert told["packets_received"] + sum(told["lost"].values()) == told["packets_sent"]
     assert told["estimates"] == told["windows"] > 0
     assert told["sensor"] == {"width": 173, "height": 130}
-    assert (told["model"], told["trained"]) == ("untrained", False)
+    assert (told["model"], told["trained"]) == ("default", True)
     assert 0 < told["latency_ms"]["p50"] <= told["latency_ms"]["p95"] <= told["latency_ms"]["p99"]
-    assert "UNTRAINED" in picture.read_text()
+    assert "UNTRAINED" not in picture.read_text()
 
 
 def test_the_demo_plays_a_real_recording_and_tells_people_what_came_of_it():
@@ -142,14 +142,14 @@ def test_the_demo_of_nothing_is_one_line_that_lists_what_is_supported():
 def test_a_demo_whose_model_can_not_be_loaded_says_why(tmp_path):
     foreign = tmp_path / "foreign.safetensors"
     foreign.write_text("hello, I am no model at all")
-    shown = neurove("demo", "--model", str(foreign), "--duration", "1", timeout_s=180)
+    shown = neurove("demo", "pattern://", "--model", str(foreign), "--duration", "1", timeout_s=180)
     assert shown.returncode == 1
     assert "not a safetensors file" in shown.stderr
     assert "Traceback" not in shown.stderr
 
 
 def test_ctrl_c_ends_the_demo_and_all_its_processes_in_order():
-    demo = Process("demo", "--duration", "60", "--json")
+    demo = Process("demo", "pattern://", "--duration", "60", "--json")
     wait_until(lambda: len(children(demo.child.pid)) == 2, timeout_s=90)  # the service and the driver
     started = children(demo.child.pid)
     code, out, errors = demo.end(signal.SIGINT)
@@ -171,7 +171,7 @@ def children(pid):
 
 
 def test_killing_the_demo_leaves_no_process_behind():
-    demo = Process("demo", "--duration", "60", "--json")
+    demo = Process("demo", "pattern://", "--duration", "60", "--json")
     wait_until(lambda: len(children(demo.child.pid)) == 2, timeout_s=90)
     started = children(demo.child.pid)
     demo.end(signal.SIGKILL)
@@ -189,7 +189,7 @@ def test_a_service_that_waits_for_a_router_ends_in_order_when_told():
 
 @pytest.mark.parametrize(("victim", "telling"), [("serve", "the service ended"), ("drive", "the driver ended")])
 def test_a_demo_that_loses_one_of_its_processes_says_which(victim, telling):
-    demo = Process("demo", "--duration", "60", "--json")
+    demo = Process("demo", "pattern://", "--duration", "60", "--json")
     wait_until(lambda: len(children(demo.child.pid)) == 2, timeout_s=90)
     for pid in children(demo.child.pid):
         if victim in Path(f"/proc/{pid}/cmdline").read_text():

@@ -9,7 +9,7 @@ def test_each_layer_wins_over_the_one_before_and_says_so(tmp_path, monkeypatch):
     monkeypatch.setenv("NEUROVE_QUEUE_S", "4.0")
     monkeypatch.setenv("NEUROVE_MAX_STREAMS", "5")
     config, origin = load(ServiceConfig, {"max_streams": "7", "model": None}, file)
-    assert (config.node, config.queue_s, config.max_streams, config.model) == ("of-file", 4.0, 7, "untrained")
+    assert (config.node, config.queue_s, config.max_streams, config.model) == ("of-file", 4.0, 7, "default")
     assert origin["node"] == f"file {file}"
     assert (origin["queue_s"], origin["max_streams"], origin["model"]) == ("environment", "flag", "default")
 

@@ -90,7 +90,7 @@ def test_models_tell_active_previous_and_available(handlers):
     assert (changed.active.name, changed.previous.name, changed.epoch) == ("two", "one", 1)
     then = ModelsReply.decode(handlers.models(ModelsRequest().encode()))
     assert (then.active.name, then.previous.name) == ("two", "one")
-    assert {info.name for info in then.available} == {"untrained", "one", "two"}
+    assert {info.name for info in then.available} == {"default", "untrained", "one", "two"}
 
 
 def test_a_request_that_is_not_one_is_refused(handlers):

@@ -17,7 +17,7 @@ def test_a_model_is_found_by_name_and_by_digest(slot):
 
 def test_an_unknown_model_changes_nothing_and_says_what_there_is(slot):
     before = slot.active
-    with pytest.raises(UnknownModel, match="model='three'.*available: untrained, one, two"):
+    with pytest.raises(UnknownModel, match="model='three'.*available: default, untrained, one, two"):
         slot.activate("three")
     assert slot.active is before
 

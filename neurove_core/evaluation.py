@@ -1,0 +1,148 @@
+"""A model on a recording with truth, exactly as the service would answer it: the driver's packets through Estimator."""
+
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurove_core.estimator import Estimator, WindowEstimate
+from neurove_core.geometry import Twists
+from neurove_core.io.packets import slices
+from neurove_core.io.recording import Recording
+from neurove_core.metrics import ANGULAR_FLOOR_RAD_S, LINEAR_FLOOR_M_S, SKIP_S, figures
+from neurove_core.network import NetworkState
+from protocol.errors import NeuroVEError
+
+_SAMPLES = 4  # of the truth in each bin, whose mean is the bin's
+_STREAM = "evaluate"
+
+
+class NoTruth(NeuroVEError):
+    """What was to be judged lacks the truth to judge it by."""
+
+    code = "no_truth"
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What a model said of one recording."""
+
+    name: str
+    start_us: NDArray[np.int64]  # (W,) of the windows
+    bin_us: int
+    twists: NDArray[np.float64]  # (W, n, 6) [m/s, rad/s]
+    events: NDArray[np.int64]  # (W,)
+    latency_ms: NDArray[np.float64]  # (W,) of the push that completed each
+    firing_rate: dict[str, float]  # share of neurons that fire per step, by layer; and of all of them
+    scaled: bool  # the linear part is in m/s; else as if the camera were 1 m above the ground
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Answers beside the truth, windows of a known truth after the settling time alone."""
+
+    answers: Answers
+    end_us: NDArray[np.int64]  # (N,) of the bins
+    truth: NDArray[np.float64]  # (N, 6)
+    answer: NDArray[np.float64]  # (N, 6)
+
+
+def answer(estimator: Estimator, recording: Recording) -> Answers:
+    """Run a model over a recording, packet by packet as a driver sends it.
+
+    Raises:
+        BrokenRecording: it can not be read to its end.
+    """
+    camera = recording.camera(_STREAM)
+    state = estimator.initial_state(recording.sensor, camera)
+    found: list[WindowEstimate] = []
+    latencies_ms: list[float] = []
+    fired = _Fired(estimator)
+    for piece in slices(recording.chunks()):
+        began = time.perf_counter()
+        pushed = estimator.push(piece.events, state, piece.t0_us)
+        took_ms = (time.perf_counter() - began) * 1e3
+        state = pushed.state
+        found += pushed.estimates
+        latencies_ms += [took_ms / max(1, len(pushed.estimates))] * len(pushed.estimates)
+        if pushed.estimates and state.age:
+            fired.add(state.network)
+    bins = estimator.config.window.bins
+    return Answers(
+        name=recording.name,
+        start_us=np.array([one.start_us for one in found], np.int64),
+        bin_us=estimator.config.window.bin_us,
+        twists=np.stack([one.twists for one in found]) if found else np.zeros((0, bins, 6)),
+        events=np.array([one.events for one in found], np.int64),
+        latency_ms=np.array(latencies_ms),
+        firing_rate=fired.rates(),
+        scaled=camera is not None and camera.height_m is not None,
+    )
+
+
+class _Fired:
+    """How often neurons fire, as their state tells it: a membrane that has just fired is exactly 0."""
+
+    def __init__(self, estimator: Estimator) -> None:
+        net = estimator.config.network
+        self._layers = [f"block {i + 1}" for i in range(len(net.channels))]
+        self._layers += [f"cell {i + 1}" for i in range(net.cells)]
+        self._spikes, self._neurons, self._steps = np.zeros(len(self._layers)), np.zeros(len(self._layers)), 0
+
+    def add(self, state: NetworkState) -> None:
+        layers = [one.v == 0 for one in state.membranes] + [one.s > 0 for one in state.cells]
+        self._spikes += [float(fired.sum()) for fired in layers]
+        self._neurons = np.array([float(fired.numel()) for fired in layers])
+        self._steps += 1
+
+    def rates(self) -> dict[str, float]:
+        if not self._steps:
+            return {}
+        rates = dict(zip(self._layers, (self._spikes / self._neurons / self._steps).tolist(), strict=True))
+        return rates | {"all": float(self._spikes.sum() / self._neurons.sum() / self._steps)}
+
+
+def judge(answers: Answers, truth: Twists) -> Judged:
+    """The answers that a truth is known for, each bin beside the mean truth over it.
+
+    The first SKIP_S of the recording are left out, and windows that the truth does not cover from end to end.
+
+    Raises:
+        NoTruth: no window is left.
+    """
+    windows, bins = answers.twists.shape[:2]
+    offsets = (np.arange(bins * _SAMPLES) + 0.5) * (answers.bin_us / _SAMPLES)
+    t_us = (answers.start_us[:, None] + offsets).astype(np.int64)
+    true = truth.at(t_us.ravel()).reshape(windows, bins, _SAMPLES, 6).mean(axis=2)
+    settled = answers.start_us >= (answers.start_us[0] if windows else 0) + SKIP_S * 1e6
+    kept = settled & np.isfinite(true).all(axis=(1, 2))
+    if not kept.any():
+        why = f"of its {windows} windows none lies after the first {SKIP_S:g} s and within the truth"
+        raise NoTruth(f"{answers.name}: {why}", windows=windows)
+    ends = (answers.start_us[:, None] + answers.bin_us * (np.arange(bins) + 1))[kept].ravel()
+    return Judged(answers, ends, true[kept].reshape(-1, 6), answers.twists[kept].reshape(-1, 6))
+
+
+def report(judged: list[Judged]) -> dict[str, Any]:
+    """All figures over some recordings together and over each, beside those of two predictors that see nothing.
+
+    `zero` says 0 always; `mean` says the mean of this very truth, so no constant is better.
+    """
+    bins = judged[0].answers.twists.shape[1]
+    truth, said = (np.concatenate(parts) for parts in zip(*((one.truth, one.answer) for one in judged), strict=True))
+    latency_ms = np.concatenate([one.answers.latency_ms for one in judged])
+    rates = [one.answers.firing_rate for one in judged]
+    every = {layer: float(np.mean([rate[layer] for rate in rates])) for layer in rates[0]}
+    return figures(truth, said, bins) | {
+        "firing_rate": every.pop("all"),
+        "firing_rate_by_layer": every,
+        "latency_ms": {f"p{q}": float(np.percentile(latency_ms, q)) for q in (50, 99)},
+        "re_floors": {"v_l_m_s": LINEAR_FLOOR_M_S, "v_a_rad_s": ANGULAR_FLOOR_RAD_S},
+        "skipped_s": SKIP_S,
+        "scaled": all(one.answers.scaled for one in judged),
+        "zero": figures(truth, np.zeros_like(truth), bins),
+        "mean": figures(truth, np.broadcast_to(truth.mean(0), truth.shape), bins),
+        "recordings": [{"name": one.answers.name} | figures(one.truth, one.answer, bins) for one in judged],
+    }

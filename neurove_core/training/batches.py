@@ -1,0 +1,96 @@
+"""Segments of sequences side by side, as the loop learns from them: drawn at random, mirrored, flipped, disturbed."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from neurove_core.training.config import RecipeConfig
+from neurove_core.training.data import Sequences
+
+_MIRRORED = np.array([-1, 1, 1, 1, -1, -1], np.float32)
+"""What a mirror across x makes of a twist; see `mirrored`."""
+
+
+class Segment(NamedTuple):
+    """S consecutive windows of B streams, each from a state at rest."""
+
+    counts: Tensor  # (S, B, 2n, H, W) uint8
+    twists: Tensor  # (S, B, n, 6): vx vy vz per metre of camera height [1/s], wx wy wz [rad/s]
+    height_m: Tensor  # (B)
+
+
+def draw(rng: np.random.Generator, sequences: Sequences, recipe: RecipeConfig) -> Segment:
+    """A segment for each stream of a batch, from any sequence and any place in it."""
+    counts, twists, heights = [], [], []
+    for _ in range(recipe.batch):
+        index = int(rng.integers(len(sequences)))
+        start = int(rng.integers(len(sequences.twists[index]) - recipe.segment_windows + 1))
+        stop = start + recipe.segment_windows
+        seen, truth = augment(rng, sequences.counts(index, start, stop), sequences.twists[index][start:stop], recipe)
+        counts.append(seen)
+        twists.append(truth)
+        heights.append(sequences.height_m[index])
+    return Segment(
+        torch.from_numpy(np.stack(counts, 1)),
+        torch.from_numpy(np.stack(twists, 1)),
+        torch.tensor(heights, dtype=torch.float32),
+    )
+
+
+def augment(
+    rng: np.random.Generator, counts: NDArray[np.uint8], twists: NDArray[np.float32], recipe: RecipeConfig
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """One stream's segment as another camera could have seen it.
+
+    Args:
+        rng: of the run.
+        counts: (S, 2n, H, W).
+        twists: (S, n, 6).
+        recipe: how often each change is made.
+    """
+    chance = rng.uniform(size=4)
+    gain, noise = math.exp(rng.uniform(*np.log(recipe.gain))), rng.uniform(0, recipe.noise_max)
+    if chance[0] < recipe.mirror:
+        counts, twists = mirrored(counts, twists)
+    if chance[1] < recipe.polarity_flip:
+        counts = polarity_flipped(counts)
+    if chance[2] < recipe.regained:
+        counts = regained(rng, counts, gain)
+    if chance[3] < recipe.noisy:
+        counts = noisy(rng, counts, noise)
+    return counts, twists
+
+
+def mirrored(counts: NDArray[np.uint8], twists: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """What a camera in a mirrored world would see: x runs the other way; vx, wy and wz change their sign.
+
+    The angular velocity is an axial vector: in a mirror across x its x component stays and the others turn around.
+    """
+    return counts[..., ::-1], twists * _MIRRORED
+
+
+def polarity_flipped(counts: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """ON as OFF: a world whose dark is bright, moving as before."""
+    bins = counts.shape[1] // 2
+    return counts[:, np.arange(2 * bins) ^ 1]
+
+
+def regained(rng: np.random.Generator, counts: NDArray[np.uint8], gain: float) -> NDArray[np.uint8]:
+    """Each count times a gain, rounded at random so that the mean is exact; saturating as a window does."""
+    scaled = counts.copy(order="C").reshape(-1)
+    seen = np.flatnonzero(scaled)
+    scaled[seen] = np.minimum(scaled[seen] * gain + rng.uniform(size=seen.size), 255).astype(np.uint8)
+    return scaled.reshape(counts.shape)
+
+
+def noisy(rng: np.random.Generator, counts: NDArray[np.uint8], mean: float) -> NDArray[np.uint8]:
+    """Random events added, `mean` of them per cell and bin."""
+    added = counts.copy(order="C").reshape(-1)
+    where = rng.integers(added.size, size=rng.poisson(mean * added.size))
+    where = where[added[where] < 200]  # so that no count wraps around
+    np.add.at(added, where, np.uint8(1))
+    return added.reshape(counts.shape)

@@ -1,0 +1,136 @@
+"""What makes a training run: the model, the sequences that it learns from, and the recipe."""
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Final, Self
+
+from pydantic import Field, ValidationError, model_validator
+
+from neurove_core.config import Config, ModelConfig
+from protocol.errors import InvalidField, shown
+
+CONFIGS: Final = Path(__file__).parent / "configs"
+"""The configurations that come with the package, by name."""
+
+Span = tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]]
+"""Least and greatest value that is drawn."""
+
+Shares = dict[str, Annotated[float, Field(ge=0)]]
+
+
+class DataConfig(Config):
+    """What is simulated: each sequence draws its own scene, way, camera, mount and pixels (domain randomisation)."""
+
+    sequences: int = Field(128, ge=1, le=100_000, description="How many.")
+    seconds: float = Field(6.0, gt=0, le=600, description="Length of each.")
+    seed: int = Field(1_000_000, ge=0, lt=900_000_000, description="Sequence i has the scene and the way of seed + i.")
+    motion_px: float = Field(1.5, ge=0.1, le=4, description="Most motion of a pixel between two of its renders.")
+    scenes: Shares = Field({"street": 0.74, "corridor": 0.1, "room": 0.16}, description="Share of each scene.")
+    cameras: Shares = Field(
+        {
+            "davis346-half": 0.35,
+            "davis240c": 0.03,
+            "pinhole:172x130": 0.05,
+            "pinhole:128x96": 0.35,
+            "pinhole:86x65": 0.22,
+        },
+        description="Share of each camera; small ones are quickly simulated.",
+    )
+    hfov_deg: Span = Field((55.0, 95.0), description="Field of view of a pinhole that is named without one.")
+    height_m: Span = Field((0.3, 2.5), description="Of the camera above the ground, log-uniform.")
+    pitch_deg: Span = Field((0.0, 12.0), description="How far the camera looks down, uniform.")
+    slowed_drive: Span = Field((1.0, 2.0), description="Log-uniform: how many times slower than a car.")
+    slowed_hand: Span = Field((3.0, 8.0), description="Log-uniform: in a room, how many times slower than a wild hand.")
+    threshold: Span = Field((0.15, 0.4), description="Of ON events, log-uniform; OFF lies within 15 % of it.")
+    threshold_sigma: Span = Field((0.02, 0.05), description="Spread of the thresholds between pixels, uniform.")
+    refractory_us: Span = Field((100.0, 1000.0), description="Uniform.")
+    leak_hz: Span = Field((0.0, 0.2), description="Uniform.")
+    shot_noise_hz: Span = Field((0.001, 2.0), description="Log-uniform.")
+    cutoff_hz: Span = Field((100.0, 1000.0), description="Log-uniform: how fast pixels are, which light decides.")
+    eps: Span = Field((0.001, 0.02), description="Log-uniform: how much of the log intensity the dark hides.")
+
+    @model_validator(mode="after")
+    def _spans_and_shares(self) -> Self:
+        for name in type(self).model_fields:
+            value = getattr(self, name)
+            if isinstance(value, tuple) and value[0] > value[1]:
+                raise ValueError(f"{name}={value}: the least value comes first")
+            if isinstance(value, dict) and not sum(value.values()) > 0:
+                raise ValueError(f"{name}={value}: some share must be above 0")
+        return self
+
+
+class RecipeConfig(Config):
+    """How the network learns; the defaults are recipe L of research/velocity.md."""
+
+    steps: int = Field(4000, ge=1, description="Updates of the weights.")
+    seed: int = Field(0, ge=0, description="Of the weights, and of what is drawn on the way.")
+    batch: int = Field(16, ge=1, le=4096, description="B: streams side by side.")
+    segment_windows: int = Field(32, ge=1, description="A stream is followed so long from a state at rest.")
+    chunk_windows: int = Field(8, ge=1, description="T: an update and the reach of its gradient, in windows.")
+    learning_rate: float = Field(1e-3, gt=0, le=1, description="At its peak; it then falls as a cosine to 0.")
+    warm_up_steps: int = Field(100, ge=0, description="Updates until the peak.")
+    clip_norm: float = Field(5.0, gt=0, description="Greatest norm of the gradient.")
+    norm_momentum: float = Field(0.02, gt=0, le=1, description="How fast tdBN's statistics follow the batches.")
+    balance_decay: float = Field(0.99, ge=0, lt=1, description="Of the means that balance L_l and L_a.")
+    mirror: float = Field(0.5, ge=0, le=1, description="Share of segments that are seen in a mirror.")
+    polarity_flip: float = Field(0.5, ge=0, le=1, description="Share of segments whose ON is OFF.")
+    noisy: float = Field(0.25, ge=0, le=1, description="Share of segments with random events added.")
+    noise_max: float = Field(0.1, ge=0, le=10, description="Most of these, per cell and bin.")
+    regained: float = Field(0.25, ge=0, le=1, description="Share of segments whose counts are scaled.")
+    gain: Span = Field(
+        (0.5, 4.0), description="By how much, log-uniform: pixels per cell are as many as the sensor has."
+    )
+    checkpoint_s: float = Field(120.0, ge=0, description="A checkpoint is written so often [s], and at the end.")
+
+    @model_validator(mode="after")
+    def _whole_chunks(self) -> Self:
+        if self.segment_windows % self.chunk_windows:
+            raise ValueError(
+                f"segment_windows={self.segment_windows} does not split into chunks of {self.chunk_windows}"
+            )
+        return self
+
+    @property
+    def chunks(self) -> int:
+        """Updates per segment."""
+        return self.segment_windows // self.chunk_windows
+
+
+class TrainingConfig(Config):
+    """A training run; the same configuration gives the same model on one machine and torch version."""
+
+    name: str = Field("model", min_length=1, max_length=64, pattern="^[A-Za-z0-9_][A-Za-z0-9_.-]*$")
+    model: ModelConfig = ModelConfig()
+    data: DataConfig = DataConfig()
+    recipe: RecipeConfig = RecipeConfig()
+
+    @model_validator(mode="after")
+    def _segments_fit(self) -> Self:
+        windows = int(self.data.seconds * 1e6) // self.model.window.duration_us
+        if windows < self.recipe.segment_windows:
+            raise ValueError(f"a sequence has {windows} windows, a segment takes {self.recipe.segment_windows}")
+        return self
+
+
+def load(source: str) -> TrainingConfig:
+    """The configuration of a TOML file, or of one that comes with the package, such as `default`.
+
+    Raises:
+        InvalidField: there is no such file, it is no TOML, or a value in it is wrong; the sentence says which.
+    """
+    path = Path(source)
+    if not path.suffix and (CONFIGS / f"{source}.toml").is_file():
+        path = CONFIGS / f"{source}.toml"
+    try:
+        return TrainingConfig.model_validate(tomllib.loads(path.read_text()))
+    except OSError as error:
+        known = ", ".join(sorted(found.stem for found in CONFIGS.glob("*.toml")))
+        why = f"{error.strerror or error}; a TOML file is expected, or one of: {known}"
+        raise InvalidField("training", "config", source, why) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InvalidField("training", "config", source, f"not TOML: {error}") from None
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"])[:80] or "config"
+        raise InvalidField("training", where, shown(first["input"]), first["msg"]) from None

@@ -1,0 +1,142 @@
+"""The commands that make models and judge them: train, evaluate."""
+
+import argparse
+import contextlib
+import json
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from service.arguments import command, sensor_size
+
+
+def train(args: argparse.Namespace) -> int:
+    """Train a model on simulated sequences, from a configuration and its seed."""
+    import torch
+
+    from neurove_core.training import config as configs
+    from neurove_core.training import data, loop
+
+    torch.set_num_threads(args.threads)
+    config = configs.load(args.config)
+    out: Path = args.out or Path("runs") / config.name
+    folder: Path = args.data or out / "data"
+    with _progress() as show:
+        cache = data.Cache(folder, config)
+        wanted = config.data.sequences
+        for done, name in enumerate(cache.fill(args.workers), wanted - len(cache.missing()) + 1):
+            show("simulated", done, wanted, name)
+
+        def learned(at: loop.Progress) -> None:
+            errors = f"{at.linear_m_s:.3f} m/s {at.angular_rad_s:.4f} rad/s"
+            show("learned", at.step, at.steps, errors)
+
+        path = loop.train(config, out, folder, resume=args.resume, on_progress=learned)
+    told = {"bundle": str(path), "bytes": path.stat().st_size, "run": str(out / loop.RUN_JSON)}
+    print(json.dumps(told) if args.json else f"wrote {path}, {told['bytes']:,} bytes")
+    return 0
+
+
+def evaluate(args: argparse.Namespace) -> int:
+    """How far a model's estimates lie from the truth: RMSE and RE as in the paper, per axis and per group."""
+    import torch
+
+    from neurove_core import evaluation, geometry, models
+    from neurove_core.estimator import Estimator
+    from neurove_core.io import open_source, read_poses
+
+    torch.set_num_threads(1)
+    estimator = Estimator(models.find(args.model))
+    estimator.warm_up()
+    given = geometry.twists(read_poses(args.truth)) if args.truth else None
+    judged = []
+    for source in args.recordings:
+        recording = open_source(source, args.sensor, args.topic)
+        truth = given or (None if recording.endless else recording.twists())
+        if truth is None:
+            why = "it never ends: say how many seconds" if recording.endless else "it holds no truth: give --truth FILE"
+            raise evaluation.NoTruth(f"{source}: {why}", source=source)
+        judged.append(evaluation.judge(evaluation.answer(estimator, recording), truth))
+    told = {"model": estimator.bundle.info.model_dump(), **evaluation.report(judged)}
+    print(json.dumps(told) if args.json else "\n".join(_table(told)))
+    if args.plot:
+        from neurove_core.evaluation_plots import plot
+
+        for one in judged:
+            for file in plot(one, args.plot):
+                print(f"wrote {file}", file=sys.stderr)
+    return 0
+
+
+def _table(told: dict[str, Any]) -> Iterator[str]:
+    """The report for people."""
+    yield f"{told['model']['name']} ({told['model']['digest'][:12]}), {told['windows']} windows"
+    yield f"{'':24} {'v_l RE':>7} {'RMSE m/s':>9} {'v_a RE':>7} {'RMSE deg/s':>10}  R2 v_l, v_a"
+    rows = [(told["model"]["name"], told), ("zero velocity", told["zero"]), ("mean of the truth", told["mean"])]
+    each = [(one["name"], one) for one in told["recordings"]] if len(told["recordings"]) > 1 else []
+    for name, row in [*rows, *each]:
+        errors = f"{_number(row['re_v_l'], 7)} {row['rmse_v_l_m_s']:9.3f} {_number(row['re_v_a'], 7)}"
+        explained = f"{_number(row['r2_v_l'], 6)} {_number(row['r2_v_a'], 6)}"
+        yield f"{name[:24]:24} {errors} {row['rmse_v_a_deg_s']:10.2f}  {explained}"
+    floors, without = told["re_floors"], (told["re_v_l_unfloored"], told["re_v_a_unfloored"])
+    yield f"RE counts truths above {floors['v_l_m_s']} m/s and {floors['v_a_rad_s']} rad/s"
+    yield f"without these floors it is {_number(without[0], 0)} and {_number(without[1], 0)}"
+    yield ""
+    yield f"{'axis':6} {'RMSE':>8} {'median':>8} {'bias':>8} {'spread':>8} {'correlation':>11}"
+    for axis, row in told["per_axis"].items():
+        unit = "deg_s" if axis[0] == "w" else "m_s"
+        numbers = [_number(row[f"{name}_{unit}"], 8) for name in ("rmse", "median_error", "bias", "spread")]
+        yield f"{axis:6} {' '.join(numbers)} {_number(row['correlation'], 11)}  {unit.replace('_s', '/s')}"
+    latency = told["latency_ms"]
+    yield f"firing rate {told['firing_rate']:.3f}; a window takes {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"
+    if not told["scaled"]:
+        yield "linear part: for a camera 1 m above the ground, because the recording does not say how high it is"
+
+
+def _number(value: float | None, width: int) -> str:
+    return f"{'-' if value is None else format(value, '.3f'):>{width}}"
+
+
+@contextlib.contextmanager
+def _progress() -> Iterator[Callable[[str, int, int, str], None]]:
+    """Shows how far each task is: bars on a terminal, else a line now and then."""
+    if not sys.stderr.isatty():
+        yield _say
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn(), TextColumn("{task.fields[about]}"))
+    with Progress(*columns, console=Console(stderr=True)) as bars:
+        tasks: dict[str, Any] = {}
+
+        def show(what: str, done: int, of: int, about: str) -> None:
+            if what not in tasks:
+                tasks[what] = bars.add_task(what, total=of, about="")
+            bars.update(tasks[what], completed=done, about=about)
+
+        yield show
+
+
+def _say(what: str, done: int, of: int, about: str) -> None:
+    if what != "learned" or done % 100 < 4 or done == of:
+        print(f"{what} {done}/{of}: {about}", file=sys.stderr, flush=True)
+
+
+def add(commands: Any) -> None:
+    """Add these commands to the parser."""
+    parser = command(commands, "train", train)
+    parser.add_argument("config", metavar="CONFIG", help="a TOML file, or `default`: that of the built-in model")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="checkpoint, run.json and bundle; default runs/NAME")
+    parser.add_argument("--data", type=Path, metavar="DIR", help="simulated sequences are kept there; default OUT/data")
+    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in OUT, if there is one")
+    parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes that simulate; default 1")
+    parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads that learn; default 1")
+    parser = command(commands, "evaluate", evaluate)
+    parser.add_argument("model", metavar="BUNDLE", help="a bundle's file, `default` or `untrained`")
+    parser.add_argument("recordings", nargs="+", metavar="RECORDING", help="with truth, such as sim://street?seconds=8")
+    parser.add_argument("--truth", type=Path, metavar="FILE", help="poses of the camera, on the recording's clock")
+    parser.add_argument("--sensor", type=sensor_size, metavar="WxH", help="sensor size, where the recording lacks it")
+    parser.add_argument("--topic", metavar="T", help="which of several event streams, where the recording has names")
+    parser.add_argument("--plot", type=Path, metavar="DIR", help="write truth and estimate over time there")

@@ -1,0 +1,104 @@
+"""A model is judged by what the service would publish, beside the truth of each bin."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from neurove_core import bundle
+from neurove_core.bundle import PER_HEIGHT
+from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
+from neurove_core.estimator import Estimator
+from neurove_core.evaluation import NoTruth, answer, judge, report
+from neurove_core.geometry import Twists
+from neurove_core.io import open_source
+from neurove_core.io.packets import slices
+from protocol import EventPacket
+from service.model_slot import ModelSlot
+from service.stream import Arrival, Stream
+
+SMALL = ModelConfig(
+    canonical=CanonicalConfig(width=24, height=18), network=NetworkConfig(channels=(4, 4), features=8, hidden=8)
+)
+SOURCE = "sim://street?seed=4&seconds=1.2&camera=pinhole:24x18:75&height=2"
+
+
+@pytest.fixture(scope="module")
+def recording():
+    return open_source(SOURCE)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return bundle.untrained(3, SMALL, "small")
+
+
+def test_the_answers_are_those_that_the_running_service_publishes(recording, model, tmp_path):
+    path = tmp_path / "small.safetensors"
+    bundle.save(model, path)
+    stream = Stream("cam0", ModelSlot(str(path)))
+    stream.see_through(recording.camera("cam0"))
+    published = []
+    for seq, piece in enumerate(slices(recording.chunks())):
+        packet = EventPacket("cam0", seq, recording.sensor, piece.t0_us, piece.events)
+        published += stream.accept(packet, Arrival(0, 0))
+    said = answer(Estimator(model), recording)
+    assert said.start_us.tolist() == [one.start_us for one in published]
+    assert said.events.tolist() == [one.events for one in published]
+    np.testing.assert_array_equal(said.twists, np.array([one.twists for one in published]))
+    assert 0 < said.firing_rate["all"] < 1
+    assert set(said.firing_rate) == {"block 1", "block 2", "cell 1", "cell 2", "all"}
+
+
+def test_each_bin_stands_beside_the_truth_of_its_own_time(recording, model):
+    judged = judge(answer(Estimator(model), recording), recording.twists())
+    assert judged.end_us[0] == 510_000  # the first half second is skipped
+    middle = recording.trajectory.twist((judged.end_us - 5_000) / 1e6)
+    np.testing.assert_allclose(judged.truth, middle, atol=2e-3)
+
+
+def test_windows_without_truth_are_left_out_and_none_at_all_is_said(recording, model):
+    said, whole = answer(Estimator(model), recording), recording.twists()
+    part = Twists(whole.t[:901], whole.twist[:901])
+    assert judge(said, part).end_us[-1] == 900_000
+    with pytest.raises(NoTruth, match="none lies after the first 0.5 s and within the truth"):
+        judge(said, Twists(whole.t[:300], whole.twist[:300]))
+
+
+def test_a_model_per_metre_of_height_is_told_by_the_cameras_height(recording, model):
+    per_height = answer(Estimator(replace(model, linear_unit=PER_HEIGHT)), recording)
+    plain = answer(Estimator(model), recording)
+    np.testing.assert_allclose(per_height.twists, plain.twists * [2, 2, 2, 1, 1, 1])
+    assert per_height.scaled
+
+
+def test_without_a_height_it_is_told_as_for_one_metre(recording, model):
+    estimator = Estimator(replace(model, linear_unit=PER_HEIGHT))
+    camera = recording.camera("cam0").model_copy(update={"height_m": None})
+    events = next(recording.since(0))
+    pushed = [
+        made.push(events, made.initial_state(recording.sensor, camera), 100_000).estimates
+        for made in (estimator, Estimator(model))
+    ]
+    assert pushed[0]
+    for a, b in zip(*pushed, strict=True):
+        np.testing.assert_array_equal(a.twists, b.twists)
+
+
+def test_a_bundle_keeps_its_linear_unit_and_an_old_one_is_in_metres_per_second(model, tmp_path):
+    path = tmp_path / "a.safetensors"
+    bundle.save(replace(model, linear_unit=PER_HEIGHT), path)
+    assert bundle.load(path).linear_unit == PER_HEIGHT
+    old = model.to_bytes().replace(b',\\"linear_unit\\":\\"m/s\\"', b"")
+    padded = int.from_bytes(old[:8], "little") - (len(model.to_bytes()) - len(old))
+    assert bundle.from_bytes(padded.to_bytes(8, "little") + old[8:], "old").linear_unit == "m/s"
+
+
+def test_the_report_has_rows_for_predictors_that_see_nothing(recording, model):
+    judged = judge(answer(Estimator(model), recording), recording.twists())
+    told = report([judged, judged])
+    assert told["zero"]["re_v_l"] == pytest.approx(1)
+    assert told["mean"]["r2_v_l"] == pytest.approx(0, abs=1e-9)
+    assert told["windows"] == 2 * told["recordings"][0]["windows"]
+    for key in ("rmse_v_l_m_s", "rmse_v_a_deg_s", "re_v_l", "re_v_a", "per_axis", "windows", "firing_rate"):
+        assert key in told

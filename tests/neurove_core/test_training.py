@@ -1,0 +1,216 @@
+"""Training: sequences as the service sees them, augmentations that keep the truth true, runs that go on exactly."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from neurove_core import bundle
+from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
+from neurove_core.estimator import Estimator
+from neurove_core.geometry import lookup_table
+from neurove_core.io.errors import BrokenRecording
+from neurove_core.training import config as configs
+from neurove_core.training import data
+from neurove_core.training.batches import draw, mirrored, noisy, polarity_flipped, regained
+from neurove_core.training.config import DataConfig, RecipeConfig, TrainingConfig
+from neurove_core.training.loop import CHECKPOINT, RUN_JSON, learn, learning_rate, train
+from neurove_core.training.run import Run
+from protocol.errors import BadModel, InvalidField
+
+MODEL = ModelConfig(
+    canonical=CanonicalConfig(width=22, height=16, hfov_deg=80),
+    network=NetworkConfig(channels=(4, 8), features=16, hidden=16),
+)
+TINY = TrainingConfig(
+    name="tiny",
+    model=MODEL,
+    data=DataConfig(sequences=3, seconds=0.5, cameras={"pinhole:24x18": 1.0}),
+    recipe=RecipeConfig(steps=12, batch=4, segment_windows=4, chunk_windows=2, warm_up_steps=2, checkpoint_s=0),
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sequences")
+    assert len(list(data.Cache(folder, TINY).fill())) == 3
+    return folder
+
+
+@pytest.fixture(scope="module")
+def sequences(folder):
+    return data.Cache(folder, TINY).open()
+
+
+def longer(steps):
+    return TINY.model_copy(update={"recipe": TINY.recipe.model_copy(update={"steps": steps})})
+
+
+def test_a_sequence_has_the_counts_that_the_service_sees_and_the_truth_of_each_bin():
+    simulation = data.drawn(TINY.data, 0)
+    sequence = data.sequence_of(simulation, MODEL)
+    assert sequence.counts.shape == (10, 10, 16, 22)
+    assert sequence.twists.shape == (10, 5, 6)
+    estimator = Estimator(bundle.untrained(config=MODEL))
+    lut = lookup_table(MODEL.canonical, simulation.sensor, simulation.lens.info)
+    state = estimator.initial_state(simulation.sensor, simulation.lens.info)
+    assert (state.lut == lut).all()
+    for chunk in simulation.chunks():
+        state = estimator.push(chunk, state, 0).state
+    state = estimator.push(chunk.span(0, 0), state, 500_000).state
+    np.testing.assert_array_equal(np.stack(state.recent), sequence.counts[-len(state.recent) :])
+    middle_s = np.array([3 * 0.05 + 2.5 * 0.01])
+    twist = simulation.trajectory.twist(middle_s)[0]
+    twist[:3] /= simulation.lens.height_m
+    np.testing.assert_allclose(sequence.twists[3, 2], twist, rtol=1e-3, atol=1e-4)
+
+
+def test_sequences_are_drawn_by_seed_and_number_alone():
+    first, again, other = (data.drawn(TINY.data, index) for index in (1, 1, 2))
+    assert (first.name, first.pixels, first.lens) == (again.name, again.pixels, again.lens)
+    assert first.pixels != other.pixels
+    heights = [data.drawn(DataConfig(seconds=0.5), index).lens.height_m for index in range(20)]
+    assert 0.3 <= min(heights) < 0.8 < 1.5 < max(heights) <= 2.5
+
+
+def test_what_is_cached_is_not_made_again_and_another_recipe_has_its_own(folder):
+    assert not list(data.Cache(folder, TINY).fill())
+    assert len(data.Cache(folder, longer(50)).missing()) == 0
+    other = TINY.model_copy(update={"data": TINY.data.model_copy(update={"seed": 5})})
+    assert len(data.Cache(folder, other).missing()) == 3
+
+
+def test_a_broken_sequence_is_named(folder, tmp_path):
+    cache = data.Cache(tmp_path, TINY)
+    cache.folder.mkdir(parents=True)
+    whole = data.Cache(folder, TINY).path(0).read_bytes()
+    for index, content in enumerate((whole, whole[:100], whole)):
+        cache.path(index).write_bytes(content)
+    with pytest.raises(BrokenRecording, match="000001"):
+        cache.open()
+
+
+def test_a_mirror_turns_what_it_turns_and_twice_is_nothing():
+    counts = np.random.default_rng(0).integers(0, 9, (3, 4, 5, 6)).astype(np.uint8)
+    twists = np.arange(1, 37, dtype=np.float32).reshape(3, 2, 6)
+    seen, truth = mirrored(counts, twists)
+    assert (seen[..., 0] == counts[..., -1]).all()
+    assert (np.sign(truth[0, 0]) == [-1, 1, 1, 1, -1, -1]).all()
+    back, twist = mirrored(seen, truth)
+    assert (back == counts).all()
+    assert (twist == twists).all()
+
+
+def test_a_mirrored_flow_is_the_flow_of_the_mirrored_twist():
+    def flow(x, y, depth, twist):
+        (vx, vy, vz), (wx, wy, wz) = twist[:3], twist[3:]
+        return (
+            (x * vz - vx) / depth + x * y * wx - (1 + x * x) * wy + y * wz,
+            (y * vz - vy) / depth + (1 + y * y) * wx - x * y * wy - x * wz,
+        )
+
+    twist = np.array([0.3, -0.2, 4.0, 0.1, -0.5, 0.2], np.float32)
+    _, other = mirrored(np.zeros((1, 2, 3, 4), np.uint8), twist)
+    u, v = flow(0.4, -0.3, 5.0, twist)
+    assert flow(-0.4, -0.3, 5.0, other) == pytest.approx((-u, v))
+
+
+def test_a_flip_swaps_the_polarities_of_each_bin():
+    counts = np.arange(6, dtype=np.uint8)[None, :, None, None]
+    assert polarity_flipped(counts).ravel().tolist() == [1, 0, 3, 2, 5, 4]
+
+
+def test_gain_and_noise_change_the_mean_as_told_and_never_wrap():
+    rng = np.random.default_rng(0)
+    counts = rng.poisson(0.5, (20, 4, 30, 30)).astype(np.uint8)
+    for gain in (0.5, 3.0):
+        assert regained(rng, counts, gain).mean() == pytest.approx(gain * counts.mean(), rel=0.02)
+    assert noisy(rng, counts, 0.1).mean() == pytest.approx(counts.mean() + 0.1, rel=0.02)
+    full = np.full((1, 2, 10, 10), 255, np.uint8)
+    assert (regained(rng, full, 4.0) == 255).all()
+    assert (noisy(rng, full, 5.0) == 255).all()
+
+
+def test_a_run_that_goes_on_from_its_checkpoint_ends_as_one_that_was_never_stopped(folder, tmp_path):
+    whole, parts = tmp_path / "whole", tmp_path / "parts"
+    at_once = train(TINY, whole, folder)
+
+    class Stopped(Exception):
+        pass
+
+    def stop(progress):
+        if progress.step == 8:
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        train(TINY, parts, folder, on_progress=stop)
+    resumed = train(TINY, parts, folder, resume=True)
+    one, two = bundle.load(at_once), bundle.load(resumed)
+    weights = two.network.state_dict()
+    assert all(torch.equal(tensor, weights[name]) for name, tensor in one.network.state_dict().items())
+    assert torch.equal(one.offset, two.offset)
+    curves = [json.loads((out / RUN_JSON).read_text())["curve"] for out in (whole, parts)]
+    assert [point["linear_error_m_s"] for point in curves[0]] == [point["linear_error_m_s"] for point in curves[1]]
+
+
+def test_a_checkpoint_of_another_recipe_is_refused_with_the_field_that_differs(folder, tmp_path):
+    train(TINY, tmp_path, folder)
+    with pytest.raises(BadModel, match="recipe.steps=12, the configuration says 16"):
+        train(longer(16), tmp_path, folder, resume=True)
+    (tmp_path / CHECKPOINT).write_bytes(b"no checkpoint")
+    with pytest.raises(BadModel, match="no checkpoint to go on from"):
+        train(TINY, tmp_path, folder, resume=True)
+
+
+def test_a_few_updates_learn_something(sequences):
+    recipe = TINY.recipe.model_copy(update={"steps": 400, "learning_rate": 0.01})
+    run = Run.begin(TINY.model_copy(update={"recipe": recipe}), sequences)
+    losses = [learn(run, draw(run.rng, sequences, recipe)) for _ in range(100)]
+    first, last = (np.mean([loss.linear for one in part for loss in one]) for part in (losses[:5], losses[-5:]))
+    assert last < 0.8 * first
+
+
+def test_the_trained_bundle_says_what_it_is(folder, tmp_path):
+    made = bundle.load(train(TINY, tmp_path, folder))
+    assert made.trained
+    assert made.linear_unit == "1/s per m of height"
+    assert "12 updates" in made.provenance
+    assert json.loads((tmp_path / RUN_JSON).read_text())["config"] == TINY.model_dump(mode="json")
+
+
+def test_the_learning_rate_rises_falls_and_ends_at_zero():
+    recipe = RecipeConfig(steps=100, warm_up_steps=10, learning_rate=0.01)
+    rates = [learning_rate(step, recipe) for step in range(101)]
+    assert max(rates) == rates[9] == rates[10] == 0.01
+    assert rates[100] == pytest.approx(0)
+    assert np.all(np.diff(rates[:10]) > 0)
+    assert np.all(np.diff(rates[10:]) < 0)
+
+
+def test_the_default_configuration_is_whole():
+    assert configs.load("default").name == "default"
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        ("name = 'a b'", "name"),
+        ("[recipe]\nsteps = 0", "recipe.steps"),
+        ("[recipe]\nsegment_windows = 30", "chunks of 8"),
+        ("[data]\nseconds = 0.5", "a sequence has 10 windows"),
+        ("[data]\nheight_m = [2.0, 1.0]", "least value comes first"),
+        ("unknown = 1", "unknown"),
+        ("= 1", "not TOML"),
+    ],
+)
+def test_a_wrong_configuration_is_refused_with_what_is_wrong(tmp_path, text, why):
+    path = tmp_path / "run.toml"
+    path.write_text(text)
+    with pytest.raises(InvalidField, match=why):
+        configs.load(str(path))
+
+
+def test_a_missing_configuration_tells_which_there_are():
+    with pytest.raises(InvalidField, match="default"):
+        configs.load("nowhere.toml")

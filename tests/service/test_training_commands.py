@@ -1,0 +1,124 @@
+"""neurove train and neurove evaluate, end to end on a model and sequences that are tiny."""
+
+import json
+
+import numpy as np
+import pytest
+
+from neurove_core import bundle
+from neurove_core.io import open_source
+from service import cli
+
+CONFIG = """
+name = "tiny"
+[model.canonical]
+width = 22
+height = 16
+[model.network]
+channels = [4, 8]
+features = 16
+hidden = 16
+[data]
+sequences = 2
+seconds = 0.5
+[data.cameras]
+"pinhole:24x18" = 1.0
+[recipe]
+steps = 8
+batch = 2
+segment_windows = 4
+chunk_windows = 2
+"""
+SOURCE = "sim://street?seed=3&seconds=0.8&camera=pinhole:24x18:75"
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("train")
+    (folder / "tiny.toml").write_text(CONFIG)
+    assert cli.main(["train", str(folder / "tiny.toml"), "--out", str(folder / "out"), "--json"]) == 0
+    return folder
+
+
+@pytest.fixture
+def run(capsys):
+    def call(*arguments):
+        code = cli.main(arguments)
+        out, err = capsys.readouterr()
+        return code, out, err
+
+    return call
+
+
+def test_training_leaves_a_bundle_a_checkpoint_and_its_account(trained):
+    out = trained / "out"
+    model = bundle.load(out / "tiny.safetensors")
+    assert (model.name, model.trained) == ("tiny", True)
+    about = json.loads((out / "run.json").read_text())
+    assert (about["step"], about["seed"], about["config"]["name"]) == (8, 0, "tiny")
+    assert about["curve"][-1]["step"] == 8
+
+
+def test_a_finished_run_resumed_gives_the_same_model(trained, run):
+    path = trained / "out" / "tiny.safetensors"
+    weights = bundle.load(path).network.state_dict()
+    code, out, err = run("train", str(trained / "tiny.toml"), "--out", str(trained / "out"), "--resume")
+    assert (code, out.startswith("wrote ")) == (0, True)
+    assert "simulated" not in err
+    again = bundle.load(path).network.state_dict()
+    assert all((tensor == again[name]).all() for name, tensor in weights.items())
+
+
+def test_evaluate_tells_machines_all_figures(trained, run):
+    code, out, _ = run("evaluate", str(trained / "out" / "tiny.safetensors"), SOURCE, "--json")
+    told = json.loads(out)
+    assert code == 0
+    for key in ("rmse_v_l_m_s", "rmse_v_a_deg_s", "re_v_l", "re_v_a", "per_axis", "windows", "firing_rate"):
+        assert key in told
+    assert told["zero"]["re_v_l"] == pytest.approx(1)
+    assert told["recordings"][0]["name"].startswith("street driving 3")
+
+
+def test_evaluate_tells_people_a_table_and_draws(trained, run, tmp_path):
+    model = str(trained / "out" / "tiny.safetensors")
+    code, out, err = run("evaluate", model, SOURCE, "--plot", str(tmp_path / "plots"))
+    assert code == 0
+    assert {"tiny", "zero velocity", "mean of the truth", "wy"} <= {line[:24].strip() for line in out.splitlines()} | {
+        line.split()[0] for line in out.splitlines() if line
+    }
+    assert err.count("wrote ") == 2
+    assert {file.suffix for file in (tmp_path / "plots").iterdir()} == {".png", ".svg"}
+
+
+@pytest.mark.parametrize(
+    ("source", "why"),
+    [("pattern://", "it never ends"), ("sim://street", "it never ends"), ("sim://nowhere?seconds=1", "nowhere")],
+)
+def test_a_recording_without_truth_is_refused_in_one_line(run, source, why):
+    code, out, err = run("evaluate", "untrained", source)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert why in err
+
+
+def test_poses_in_a_file_are_a_truth(trained, run, tmp_path):
+
+    poses = open_source(SOURCE).trajectory.poses
+    made = poses(np.arange(0, 800_001, 5_000))
+    lines = [
+        " ".join(f"{value:.9f}" for value in (t / 1e6, *position, *q))
+        for t, position, q in zip(made.t, made.position_m, made.orientation, strict=True)
+    ]
+    truth = tmp_path / "truth.txt"
+    truth.write_text("\n".join(lines) + "\n")
+    model = str(trained / "out" / "tiny.safetensors")
+    code, out, _ = run("evaluate", model, SOURCE, "--truth", str(truth), "--json")
+    exact = json.loads(run("evaluate", model, SOURCE, "--json")[1])
+    assert code == 0
+    assert json.loads(out)["rmse_v_l_m_s"] == pytest.approx(exact["rmse_v_l_m_s"], rel=0.02)
+
+
+def test_a_wrong_configuration_ends_in_one_line(run, tmp_path):
+    (tmp_path / "bad.toml").write_text("[recipe]\nsteps = 0\n")
+    code, _, err = run("train", str(tmp_path / "bad.toml"))
+    assert (code, err.count("\n")) == (2, 1)
+    assert "recipe.steps" in err
