@@ -13,7 +13,7 @@ from neurove_core.sim.camera import CAMERAS, as_image, named_camera, rays_of
 from neurove_core.sim.draw import draw
 from neurove_core.sim.pixels import QUIET, PixelConfig
 from neurove_core.sim.reference import render_reference
-from neurove_core.sim.render import World, render
+from neurove_core.sim.render import render
 from neurove_core.sim.scene import SCENES, named_scene
 from neurove_core.sim.simulate import MOTION_PX, Simulation, simulate
 from neurove_core.sim.source import simulation_of
@@ -29,6 +29,7 @@ from neurove_core.sim.trajectory import (
     slider,
     still,
 )
+from neurove_core.sim.views import World
 from protocol import Events, Sensor
 from protocol.errors import InvalidField
 from protocol.events import check_events
@@ -155,10 +156,10 @@ def test_flow_from_truth_and_depth_is_where_the_points_go(scene):
 @pytest.mark.parametrize("scene", ["street", "corridor", "room", "wall"])
 def test_the_picture_moves_by_the_flow_of_the_truth(scene):
     simulation, info, rays = film(scene, TRAJECTORIES[scene], 5), SMALL.info, rays_of(SMALL.info)
-    dt = 4e-3
-    views = [simulation.view(t) for t in (2.0, 2.0 + dt)]
+    at, dt = 3.0, 4e-3
+    views = [simulation.view(t) for t in (at, at + dt)]
     first, second = (blurred(as_image(rays, info.sensor, view.light)) for view in views)
-    flow = flow_px_s(rays, views[0].depth, simulation.trajectory.twist(np.array([2.0 + dt / 2]))[0], info) * dt
+    flow = flow_px_s(rays, views[0].depth, simulation.trajectory.twist(np.array([at + dt / 2]))[0], info) * dt
     u, v = (as_image(rays, info.sensor, part) for part in flow)
     gy, gx = np.gradient((first + second) / 2)
     change, told = second - first, -(gx * u + gy * v)
