@@ -390,6 +390,20 @@ def test_a_simulated_slider_has_the_statistics_of_the_real_one():
         assert 0.5 < statistics(simulated)[name] / value < 2, name
 
 
+def test_mvsecs_real_drive_goes_down_a_simulated_street():
+    pytest.importorskip("h5py", reason="h5py is not installed: pip install 'neurove[recordings]'")
+    drive = parse_trajectory(f"{shared('mvsec/outdoor_day1_odom.h5')}?start=20", 3.0)
+    simulation = simulate("street", drive, SMALL, seed=3, seconds=1.0)
+    events, truth = everything(simulation), simulation.twists()
+    per_window = np.bincount(events.t // 100_000, minlength=10)[:10]
+    assert per_window.min() > 100, per_window
+    speed = np.linalg.norm(truth.twist[:, :3], axis=1)
+    position = drive.pose(truth.t / 1e6)[0]
+    went = np.linalg.norm(np.diff(position, axis=0), axis=1) / (np.diff(truth.t) * 1e-6)
+    assert speed.min() > 1.0  # it does drive
+    np.testing.assert_allclose((speed[1:] + speed[:-1]) / 2, went, rtol=1e-3)
+
+
 def statistics(events: Events) -> dict[str, float]:
     """Rate per pixel [Hz], share of ON, and quartiles of the time between two events of a pixel [us]."""
     pixel = events.y.astype(np.int64) * 240 + events.x
