@@ -65,7 +65,7 @@ def world_at(scene: str, t_s: float, seed: int = 3) -> tuple[World, np.ndarray, 
 @pytest.mark.parametrize("scene", SCENES)
 def test_the_compiled_renderer_draws_what_the_plain_one_does(scene):
     world, position, turned = world_at(scene, 1.7)
-    rays = rays_of(named_camera("pinhole:40x30:80").info)
+    rays = rays_of(named_camera("pinhole:28x21:80").info)
     light, depth = render(world, rays, position, turned, 1e-3)
     plain, plain_depth = render_reference(world, rays, position, turned, 1e-3)
     # rounding may turn a pixel on an edge from one panel to the other, and no more than that
@@ -76,9 +76,8 @@ def test_the_compiled_renderer_draws_what_the_plain_one_does(scene):
 
 
 @pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.parametrize("camera", ["davis346-half", "pinhole:86x65:75"])
-def test_a_tile_that_asks_only_its_candidates_sees_what_all_panels_show(scene, camera):
-    mounted = named_camera(camera)
+def test_a_tile_that_asks_only_its_candidates_sees_what_all_panels_show(scene):
+    mounted = named_camera("davis346-half")  # a lens that distorts, and tiles cut off by the sensor's border
     simulation = simulate(scene, TRAJECTORIES[scene], mounted, QUIET, seed=3)
     view = simulation.view(1.7)
     built = named_scene(scene)(simulation.trajectory, 3)
