@@ -17,7 +17,7 @@ _SMALL_RAD = 1e-3  # below it the quotients are their series, which is then exac
 def product(a: Array, b: Array) -> Array:
     """Quaternion (..., 4) of the rotation that turns by b first, then by a."""
     av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
-    vector = aw * bv + bw * av + np.cross(av, bv)
+    vector = aw * bv + bw * av + _cross(av, bv)
     return np.concatenate([vector, aw * bw - (av * bv).sum(-1, keepdims=True)], axis=-1)
 
 
@@ -32,13 +32,19 @@ def turn(q: Array, v: Array) -> Array:
     >>> turn(np.array([0.0, 0.0, 0.6, 0.8]), np.array([1.0, 0.0, 0.0])).round(9).tolist()
     [0.28, 0.96, 0.0]
     """
-    t = 2 * np.cross(q[..., :3], v)
-    return np.asarray(v + q[..., 3:] * t + np.cross(q[..., :3], t))
+    t = 2 * _cross(q[..., :3], v)
+    return np.asarray(v + q[..., 3:] * t + _cross(q[..., :3], t))
 
 
 def matrix_of(q: Array) -> Array:
     """Rotation matrices (..., 3, 3) of quaternions (..., 4)."""
-    return np.stack([turn(q, axis) for axis in np.eye(3)], axis=-1)
+    x, y, z, w = np.moveaxis(q, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, -1) for row in rows], -2)
 
 
 def quaternion_of(matrix: Array) -> Array:
@@ -88,8 +94,8 @@ def screw_of(q: Array, position: Array) -> Array:
     safe = np.where(angle < _SMALL_RAD, 1.0, angle)
     series = 1 / 12 + angle**2 / 720
     factor = np.where(angle < _SMALL_RAD, series, (1 - safe / 2 / np.tan(safe / 2)) / safe**2)
-    turned = np.cross(phi, position)
-    v = position - turned / 2 + factor * np.cross(phi, turned)
+    turned = _cross(phi, position)
+    v = position - turned / 2 + factor * _cross(phi, turned)
     return np.concatenate([v, phi], axis=-1)
 
 
@@ -100,8 +106,8 @@ def pose_of(screw: Array) -> tuple[Array, Array]:
     safe = np.where(angle < _SMALL_RAD, 1.0, angle)
     first = np.where(angle < _SMALL_RAD, 0.5 - angle**2 / 24, (1 - np.cos(safe)) / safe**2)
     second = np.where(angle < _SMALL_RAD, 1 / 6 - angle**2 / 120, (safe - np.sin(safe)) / safe**3)
-    turned = np.cross(phi, v)
-    return exp(phi), v + first * turned + second * np.cross(phi, turned)
+    turned = _cross(phi, v)
+    return exp(phi), v + first * turned + second * _cross(phi, turned)
 
 
 def body_twist(screw: Array, rate: Array, terms: int = 8) -> Array:
@@ -119,4 +125,10 @@ def body_twist(screw: Array, rate: Array, terms: int = 8) -> Array:
 def _bracket(a: Array, b: Array) -> Array:
     """Lie bracket of screws (..., 6)."""
     va, wa, vb, wb = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
-    return np.concatenate([np.cross(wa, vb) + np.cross(va, wb), np.cross(wa, wb)], axis=-1)
+    return np.concatenate([_cross(wa, vb) + _cross(va, wb), _cross(wa, wb)], axis=-1)
+
+
+def _cross(a: Array, b: Array) -> Array:
+    """Vector products (..., 3); numpy's own takes five times as long over small arrays."""
+    a0, a1, a2, b0, b1, b2 = (v[..., k] for v in (a, b) for k in range(3))
+    return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], -1)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.sim.compile import fast
-from neurove_core.sim.render import NEAR_M
+from neurove_core.sim.views import NEAR_M
 
 
 class Candidates(NamedTuple):
@@ -144,25 +144,25 @@ def candidates_of(
     low_x, low_y = np.ascontiguousarray(tiles[:, 0]), np.ascontiguousarray(tiles[:, 1])
     high_x, high_y = np.ascontiguousarray(tiles[:, 2]), np.ascontiguousarray(tiles[:, 3])
     edge = (low_x.min(), low_y.min(), high_x.max(), high_y.max())
-    kept = np.empty(n, np.int64)
-    count = 0
-    for i in order:
+    wanted = np.zeros(n, np.bool_)
+    for i in range(n):
         inside = boxes[i, 0] <= edge[2] and boxes[i, 2] >= edge[0] and boxes[i, 1] <= edge[3] and boxes[i, 3] >= edge[1]
-        if inside and nearest[i] < far_m:
-            kept[count] = i
-            count += 1
+        wanted[i] = inside and nearest[i] < far_m
+    kept, place = np.flatnonzero(wanted), np.cumsum(wanted) - 1  # in their own order, which decides between equals
+    order = order[wanted[order]]
+    count = kept.size
     seen = np.empty((count, m), np.bool_)
     first = np.zeros(m + 1, np.int64)
     edges = np.empty((views.shape[0], 4, 3))
     for k in range(count):
-        x0, y0, x1, y1 = boxes[kept[k]]
-        _edges_of(views[:, kept[k]], corner, edges)
+        x0, y0, x1, y1 = boxes[order[k]]
+        _edges_of(views[:, order[k]], corner, edges)
         for tile in range(m):  # `&` and not `and`: without branches this is a few tiles per cycle
             touch = (x0 <= high_x[tile]) & (x1 >= low_x[tile]) & (y0 <= high_y[tile]) & (y1 >= low_y[tile])
             seen[k, tile] = touch
         for tile in range(m):
             if seen[k, tile]:
-                seen[k, tile] = _may_hit(edges, tiles[tile], around[kept[k]])
+                seen[k, tile] = _may_hit(edges, tiles[tile], around[order[k]])
                 first[tile + 1] += seen[k, tile]
     first = first.cumsum()
     panel, depth = np.empty(first[m], np.int64), np.empty(first[m])
@@ -170,6 +170,6 @@ def candidates_of(
     for k in range(count):
         for tile in range(m):
             if seen[k, tile]:
-                panel[put[tile]], depth[put[tile]] = k, nearest[kept[k]]
+                panel[put[tile]], depth[put[tile]] = place[order[k]], nearest[order[k]]
                 put[tile] += 1
-    return Candidates(kept[:count].copy(), first, panel, depth)
+    return Candidates(kept, first, panel, depth)

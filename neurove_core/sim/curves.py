@@ -188,6 +188,6 @@ class Mounted(Trajectory):
 
     def twist(self, t_s: ArrayLike) -> Array:
         """See `Trajectory`."""
-        v, w = np.split(self.trajectory.twist(t_s), 2, axis=-1)
-        back = rotations.inverse(self._mount)
-        return np.concatenate([rotations.turn(back, v), rotations.turn(back, w)], axis=-1)
+        twist = self.trajectory.twist(t_s)
+        both = twist.reshape(*twist.shape[:-1], 2, 3)
+        return rotations.turn(rotations.inverse(self._mount), both).reshape(twist.shape)

@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 from neurove_core.sim.camera import Rays
 from neurove_core.sim.compile import fast
 from neurove_core.sim.cull import Candidates
+from neurove_core.sim.lanes import DEPTH, LANES, LIGHT, ROWS, load_tile
 from neurove_core.sim.pixels import Found, Mismatch, PixelState, find_crossings
-from neurove_core.sim.render import Backdrop, render_span
+from neurove_core.sim.tile import render_tile
+from neurove_core.sim.views import Backdrop
 
 GRIDS: Final = (60, 240, 960)
 """Into how many equal steps an interval may be cut; a tile is rendered after each or after some of them."""
@@ -50,24 +52,6 @@ def tile_speeds(
 
 
 @fast
-def render_all(
-    backdrop: Backdrop,
-    rays: Rays,
-    candidates: Candidates,
-    views: NDArray[np.float64],
-    rotation: NDArray[np.float64],
-    light: NDArray[np.float32],
-    depth: NDArray[np.float32],
-) -> None:  # pragma: no cover (machine code)
-    """Log intensity (N,) and depth (N,) of all tiles, from one place, whose views (N, VIEW) and rotation are given."""
-    for tile in range(rays.first.size - 1):
-        a, b = candidates.first[tile], candidates.first[tile + 1]
-        first, stop = rays.first[tile], rays.first[tile + 1]
-        panel, nearest = candidates.panel[a:b], candidates.nearest[a:b]
-        render_span(backdrop, views, rotation, panel, nearest, rays, first, stop, light[first:stop], depth)
-
-
-@fast
 def run_tiles(
     backdrop: Backdrop,
     rays: Rays,
@@ -98,16 +82,17 @@ def run_tiles(
     """
     steps = views.shape[0] - 1
     t, pixel, p, n = np.empty(4096, np.int32), np.empty(4096, np.int32), np.empty(4096, np.uint8), 0
-    buffer = np.empty(np.max(rays.first[1:] - rays.first[:-1]), np.float32)
+    work = np.empty(ROWS * LANES, np.float32)
     for tile in range(parts.size):
         a, b = candidates.first[tile], candidates.first[tile + 1]
         panel, nearest = candidates.panel[a:b], candidates.nearest[a:b]
         first, stop, count = rays.first[tile], rays.first[tile + 1], parts[tile]
-        light = buffer[: stop - first]
+        light = work[LIGHT : LIGHT + stop - first]
+        load_tile(rays, tile, work)
         weight = (weights[count, 0], weights[count, 1], weights[count, 2])
         for k in range(1, count + 1):
             j = k * (steps // count)
-            render_span(backdrop, views[j], rotations[j], panel, nearest, rays, first, stop, light, depth)
+            render_tile(backdrop, views[j], rotations[j], panel, nearest, rays.x[first], rays.y[first], work)
             start_us, stop_us, done = (k - 1) * span_us / count, k * span_us / count, 0
             while True:
                 done, n = find_crossings(
@@ -118,4 +103,5 @@ def run_tiles(
                 t = np.concatenate((t, np.empty_like(t)))
                 pixel = np.concatenate((pixel, np.empty_like(pixel)))
                 p = np.concatenate((p, np.empty_like(p)))
+        depth[first:stop] = work[DEPTH : DEPTH + stop - first]
     return Found(t, pixel, p, n)

@@ -5,8 +5,9 @@ from numpy.typing import NDArray
 
 from neurove_core.sim.camera import Rays
 from neurove_core.sim.panels import CLEAR2, SKY_COLUMNS, SKY_ROWS, SKY_TOP, Panels, Sky
-from neurove_core.sim.render import NEAR_M, TAPS, World
+from neurove_core.sim.shade import TAPS
 from neurove_core.sim.textures import LEVELS, NAMES, Textures
+from neurove_core.sim.views import NEAR_M, World
 
 Array = NDArray[np.float64]
 

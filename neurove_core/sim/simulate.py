@@ -13,7 +13,7 @@ from neurove_core.geometry import Twists
 from neurove_core.io.recording import EventsOnly, in_chunks
 from neurove_core.sim.camera import Camera, Rays, rays_of
 from neurove_core.sim.cull import Candidates, candidates_of
-from neurove_core.sim.interval import GRIDS, render_all, run_tiles, tile_speeds
+from neurove_core.sim.interval import GRIDS, run_tiles, tile_speeds
 from neurove_core.sim.path import Moving
 from neurove_core.sim.pixels import (
     USUAL,
@@ -26,10 +26,11 @@ from neurove_core.sim.pixels import (
     make_pixels,
     put_in_order,
 )
-from neurove_core.sim.render import Backdrop, World, views_of
+from neurove_core.sim.render import render_all
 from neurove_core.sim.scene import Scene, named_scene
 from neurove_core.sim.textures import make_textures
 from neurove_core.sim.trajectory import Mounted, Trajectory
+from neurove_core.sim.views import Backdrop, World, views_of
 from protocol.camera import CameraInfo
 from protocol.errors import InvalidField
 from protocol.events import Events, Sensor
@@ -233,7 +234,8 @@ class _Film:
         around = np.max([grid[row + i, column + j] for i in (-1, 0, 1) for j in (-1, 0, 1)], axis=0)
         needed = around * (stop_us - start_us) * 1e-6 / self._simulation.motion_px
         steps = next((steps for steps in GRIDS if steps >= needed.max()), GRIDS[-1])
-        divisors = np.array([count for count in range(1, steps + 1) if steps % count == 0])
+        counts = np.arange(1, steps + 1)
+        divisors = counts[steps % counts == 0]
         return divisors[np.minimum(divisors.searchsorted(needed), divisors.size - 1)], steps
 
     def _weights_of(self, span_us: int, steps: int) -> NDArray[np.float64]:

@@ -53,6 +53,7 @@ class Street:
         self._trajectory, self._seed, self._style, self.sky = trajectory, seed, style, sky
         self._path = Path(trajectory, 1.5 * style.far + 2 * BLOCK * STEP_M)
         self._blocks: dict[int, Panels] = {}
+        self._standing = NOTHING  # all of the blocks
         self._reach = int(1.5 * style.far / STEP_M / BLOCK)
 
     def near(self, t_s: float) -> Panels:
@@ -64,8 +65,9 @@ class Street:
             way = self._path.array()
             self._blocks = {number: panels for number, panels in self._blocks.items() if number in wanted}
             self._blocks |= {number: self._block(number, way) for number in missing}
+            self._standing = Panels.join(list(self._blocks.values()))
         position = self._trajectory.pose(np.array([t_s]))[0][0]
-        around = Panels.join([self._ground(position), *self._blocks.values()])
+        around = Panels.join([self._ground(position), self._standing])
         radius = np.hypot(*np.minimum(around.half, ENDLESS).T)
         distance = np.linalg.norm((around.centre - position)[:, [0, 2]], axis=1)
         return around.take(distance - radius < self._style.far)

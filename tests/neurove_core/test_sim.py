@@ -13,7 +13,7 @@ from neurove_core.sim.camera import CAMERAS, as_image, named_camera, rays_of
 from neurove_core.sim.draw import draw
 from neurove_core.sim.pixels import QUIET, PixelConfig
 from neurove_core.sim.reference import render_reference
-from neurove_core.sim.render import World, render
+from neurove_core.sim.render import render
 from neurove_core.sim.scene import SCENES, named_scene
 from neurove_core.sim.simulate import MOTION_PX, Simulation, simulate
 from neurove_core.sim.source import simulation_of
@@ -29,6 +29,7 @@ from neurove_core.sim.trajectory import (
     slider,
     still,
 )
+from neurove_core.sim.views import World
 from protocol import Events, Sensor
 from protocol.errors import InvalidField
 from protocol.events import check_events
@@ -64,7 +65,7 @@ def world_at(scene: str, t_s: float, seed: int = 3) -> tuple[World, np.ndarray, 
 @pytest.mark.parametrize("scene", SCENES)
 def test_the_compiled_renderer_draws_what_the_plain_one_does(scene):
     world, position, turned = world_at(scene, 1.7)
-    rays = rays_of(named_camera("pinhole:40x30:80").info)
+    rays = rays_of(named_camera("pinhole:28x21:80").info)
     light, depth = render(world, rays, position, turned, 1e-3)
     plain, plain_depth = render_reference(world, rays, position, turned, 1e-3)
     # rounding may turn a pixel on an edge from one panel to the other, and no more than that
@@ -75,9 +76,8 @@ def test_the_compiled_renderer_draws_what_the_plain_one_does(scene):
 
 
 @pytest.mark.parametrize("scene", SCENES)
-@pytest.mark.parametrize("camera", ["davis346-half", "pinhole:86x65:75"])
-def test_a_tile_that_asks_only_its_candidates_sees_what_all_panels_show(scene, camera):
-    mounted = named_camera(camera)
+def test_a_tile_that_asks_only_its_candidates_sees_what_all_panels_show(scene):
+    mounted = named_camera("davis346-half")  # a lens that distorts, and tiles cut off by the sensor's border
     simulation = simulate(scene, TRAJECTORIES[scene], mounted, QUIET, seed=3)
     view = simulation.view(1.7)
     built = named_scene(scene)(simulation.trajectory, 3)
@@ -155,10 +155,10 @@ def test_flow_from_truth_and_depth_is_where_the_points_go(scene):
 @pytest.mark.parametrize("scene", ["street", "corridor", "room", "wall"])
 def test_the_picture_moves_by_the_flow_of_the_truth(scene):
     simulation, info, rays = film(scene, TRAJECTORIES[scene], 5), SMALL.info, rays_of(SMALL.info)
-    dt = 4e-3
-    views = [simulation.view(t) for t in (2.0, 2.0 + dt)]
+    at, dt = 3.0, 4e-3
+    views = [simulation.view(t) for t in (at, at + dt)]
     first, second = (blurred(as_image(rays, info.sensor, view.light)) for view in views)
-    flow = flow_px_s(rays, views[0].depth, simulation.trajectory.twist(np.array([2.0 + dt / 2]))[0], info) * dt
+    flow = flow_px_s(rays, views[0].depth, simulation.trajectory.twist(np.array([at + dt / 2]))[0], info) * dt
     u, v = (as_image(rays, info.sensor, part) for part in flow)
     gy, gx = np.gradient((first + second) / 2)
     change, told = second - first, -(gx * u + gy * v)
@@ -387,6 +387,20 @@ def test_a_simulated_slider_has_the_statistics_of_the_real_one():
     simulated = everything(simulate("wall", from_poses(poses), camera, seed=0, seconds=0.17))
     for name, value in statistics(real).items():
         assert 0.5 < statistics(simulated)[name] / value < 2, name
+
+
+def test_mvsecs_real_drive_goes_down_a_simulated_street():
+    pytest.importorskip("h5py", reason="h5py is not installed: pip install 'neurove[recordings]'")
+    drive = parse_trajectory(f"{shared('mvsec/outdoor_day1_odom.h5')}?start=20", 3.0)
+    simulation = simulate("street", drive, SMALL, seed=3, seconds=1.0)
+    events, truth = everything(simulation), simulation.twists()
+    per_window = np.bincount(events.t // 100_000, minlength=10)[:10]
+    assert per_window.min() > 100, per_window
+    speed = np.linalg.norm(truth.twist[:, :3], axis=1)
+    position = drive.pose(truth.t / 1e6)[0]
+    went = np.linalg.norm(np.diff(position, axis=0), axis=1) / (np.diff(truth.t) * 1e-6)
+    assert speed.min() > 1.0  # it does drive
+    np.testing.assert_allclose((speed[1:] + speed[:-1]) / 2, went, rtol=1e-3)
 
 
 def statistics(events: Events) -> dict[str, float]:
