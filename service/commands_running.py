@@ -23,7 +23,7 @@ from service.arguments import (
 from service.config import ServiceConfig, load
 from service.lifecycle import stop_on_signals
 
-DEFAULT_SOURCE = "sim://street?camera=pinhole:86x65:75"  # small, so that it is simulated faster than it is played
+DEFAULT_SOURCE = "sim://"
 _DEFAULT_DEMO_S = 20.0
 _STREAM = "cam0"
 
