@@ -68,7 +68,7 @@ class Engine:
             twists (T, B, n, 6) in scaled units and the next state, as NeuroVE.forward.
         """
         steps, batch = spikes.shape[:2]
-        x, membranes = self.features(spikes, state)
+        x, membranes = self._features(spikes, state)
         rows = x.permute(0, 2, 3, 1).reshape(steps * batch, -1)  # as it lies in memory
         twists, cells, y = (self._plain_cells if is_plain() else self._fused_cells)(rows, steps, state)
         return twists.view(steps, batch, self._bins, 6), NetworkState(membranes, cells, y)
@@ -76,6 +76,9 @@ class Engine:
     @torch.inference_mode()
     def features(self, spikes: Tensor, state: NetworkState) -> tuple[Tensor, tuple[LIFState, ...]]:
         """Spikes (T * B, C, H', W') of the last map of the feature extractor alone, and its membranes after them."""
+        return self._features(spikes, state)
+
+    def _features(self, spikes: Tensor, state: NetworkState) -> tuple[Tensor, tuple[LIFState, ...]]:
         x = spikes.flatten(0, 1).contiguous(memory_format=torch.channels_last)
         fire = self._plain_fire if is_plain() else self._fused_fire
         membranes = []

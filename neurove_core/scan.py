@@ -67,12 +67,15 @@ def scan_in_place(maps: Tensor, v: Tensor, decay: float, v_th: float) -> tuple[T
     Returns:
         spikes (T * B, C, H, W) and the potentials after the last reset, both channels last.
     """
-    rows = maps.permute(0, 2, 3, 1).contiguous()  # no copy where channels are last
-    after = v.permute(0, 2, 3, 1).clone(memory_format=torch.contiguous_format)
-    neurons = after.numpy().reshape(-1)
-    kind = neurons.dtype.type
-    _in_place(rows.numpy().reshape(-1, neurons.size), neurons, kind(decay), kind(v_th))
-    return rows.permute(0, 3, 1, 2), after.permute(0, 3, 1, 2)
+    rows = maps.permute(0, 2, 3, 1)
+    if not rows.is_contiguous():
+        rows = rows.contiguous()
+        maps = rows.permute(0, 3, 1, 2)
+    before = np.ascontiguousarray(v.detach().numpy().transpose(0, 2, 3, 1))
+    after = np.empty_like(before)
+    kind = after.dtype.type
+    _in_place(rows.numpy().reshape(-1, after.size), before.reshape(-1), after.reshape(-1), kind(decay), kind(v_th))
+    return maps, torch.from_numpy(after).permute(0, 3, 1, 2)
 
 
 class _Scan(torch.autograd.Function):
@@ -184,12 +187,16 @@ def _backward(
 
 
 @compiled
-def _in_place(currents: Array, v: Array, decay: Any, v_th: Any) -> None:  # pragma: no cover (machine code)
+def _in_place(
+    currents: Array, before: Array, after: Array, decay: Any, v_th: Any
+) -> None:  # pragma: no cover (machine code)
     steps, n = currents.shape
-    one, none = v.dtype.type(1), v.dtype.type(0)
+    one, none = after.dtype.type(1), after.dtype.type(0)
     for start in range(0, n, _BLOCK):
         stop = min(start + _BLOCK, n)
-        v_now = v[start:stop]
+        v_before, v_now = before[start:stop], after[start:stop]
+        for i in range(stop - start):
+            v_now[i] = v_before[i]
         for t in range(steps):
             current = currents[t, start:stop]
             for i in range(stop - start):

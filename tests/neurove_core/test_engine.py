@@ -162,3 +162,12 @@ def test_where_the_packed_convolution_cannot_be_trusted_the_plain_one_serves_and
     torch.testing.assert_close(twists, expected, rtol=1e-3, atol=1e-4)
     assert len(caplog.records) == 1
     assert "packed convolutions are off" in caplog.text
+
+
+def test_a_state_that_training_left_with_its_gradient_is_taken_over_all_the_same():
+    network, spikes = make_network(SMALL).requires_grad_(), make_spikes(SMALL)
+    _, carried = network(spikes[:2], network.initial_state(1))
+    assert carried.membranes[0].v.requires_grad
+    twists, state = Engine(network)(spikes[2:], carried)
+    assert torch.isfinite(twists).all()
+    assert state.finite()
