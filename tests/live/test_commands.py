@@ -119,7 +119,7 @@ def test_the_demo_plays_a_real_recording_and_tells_people_what_came_of_it():
     assert f"events     {events:,} of {events:,}" in shown.stdout
     assert "estimates  3 of 3 windows" in shown.stdout
     assert "lost       nothing" in shown.stdout
-    assert "UNTRAINED: the velocities mean nothing" in shown.stdout
+    assert "model      default\n" in shown.stdout
 
 
 def test_the_demo_of_a_truncated_recording_plays_what_is_whole_and_says_where_it_broke(tmp_path):
