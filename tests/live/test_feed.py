@@ -60,7 +60,8 @@ def test_packets_in_estimates_out_and_the_counts_are_exact(node, heard, driver):
     assert (status.windows, status.estimates, status.lost.nonzero()) == (windows, windows, {})
     assert [one.seq for one in heard.of("exact")] == list(range(windows))
     assert [one.start_us for one in heard.of("exact")] == [i * WINDOW_US for i in range(windows)]
-    assert {Flag.UNTRAINED, Flag.UNCALIBRATED} <= set(heard.of("exact")[0].flags)
+    assert {Flag.UNSCALED, Flag.UNCALIBRATED} <= set(heard.of("exact")[0].flags)
+    assert Flag.UNTRAINED not in heard.of("exact")[0].flags
     wait_until(lambda: "exact" in heard.statuses)
     assert "neurove/v1/@node/n1/serves/exact" in transport.tokens(config.keys.serves(), 1.0)
 
