@@ -141,8 +141,9 @@ def test_the_table_of_keys_has_all_keys_and_no_other() -> None:
     names = {"prefix": Keys().prefix, "stream": "cam0", "node": "n1"}
     told = {re.sub(r"<(\w+)>", lambda part: names[part[1]], key) for key in column(table("key"))}
     built = set()
-    for name, build in inspect.getmembers(Keys(), inspect.ismethod):
+    for name, _ in inspect.getmembers(Keys, inspect.isfunction):  # of the class: Python 3.11.2 fails on a Keys()
         if not name.startswith("_") and name != "stream_of":
+            build = getattr(Keys(), name)
             built.add(build(**{part: names[part] for part in inspect.signature(build).parameters}))
     assert told == built
     assert f"by default `{Keys().prefix}`" in README
