@@ -26,7 +26,7 @@ _WAVES, _PERIOD = 100, 20
 _BETAS, _EPSILON = (0.9, 0.99), 1e-8
 _LOG_FLOOR = 1e-9
 _LEAST_V_TH = 0.02  # of a learned threshold
-_CHECK_EVERY, _CHECKED_SHARE = 20, 0.4  # when the closed loop is looked at: every so many of the last fine updates
+_CHECK_EVERY, _CHECKED_SHARE = 10, 0.15  # when the closed loop is looked at: every so many of the last fine updates
 _CHECK_FROM, _CHECK_WAVES = 300, 16  # and how: on its own answers from this step on, over so many training waves
 _NO_ANSWER = 1e3  # error of an answer that is not finite
 
