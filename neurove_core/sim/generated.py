@@ -95,20 +95,26 @@ def _rate(values: Array) -> Array:
     return np.asarray(np.gradient(values, _DRIVE_STEP_S))
 
 
-def hand_held(seed: int, seconds: float = 60.0) -> SplineTrajectory:
+def hand_held(seed: int, seconds: float = 60.0, moved: float = 1.0, turned: float = 1.0) -> SplineTrajectory:
     """A camera waved about in front of a scene: six degrees of freedom, calm and wild by turns.
 
     Within half a metre or so of where it starts and looking along z within some 40 degrees. Its spectra and speeds are
     modelled on poster_6dof of the Event Camera Dataset: speed 0.9 m/s in the median and 2.4 at 99 %, turning 1.2 rad/s
     in the median and 12 at 99 %.
+
+    Args:
+        seed: of the path; the same one for any `moved` and `turned`.
+        seconds: how long it lasts.
+        moved: factor of how far it moves; 0 leaves a camera that turns in place.
+        turned: factor of how far it turns; 0 leaves one that moves without turning.
     """
     n = math.ceil(seconds / _HAND_STEP_S) + 1
     rng = [np.random.default_rng((seed, 3, k)) for k in range(4)]
     # how wild it is comes and goes over some seconds
     wild = np.exp(np.clip(0.35 * noise(rng[0], n, 1, 0.02, 0.06, _HAND_STEP_S) - 0.1, -1.0, 0.5))
     wild_turns = np.exp(np.clip(1.0 * noise(rng[1], n, 1, 0.02, 0.06, _HAND_STEP_S) - 0.5, -2.0, 1.2))
-    position = 0.12 * wild * noise(rng[2], n, 3, 0.3, 0.9, _HAND_STEP_S)
-    turns = 0.14 * wild_turns * noise(rng[3], n, 3, 0.8, 2.0, _HAND_STEP_S)
+    position = moved * 0.12 * wild * noise(rng[2], n, 3, 0.3, 0.9, _HAND_STEP_S)
+    turns = turned * 0.14 * wild_turns * noise(rng[3], n, 3, 0.8, 2.0, _HAND_STEP_S)
     position = position - position[:1]
     return SplineTrajectory.through(f"handheld {seed}", _HAND_STEP_S, position, rotations.exp(turns), seconds)
 

@@ -28,9 +28,13 @@ def draw(rng: np.random.Generator, sequences: Sequences, recipe: RecipeConfig) -
     counts, twists, heights = [], [], []
     for _ in range(recipe.batch):
         index = int(rng.integers(len(sequences)))
-        start = int(rng.integers(len(sequences.twists[index]) - recipe.segment_windows + 1))
-        stop = start + recipe.segment_windows
-        seen, truth = augment(rng, sequences.counts(index, start, stop), sequences.twists[index][start:stop], recipe)
+        twice = bool(rng.uniform() < recipe.doubled)
+        windows = recipe.segment_windows * (1 + twice)
+        start = int(rng.integers(len(sequences.twists[index]) - windows + 1))
+        seen, truth = sequences.counts(index, start, start + windows), sequences.twists[index][start : start + windows]
+        if twice:
+            seen, truth = doubled(seen, truth)
+        seen, truth = augment(rng, seen, truth, recipe)
         counts.append(seen)
         twists.append(truth)
         heights.append(sequences.height_m[index])
@@ -52,10 +56,12 @@ def augment(
         twists: (S, n, 6).
         recipe: how often each change is made.
     """
-    chance = rng.uniform(size=4)
+    chance = rng.uniform(size=5)
     gain, noise = math.exp(rng.uniform(*np.log(recipe.gain))), rng.uniform(0, recipe.noise_max)
     if chance[0] < recipe.mirror:
         counts, twists = mirrored(counts, twists)
+    if chance[4] < recipe.reversed:
+        counts, twists = backwards(counts, twists)
     if chance[1] < recipe.polarity_flip:
         counts = polarity_flipped(counts)
     if chance[2] < recipe.regained:
@@ -71,6 +77,34 @@ def mirrored(counts: NDArray[np.uint8], twists: NDArray[np.float32]) -> tuple[ND
     The angular velocity is an axial vector: in a mirror across x its x component stays and the others turn around.
     """
     return counts[..., ::-1], twists * _MIRRORED
+
+
+def doubled(counts: NDArray[np.uint8], twists: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """The same motion at twice the speed: two bins become one, and half as many windows are left.
+
+    Events come from changes of brightness, not from time, so but for noise and dead times this is what would be seen.
+    So speed is not told by the scene: a street has been gone through at several.
+
+    >>> counts = np.arange(8, dtype=np.uint8).reshape(2, 4, 1, 1)  # 2 windows of 2 bins, OFF and ON of each
+    >>> doubled(counts, np.ones((2, 2, 6), np.float32))[0].ravel().tolist()
+    [2, 4, 10, 12]
+    """
+    windows, channels, rows, columns = counts.shape
+    bins = channels // 2
+    pairs = counts[: windows // 2 * 2].reshape(windows // 2 * bins, 2, 2, rows, columns)
+    summed = np.minimum(pairs[:, 0], 255 - pairs[:, 1]) + pairs[:, 1]
+    faster = twists[: windows // 2 * 2].reshape(windows // 2 * bins, 2, 6).mean(axis=1) * np.float32(2)
+    return summed.reshape(-1, channels, rows, columns), faster.reshape(-1, bins, 6)
+
+
+def backwards(counts: NDArray[np.uint8], twists: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """The film run backwards: what got brighter gets darker, and every velocity turns around.
+
+    >>> counts = np.arange(8, dtype=np.uint8).reshape(2, 4, 1, 1)
+    >>> backwards(counts, np.ones((2, 2, 6), np.float32))[0].ravel().tolist()
+    [7, 6, 5, 4, 3, 2, 1, 0]
+    """
+    return counts[::-1, ::-1], -twists[::-1, ::-1]
 
 
 def polarity_flipped(counts: NDArray[np.uint8]) -> NDArray[np.uint8]:

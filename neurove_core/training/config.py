@@ -25,7 +25,11 @@ class DataConfig(Config):
     seconds: float = Field(6.0, gt=0, le=600, description="Length of each.")
     seed: int = Field(1_000_000, ge=0, lt=900_000_000, description="Sequence i has the scene and the way of seed + i.")
     motion_px: float = Field(1.5, ge=0.1, le=4, description="Most motion of a pixel between two of its renders.")
-    scenes: Shares = Field({"street": 0.74, "corridor": 0.1, "room": 0.16}, description="Share of each scene.")
+    scenes: Shares = Field({"street": 0.6, "corridor": 0.1, "room": 0.3}, description="Share of each scene.")
+    hands: Shares = Field(
+        {"waved": 0.5, "turned": 0.25, "slid": 0.1, "spun": 0.15},
+        description="Share of each way in a room: waved about, turned in place, moved without turning, spun steadily.",
+    )
     cameras: Shares = Field(
         {
             "davis346-half": 0.35,
@@ -39,8 +43,9 @@ class DataConfig(Config):
     hfov_deg: Span = Field((55.0, 95.0), description="Field of view of a pinhole that is named without one.")
     height_m: Span = Field((0.3, 2.5), description="Of the camera above the ground, log-uniform.")
     pitch_deg: Span = Field((0.0, 12.0), description="How far the camera looks down, uniform.")
-    slowed_drive: Span = Field((1.0, 2.0), description="Log-uniform: how many times slower than a car.")
-    slowed_hand: Span = Field((3.0, 8.0), description="Log-uniform: in a room, how many times slower than a wild hand.")
+    slowed_drive: Span = Field((1.0, 4.0), description="Log-uniform: how many times slower than a car.")
+    slowed_hand: Span = Field((1.0, 6.0), description="Log-uniform: in a room, how many times slower than a wild hand.")
+    spun_rad_s: Span = Field((0.1, 2.0), description="Log-uniform: rate of a camera that spins in place.")
     threshold: Span = Field((0.15, 0.4), description="Of ON events, log-uniform; OFF lies within 15 % of it.")
     threshold_sigma: Span = Field((0.02, 0.05), description="Spread of the thresholds between pixels, uniform.")
     refractory_us: Span = Field((100.0, 1000.0), description="Uniform.")
@@ -74,6 +79,8 @@ class RecipeConfig(Config):
     norm_momentum: float = Field(0.02, gt=0, le=1, description="How fast tdBN's statistics follow the batches.")
     balance_decay: float = Field(0.99, ge=0, lt=1, description="Of the means that balance L_l and L_a.")
     mirror: float = Field(0.5, ge=0, le=1, description="Share of segments that are seen in a mirror.")
+    doubled: float = Field(0.4, ge=0, le=1, description="Share of segments played at twice their speed.")
+    reversed: float = Field(0.1, ge=0, le=1, description="Share of segments played backwards.")
     polarity_flip: float = Field(0.5, ge=0, le=1, description="Share of segments whose ON is OFF.")
     noisy: float = Field(0.25, ge=0, le=1, description="Share of segments with random events added.")
     noise_max: float = Field(0.1, ge=0, le=10, description="Most of these, per cell and bin.")
@@ -108,8 +115,9 @@ class TrainingConfig(Config):
     @model_validator(mode="after")
     def _segments_fit(self) -> Self:
         windows = int(self.data.seconds * 1e6) // self.model.window.duration_us
-        if windows < self.recipe.segment_windows:
-            raise ValueError(f"a sequence has {windows} windows, a segment takes {self.recipe.segment_windows}")
+        takes = self.recipe.segment_windows * (2 if self.recipe.doubled else 1)
+        if windows < takes:
+            raise ValueError(f"a sequence has {windows} windows, a segment takes {takes}")
         return self
 
 

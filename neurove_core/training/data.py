@@ -29,7 +29,7 @@ from neurove_core.sim.path import Moving
 from neurove_core.sim.pixels import PixelConfig
 from neurove_core.sim.scene import named_scene
 from neurove_core.sim.simulate import Simulation
-from neurove_core.sim.trajectory import Mounted, Trajectory, driving, hand_held
+from neurove_core.sim.trajectory import Mounted, Trajectory, driving, hand_held, rotation
 from neurove_core.training.config import DataConfig, Span, TrainingConfig
 from neurove_core.windows import WindowsState
 
@@ -100,7 +100,7 @@ def drawn(config: DataConfig, index: int) -> Simulation:
     slowed = _log_uniform(rng, config.slowed_hand if scene == "room" else config.slowed_drive)
     trajectory: Trajectory
     if scene == "room":
-        trajectory = Part(hand_held(seed, config.seconds), 0.0, slowed, config.seconds)
+        trajectory = _in_a_hand(rng, config, seed, slowed)
     else:
         trajectory = _turning_part(rng, driving(seed, _DRIVE_S + config.seconds), slowed, config.seconds)
     mounted = Mounted(trajectory, camera.height_m, camera.pitch_deg)
@@ -233,9 +233,20 @@ class Sequences:
         return found
 
 
+def _in_a_hand(rng: np.random.Generator, config: DataConfig, seed: int, slowed: float) -> Trajectory:
+    """A camera that is waved about, only turned, or only moved; or one that spins on a random, mostly upright axis."""
+    way = _choice(rng, config.hands)
+    if way == "spun":
+        axis = rng.standard_normal(3) * (0.4, 1.0, 0.4)
+        rate = _log_uniform(rng, config.spun_rad_s) * axis / np.linalg.norm(axis)
+        return rotation(*(float(one) for one in rate), config.seconds)
+    moved, turned = {"waved": (1.0, 1.0), "turned": (0.0, 1.0), "slid": (1.0, 0.0)}[way]
+    return Part(hand_held(seed, config.seconds, moved, turned), 0.0, slowed, config.seconds)
+
+
 def _turning_part(rng: np.random.Generator, drive: Trajectory, slowed: float, seconds: float) -> Part:
-    """Of two parts of a drive the one that turns more: most of any drive goes straight on."""
-    parts = [Part(drive, float(start_s), slowed, seconds) for start_s in rng.uniform(0, _DRIVE_S, 2)]
+    """Of three parts of a drive the one that turns most: most of any drive goes straight on."""
+    parts = [Part(drive, float(start_s), slowed, seconds) for start_s in rng.uniform(0, _DRIVE_S, 3)]
     t_s = np.linspace(0, seconds, 100)
     return max(parts, key=lambda part: float(np.abs(part.twist(t_s)[:, 4]).mean()))
 
