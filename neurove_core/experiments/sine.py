@@ -26,7 +26,7 @@ _WAVES, _PERIOD = 100, 20
 _BETAS, _EPSILON = (0.9, 0.99), 1e-8
 _LOG_FLOOR = 1e-9
 _LEAST_V_TH = 0.02  # of a learned threshold
-_CHECK_EVERY, _CHECKED_SHARE = 10, 0.15  # when the closed loop is looked at: every so many of the last fine updates
+_CHECK_EVERY = 20  # fine updates from one look at the closed loop to the next
 _CHECK_FROM, _CHECK_WAVES = 300, 16  # and how: on its own answers from this step on, over so many training waves
 _NO_ANSWER = 1e3  # error of an answer that is not finite
 
@@ -61,6 +61,12 @@ class Recipe(Config):
     fine_lr_end: float = Field(2e-6, gt=0)
     closed_share: float = Field(0.4, ge=0, le=1)
     closed_steps: int = Field(700, ge=10, lt=LENGTH, description="Longest closed-loop window.")
+    chosen_share: float = Field(
+        0.4,
+        ge=0,
+        le=1,
+        description="Share of the fine updates, the last, of whose weights the best are kept; 0: the last.",
+    )
     rate: float = Field(0.0, ge=0, lt=1, description="Spike rate that each layer is held to; 0 for none.")
     rate_weight: float = Field(1.0, ge=0, description="Of a missing rate, relative to the error.")
     clip: float = Field(0.5, gt=0, description="Norm of the gradient.")
@@ -263,7 +269,7 @@ def train(recipe: Recipe, seed: int, progress: Callable[[int, float], None] = la
             walk.advance(tape)
         adam.step(grad, lr)
         left = recipe.fine_updates - 1 - update
-        if left % _CHECK_EVERY == 0 and left < _CHECKED_SHARE * recipe.fine_updates:
+        if left % _CHECK_EVERY == 0 and left < recipe.chosen_share * recipe.fine_updates:
             best.look()
         progress(recipe.updates + update, mse)
     best.restore()
@@ -294,8 +300,9 @@ class _Best:
             self._score, self._theta = regression * forecast, self._network.theta.copy()
 
     def restore(self) -> None:
-        """Go back to them."""
-        self._network.theta[:] = self._theta
+        """Go back to them, if any were looked at."""
+        if self._score < math.inf:
+            self._network.theta[:] = self._theta
 
 
 def _closed_steps(update: int, recipe: Recipe, rng: np.random.Generator) -> int:
