@@ -11,9 +11,14 @@ from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.estimator import Estimator
 from neurove_core.geometry import lookup_table
 from neurove_core.io.errors import BrokenRecording
+from neurove_core.sim.camera import named_camera
+from neurove_core.sim.pixels import PixelConfig
+from neurove_core.sim.scene import named_scene
+from neurove_core.sim.simulate import Simulation
+from neurove_core.sim.trajectory import Mounted, rotation
 from neurove_core.training import config as configs
 from neurove_core.training import data
-from neurove_core.training.batches import draw, mirrored, noisy, polarity_flipped, regained
+from neurove_core.training.batches import backwards, doubled, draw, mirrored, noisy, polarity_flipped, regained
 from neurove_core.training.config import DataConfig, RecipeConfig, TrainingConfig
 from neurove_core.training.loop import CHECKPOINT, RUN_JSON, learn, learning_rate, train
 from neurove_core.training.run import Run
@@ -119,6 +124,46 @@ def test_a_mirrored_flow_is_the_flow_of_the_mirrored_twist():
 def test_a_flip_swaps_the_polarities_of_each_bin():
     counts = np.arange(6, dtype=np.uint8)[None, :, None, None]
     assert polarity_flipped(counts).ravel().tolist() == [1, 0, 3, 2, 5, 4]
+
+
+def test_twice_the_speed_is_what_a_camera_that_turns_twice_as_fast_sees():
+    def turning(rate, seconds):
+        calm = PixelConfig(leak_hz=0, shot_noise_hz=0, threshold_sigma=0, refractory_us=0)
+        camera = named_camera("pinhole:44x32:80")
+        way = Mounted(rotation(0, rate, 0, seconds), camera.height_m, camera.pitch_deg)
+        return data.sequence_of(Simulation("room", named_scene("room"), way, camera, calm, 7, seconds), MODEL)
+
+    slow, fast = turning(1.0, 0.4), turning(2.0, 0.2)
+    counts, twists = doubled(slow.counts, slow.twists)
+    assert twists == pytest.approx(fast.twists, abs=1e-5)
+    assert counts.shape == fast.counts.shape
+    assert int(counts.sum()) == pytest.approx(int(fast.counts.sum()), rel=0.05)
+    assert np.corrcoef(counts.ravel(), fast.counts.ravel())[0, 1] > 0.9
+
+
+def test_backwards_and_back_again_is_what_it_was_and_every_velocity_turns_around():
+    counts = np.random.default_rng(0).integers(0, 9, (3, 4, 5, 6)).astype(np.uint8)
+    twists = np.arange(1, 37, dtype=np.float32).reshape(3, 2, 6)
+    seen, truth = backwards(counts, twists)
+    assert (truth[0, 0] == -twists[-1, -1]).all()
+    assert (seen[0, 0] == counts[-1, -1]).all()  # the first OFF events are the last ON events
+    assert (backwards(seen, truth)[0] == counts).all()
+    assert (backwards(seen, truth)[1] == twists).all()
+
+
+def test_a_count_that_is_doubled_does_not_wrap():
+    counts = np.full((2, 2, 1, 1), 200, np.uint8)
+    assert (doubled(counts, np.zeros((2, 1, 6), np.float32))[0] == 255).all()
+
+
+@pytest.mark.parametrize("way", ["waved", "turned", "slid", "spun"])
+def test_each_way_of_a_hand_moves_and_turns_as_its_name_says(way):
+    config = DataConfig(seconds=2.0, scenes={"room": 1.0}, hands={way: 1.0})
+    for index in range(3):
+        twist = data.drawn(config, index).trajectory.twist(np.linspace(0, 2, 50))
+        speed, rate = np.linalg.norm(twist[:, :3], axis=1).max(), np.linalg.norm(twist[:, 3:], axis=1).max()
+        assert (speed > 1e-3) == (way in ("waved", "slid"))
+        assert (rate > 1e-3) == (way != "slid")
 
 
 def test_gain_and_noise_change_the_mean_as_told_and_never_wrap():
