@@ -6,7 +6,15 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from neurove_core.neurons import require, require_sequence, require_shape_of_layer, require_threshold, require_width
+from neurove_core.neurons import (
+    drawn_weights,
+    require,
+    require_sequence,
+    require_shape_of_layer,
+    require_threshold,
+    require_width,
+    scan_of,
+)
 from neurove_core.surrogate import Surrogate, spike
 
 
@@ -89,10 +97,9 @@ class ASLSTM(nn.Module):
         require(0 <= alpha <= 1, "ASLSTM", "alpha", alpha, "must be 0 to 1")
         require_threshold("ASLSTM", v_th, surrogate, surrogate_width)
         self.hidden = hidden
-        bound = hidden**-0.5
-        self.w_x = nn.Parameter(torch.empty(5 * hidden, inputs).uniform_(-bound, bound))
-        self.w_v = nn.Parameter(torch.empty(4 * hidden, hidden).uniform_(-bound, bound))
-        self.b = nn.Parameter(torch.empty(5 * hidden).uniform_(-bound, bound))
+        self.w_x = drawn_weights(hidden, 5 * hidden, inputs)
+        self.w_v = drawn_weights(hidden, 4 * hidden, hidden)
+        self.b = drawn_weights(hidden, 5 * hidden)
         if diffusion:
             self.d_time = nn.Parameter(torch.full((hidden,), 0.2))
         else:
@@ -114,12 +121,9 @@ class ASLSTM(nn.Module):
         Raises:
             InvalidField: x is no sequence of this width, or the state is not of its batch.
         """
-        params, steps = self.params(), []
+        params = self.params()
         require_sequence("ASLSTM", x, params.w_x.shape[1], state, self.hidden)
-        for x_t in x:
-            state = aslstm_step(x_t, state, params)
-            steps.append(state)
-        return ASLSTMState(*(torch.stack(field) for field in zip(*steps, strict=True))), state
+        return scan_of(aslstm_step, x, state, params)
 
 
 class SLSTMState(NamedTuple):
@@ -192,10 +196,9 @@ class SLSTM(nn.Module):
         require_shape_of_layer("SLSTM", inputs=inputs, hidden=hidden)
         require_threshold("SLSTM", v_th, surrogate, surrogate_width)
         self.hidden = hidden
-        bound = hidden**-0.5
-        self.w_x = nn.Parameter(torch.empty(4 * hidden, inputs).uniform_(-bound, bound))
-        self.w_v = nn.Parameter(torch.empty(4 * hidden, hidden).uniform_(-bound, bound))
-        self.b = nn.Parameter(torch.empty(4 * hidden).uniform_(-bound, bound))
+        self.w_x = drawn_weights(hidden, 4 * hidden, inputs)
+        self.w_v = drawn_weights(hidden, 4 * hidden, hidden)
+        self.b = drawn_weights(hidden, 4 * hidden)
         self._constants = (v_th, surrogate, surrogate_width)
 
     def params(self) -> SLSTMParams:
@@ -213,12 +216,9 @@ class SLSTM(nn.Module):
         Raises:
             InvalidField: x is no sequence of this width, or the state is not of its batch.
         """
-        params, steps = self.params(), []
+        params = self.params()
         require_sequence("SLSTM", x, params.w_x.shape[1], state, self.hidden)
-        for x_t in x:
-            state = slstm_step(x_t, state, params)
-            steps.append(state)
-        return SLSTMState(*(torch.stack(field) for field in zip(*steps, strict=True))), state
+        return scan_of(slstm_step, x, state, params)
 
 
 def readout_step(z: Tensor, y: Tensor, weight: Tensor, bias: Tensor, kappa: Tensor | float) -> Tensor:

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -17,6 +17,9 @@ from torch.nn.functional import linear
 from neurove_core import scan
 from neurove_core.surrogate import SURROGATES, Surrogate, spike
 from protocol.errors import InvalidField
+
+StateT = TypeVar("StateT", bound=tuple[Any, ...])
+ParamsT = TypeVar("ParamsT")
 
 
 class LIFParams(NamedTuple):
@@ -359,12 +362,11 @@ class LTC(nn.Module):
         require_shape_of_layer("LTC", inputs=inputs, hidden=hidden)
         require_threshold("LTC", v_th, surrogate, surrogate_width)
         self.hidden = hidden
-        bound = hidden**-0.5
-        self.w_x = nn.Parameter(torch.empty(hidden, inputs).uniform_(-bound, bound))
-        self.w_s = nn.Parameter(torch.empty(hidden, hidden).uniform_(-bound, bound))
-        self.b = nn.Parameter(torch.empty(hidden).uniform_(-bound, bound))
-        self.w_a = nn.Parameter(torch.empty(hidden, 2 * hidden).uniform_(-bound, bound))
-        self.b_a = nn.Parameter(torch.empty(hidden).uniform_(-bound, bound))
+        self.w_x = drawn_weights(hidden, hidden, inputs)
+        self.w_s = drawn_weights(hidden, hidden, hidden)
+        self.b = drawn_weights(hidden, hidden)
+        self.w_a = drawn_weights(hidden, hidden, 2 * hidden)
+        self.b_a = drawn_weights(hidden, hidden)
         self._constants = (v_th, surrogate, surrogate_width)
 
     def params(self) -> LTCParams:
@@ -382,12 +384,27 @@ class LTC(nn.Module):
         Raises:
             InvalidField: x is no sequence of this width, or the state is not of its batch.
         """
-        params, steps = self.params(), []
+        params = self.params()
         require_sequence("LTC", x, params.w_x.shape[1], state, self.hidden)
-        for x_t in x:
-            state = ltc_step(x_t, state, params)
-            steps.append(state)
-        return LTCState(*(torch.stack(field) for field in zip(*steps, strict=True))), state
+        return scan_of(ltc_step, x, state, params)
+
+
+def scan_of(
+    step: Callable[[Tensor, StateT, ParamsT], StateT], x: Tensor, state: StateT, params: ParamsT
+) -> tuple[StateT, StateT]:
+    """A step over a sequence (T, B, I): the states of all steps, each field (T, B, N), and the last one."""
+    steps = []
+    for x_t in x:
+        state = step(x_t, state, params)
+        steps.append(state)
+    fields = zip(*steps, strict=True)
+    return type(state)(*(torch.stack(field) for field in fields)), state
+
+
+def drawn_weights(hidden: int, *shape: int) -> nn.Parameter:
+    """Weights of a layer of N neurons, uniform within 1 / sqrt(N) of 0."""
+    bound = hidden**-0.5
+    return nn.Parameter(torch.empty(shape).uniform_(-bound, bound))
 
 
 def lif_params(what: str, decay: float, v_th: float, surrogate: Surrogate, surrogate_width: float) -> LIFParams:
