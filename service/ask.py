@@ -78,7 +78,9 @@ def _ask(transport: Transport, key: str, request: Message, reply: type[ReplyT], 
     answers = transport.ask(key, request.encode(), timeout_s)
     if not answers:
         # Zenoh tells a denied question from one that nobody answers as little as we can here.
-        raise NoService(f"no service answers {key}; is `neurove serve` running there, and does its access list let you ask?")
+        raise NoService(
+            f"no service answers {key}; is `neurove serve` running there, and does its access list let you ask?"
+        )
     return sorted((reply.decode(answer.payload) for answer in answers), key=lambda one: str(getattr(one, "node", "")))
 
 
@@ -90,7 +92,9 @@ def need_service(transport: Transport, config: ClientConfig) -> None:
     """
     if not transport.tokens(config.keys.alive(), ANSWER_S):
         behind = ", ".join(config.connect)
-        raise NoService(f"no service behind {behind}; is `neurove serve` running there, and does its access list know you?")
+        raise NoService(
+            f"no service behind {behind}; is `neurove serve` running there, and does its access list know you?"
+        )
 
 
 def listen(

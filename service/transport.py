@@ -255,7 +255,7 @@ def _where(listen: tuple[str, ...], connect: tuple[str, ...]) -> str:
 
 
 def _unreached(connect: tuple[str, ...]) -> str:
-    """Why no connection may have come about: Zenoh says the same of a port that is closed and of a refused certificate."""
+    """Why no connection came about, as far as Zenoh tells: a closed port and a refused certificate look the same."""
     secured = any(endpoint.startswith(("tls/", "quic/")) for endpoint in connect)
     refused = ", or one side refuses the other's certificate (zenoh_config)" if secured else ""
     return f"nobody listens at {', '.join(connect)}{refused}"
