@@ -10,7 +10,7 @@ import pytest
 import zenoh
 
 from service.transport import open_transport
-from tests.live.conftest import free_endpoint
+from tests.live.conftest import START_S, free_endpoint
 
 TLS = Path(__file__).resolve().parents[2] / "deploy" / "tls"
 
@@ -45,7 +45,7 @@ def access_list(config):
 
 def joined(endpoint, config):
     """Our own session, with the certificate of this configuration."""
-    return open_transport("client", connect=(endpoint,), config_file=config, patience_s=20)
+    return open_transport("client", connect=(endpoint,), config_file=config, patience_s=START_S)
 
 
 def bare(endpoint, config=None, **settings):
