@@ -77,7 +77,10 @@ def activate(transport: Transport, config: ClientConfig, model: str, node: str =
 def _ask(transport: Transport, key: str, request: Message, reply: type[ReplyT], timeout_s: float) -> list[ReplyT]:
     answers = transport.ask(key, request.encode(), timeout_s)
     if not answers:
-        raise NoService(f"no service answers {key}; is `neurove serve` running there?")
+        # Zenoh tells a denied question from one that nobody answers as little as we can here.
+        raise NoService(
+            f"no service answers {key}; is `neurove serve` running there, and does its access list let you ask?"
+        )
     return sorted((reply.decode(answer.payload) for answer in answers), key=lambda one: str(getattr(one, "node", "")))
 
 
@@ -88,7 +91,10 @@ def need_service(transport: Transport, config: ClientConfig) -> None:
         NoService: none is.
     """
     if not transport.tokens(config.keys.alive(), ANSWER_S):
-        raise NoService(f"no service behind {', '.join(config.connect)}; is `neurove serve` running there?")
+        behind = ", ".join(config.connect)
+        raise NoService(
+            f"no service behind {behind}; is `neurove serve` running there, and does its access list know you?"
+        )
 
 
 def listen(

@@ -57,7 +57,8 @@ def drive(args: argparse.Namespace) -> int:
     with ask.connect(config, patience_s=max(ask.CONNECT_S, args.wait), stop=stop) as transport:
         player = _player(args, recording, transport, config.keys)
         if args.wait and not player.wait_for_listener(args.wait, stop) and not stop.is_set():
-            raise ask.NoService(f"no service took up stream {player.label} within {args.wait:g} s")
+            may = "; if one runs, may this certificate feed it?" if config.zenoh_config else ""
+            raise ask.NoService(f"no service took up stream {player.label} within {args.wait:g} s{may}")
         sent = player.play(stop, speed=args.speed, loop=args.loop, duration_s=args.duration)
     broken = sent.broken.message if sent.broken else None
     if args.json:

@@ -224,9 +224,9 @@ def open_transport(
                     f"can not open a Zenoh session: {_where(listen, connect)}: {_reason(error)}"
                 ) from None
         if time.monotonic() >= deadline or stop.is_set():
-            raise EndpointError(f"nobody listens at {', '.join(connect)}")
+            raise EndpointError(_unreached(connect))
         if not waiting:
-            log.info("waiting for a router", connect=", ".join(connect))
+            log.info("waiting for a router", connect=", ".join(connect), why=_unreached(connect))
             waiting = True
         stop.wait(_RETRY_S)
 
@@ -252,6 +252,13 @@ def _session_config(
 def _where(listen: tuple[str, ...], connect: tuple[str, ...]) -> str:
     parts = [f"listen={', '.join(listen)}"] * bool(listen) + [f"connect={', '.join(connect)}"] * bool(connect)
     return " ".join(parts) or "no endpoints"
+
+
+def _unreached(connect: tuple[str, ...]) -> str:
+    """Why no connection came about, as far as Zenoh tells: a closed port and a refused certificate look the same."""
+    secured = any(endpoint.startswith(("tls/", "quic/")) for endpoint in connect)
+    refused = ", or one side refuses the other's certificate (zenoh_config)" if secured else ""
+    return f"nobody listens at {', '.join(connect)}{refused}"
 
 
 def _reason(error: zenoh.ZError) -> str:
