@@ -19,6 +19,7 @@ from safetensors import SafetensorError
 from torch import Tensor, nn
 
 from neurove_core.config import Config, ModelConfig
+from neurove_core.golden import Golden
 from neurove_core.network import NeuroVE
 from protocol.control import ModelInfo
 from protocol.errors import BadModel, shown
@@ -62,6 +63,7 @@ class Bundle:
     offset: Tensor  # (6): twist = network output * scale + offset, in linear_unit and rad/s
     scale: Tensor  # (6)
     linear_unit: LinearUnit = METRIC
+    golden: Golden | None = None  # none: the model can not be tested on another machine, and passes unseen
     digest: str = ""  # sha256 of the bundle's bytes, hex
 
     @property
