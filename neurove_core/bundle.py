@@ -121,8 +121,13 @@ class Bundle:
 
 
 def save(bundle: Bundle, path: Path) -> None:
-    """Write a bundle's file; it is whole or it is not there, and what was there before stays until it is."""
-    data, part = bundle.to_bytes(), path.with_name(path.name + ".part")
+    """Write a bundle's file, as `write_whole`."""
+    write_whole(path, bundle.to_bytes())
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file; it is whole or it is not there, and what was there before stays until it is."""
+    part = path.with_name(path.name + ".part")
     try:
         with part.open("wb") as file:
             file.write(data)

@@ -116,6 +116,11 @@ def packed(golden: Golden) -> dict[str, Tensor]:
     }
 
 
+def stored_bytes(counts: NDArray[np.uint8]) -> int:
+    """By how much windows (T, 2n, H, W) make a bundle's file larger, without their answers."""
+    return (counts.size + 7) // 8 + int(np.count_nonzero(counts))
+
+
 def unpacked(tensors: dict[str, Tensor], config: "ModelConfig", tolerance: float | None, name: str) -> Golden | None:
     """Take the golden test out of a bundle's tensors; none where it has none.
 
