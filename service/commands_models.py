@@ -186,12 +186,13 @@ def _write_new(path: Path, data: bytes, mode: int) -> None:
 def add(commands: Any) -> None:
     """Add these commands to the parser."""
     parser = commands.add_parser("model", help="Model bundles.").add_subparsers(required=True, metavar="COMMAND")
+    trust = "public keys of those who may make models"
     new = command(parser, "new", new_model, as_json=False)
     new.add_argument("file", type=Path, metavar="FILE", help="bundle to write, ending in .safetensors")
     new.add_argument("--seed", type=int, default=0, help="of the weights")
     inspect = command(parser, "inspect", inspect_model)
     inspect.add_argument("file", type=Path, metavar="BUNDLE", help="to read, and BUNDLE.sig where there is one")
-    inspect.add_argument("--trust", type=Path, nargs="+", default=[], metavar="PUB", help="public keys of its makers")
+    inspect.add_argument("--trust", type=Path, action="extend", nargs="+", default=[], metavar="PUB", help=trust)
     keys = command(parser, "keygen", keygen)
     keys.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="folder to write them to; default here")
     keys.add_argument(
@@ -204,7 +205,7 @@ def add(commands: Any) -> None:
     sign.add_argument("--allow-downgrade", action="store_true", help="nodes may take it after a higher release")
     verify = command(parser, "verify", verify_model)
     verify.add_argument("bundle", type=Path, metavar="BUNDLE", help="to check, with BUNDLE.sig beside it")
-    verify.add_argument("--trust", type=Path, nargs="+", required=True, metavar="PUB", help="public keys of its makers")
+    verify.add_argument("--trust", type=Path, action="extend", nargs="+", required=True, metavar="PUB", help=trust)
 
 
 def _release(text: str) -> int:

@@ -63,7 +63,8 @@ def release_told(signed: dict[str, Any]) -> str:
 
 def _pairs(fields: dict[str, Any] | None, skip: tuple[str, ...] = ()) -> str:
     told = {name: value for name, value in (fields or {}).items() if name not in skip and value is not None}
-    return ", ".join(f"{name} {value}" for name, value in told.items()) or "none"
+    shown = (f"{name} {value:.6g}" if isinstance(value, float) else f"{name} {value}" for name, value in told.items())
+    return ", ".join(shown) or "none"
 
 
 def _signature_told(state: dict[str, Any]) -> str:
