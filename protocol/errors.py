@@ -165,7 +165,7 @@ class Untrusted(NeuroVEError):
     code = "untrusted"
 
     def __init__(self, name: str, reason: str, why: str) -> None:
-        super().__init__(f"model {name}: {why}", value=name, reason=reason)
+        super().__init__(f"model {name}: signature refused ({reason}): {why}", value=name, reason=reason)
 
 
 class Downgrade(NeuroVEError):

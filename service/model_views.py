@@ -69,6 +69,6 @@ def _pairs(fields: dict[str, Any] | None, skip: tuple[str, ...] = ()) -> str:
 
 def _signature_told(state: dict[str, Any]) -> str:
     if "release" not in state:
-        return "none" if state["state"] == "none" else f"refused: {state['why']}"
+        return "none" if state["state"] == "none" else str(state["why"])
     valid = "valid" if state["state"] == "valid" else "not checked (say whom you trust: --trust PUB)"
     return f"{valid}, {release_told(state)}"

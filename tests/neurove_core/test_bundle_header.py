@@ -2,13 +2,16 @@
 
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neurove_core import bundle
+import neurove_core
+from neurove_core import bundle, golden, manifest
 from neurove_core.about import About, Limits, MadeBy
+from neurove_core.bundle import Header
 from protocol.errors import BadModel
 from tests.bundles import CONFIG, DATA, ORIGINAL, packed, refusal, unpacked, with_entries, with_fields
 
@@ -171,3 +174,12 @@ def test_a_pickle_is_refused_and_not_one_opcode_of_it_runs(tmp_path):
 
     refusal(pickle.dumps(Trap()))
     assert not list(tmp_path.iterdir())
+
+
+def test_the_page_of_the_format_names_every_field_and_reason():
+    page = (Path(neurove_core.__file__).parent / "BUNDLE.md").read_text()
+    named = [*Header.model_fields, *MadeBy.model_fields, *Limits.model_fields, *manifest.Signed.model_fields]
+    assert [name for name in named if f"`{name}`" not in page] == []
+    for bound in (bundle.MAX_BYTES >> 20, bundle.MAX_HEADER_BYTES >> 20, golden.MAX_CELLS >> 20):
+        assert f"{bound} MiB" in page
+    assert f"{bundle.MAX_TENSORS:,};" in page
