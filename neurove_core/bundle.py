@@ -8,7 +8,7 @@ import hashlib
 import json
 import os
 import struct
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Literal, Self
 
@@ -18,7 +18,10 @@ from pydantic import Field, ValidationError
 from safetensors import SafetensorError
 from torch import Tensor, nn
 
-from neurove_core.config import Config, ModelConfig
+from neurove_core import golden
+from neurove_core.about import About, Limits
+from neurove_core.config import ModelConfig
+from neurove_core.golden import Golden
 from neurove_core.network import NeuroVE
 from protocol.control import ModelInfo
 from protocol.errors import BadModel, shown
@@ -37,7 +40,7 @@ _KEY = "neurove"
 _OFFSET, _SCALE = "output.offset", "output.scale"
 
 
-class Header(Config):
+class Header(About):
     """What a bundle says about itself, as JSON in the file's safetensors header."""
 
     bundle_version: int = BUNDLE_VERSION
@@ -48,6 +51,7 @@ class Header(Config):
     linear_unit: LinearUnit = Field(
         METRIC, description="Of the linear part: m/s, or to be multiplied by the camera's height above the ground [m]."
     )
+    golden_tolerance: float | None = Field(None, gt=0, le=1, description="Of the golden test, where there is one.")
 
 
 @dataclass(frozen=True)
@@ -62,6 +66,8 @@ class Bundle:
     offset: Tensor  # (6): twist = network output * scale + offset, in linear_unit and rad/s
     scale: Tensor  # (6)
     linear_unit: LinearUnit = METRIC
+    about: About = field(default_factory=About)
+    golden: Golden | None = None  # none: the model can not be tested on another machine, and passes unseen
     digest: str = ""  # sha256 of the bundle's bytes, hex
 
     @property
@@ -76,6 +82,22 @@ class Bundle:
             parameters=parameters,
         )
 
+    @property
+    def release(self) -> int:
+        """Counter of this model's releases."""
+        return self.about.release
+
+    @property
+    def prime_windows(self) -> int:
+        """How many recent windows a stream replays so that this model's estimates are settled."""
+        windows = self.about.prime_windows
+        return self.config.settle_windows if windows is None else windows
+
+    @property
+    def limits(self) -> Limits:
+        """By how much it may differ from the model that it takes over from."""
+        return self.about.limits or Limits()
+
     def to_bytes(self) -> bytes:
         """The bundle as the bytes of its file."""
         header = Header(
@@ -84,9 +106,14 @@ class Bundle:
             provenance=self.provenance,
             config=self.config,
             linear_unit=self.linear_unit,
+            golden_tolerance=self.golden.tolerance if self.golden else None,
+            **dict(self.about),
         )
+        untold = About.model_fields.keys() - self.about.told() | (set() if self.golden else {"golden_tolerance"})
         tensors = {**_stored(self.network), _OFFSET: self.offset, _SCALE: self.scale}
-        return safetensors.torch.save(tensors, {_KEY: header.model_dump_json()})
+        if self.golden:
+            tensors |= golden.packed(self.golden)
+        return safetensors.torch.save(tensors, {_KEY: header.model_dump_json(exclude=untold)})
 
     def with_digest(self) -> Self:
         """This bundle, its digest computed."""
@@ -94,8 +121,13 @@ class Bundle:
 
 
 def save(bundle: Bundle, path: Path) -> None:
-    """Write a bundle's file; it is whole or it is not there, and what was there before stays until it is."""
-    data, part = bundle.to_bytes(), path.with_name(path.name + ".part")
+    """Write a bundle's file, as `write_whole`."""
+    write_whole(path, bundle.to_bytes())
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file; it is whole or it is not there, and what was there before stays until it is."""
+    part = path.with_name(path.name + ".part")
     try:
         with part.open("wb") as file:
             file.write(data)
@@ -134,6 +166,7 @@ def from_bytes(data: bytes, name: str) -> Bundle:
     except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:
         # the last two: a tensor without elements may claim sides that torch has no integer for
         raise BadModel(name, f"not a whole safetensors file: {error}") from None
+    test = golden.unpacked(tensors, header.config, header.golden_tolerance, name)
     with torch.device("meta"):  # shapes alone: a header of a few bytes may declare terabytes of weights
         wanted = {**_stored(NeuroVE(header.config)), _OFFSET: torch.zeros(6), _SCALE: torch.ones(6)}
     _check_tensors(tensors, wanted, name)
@@ -149,6 +182,8 @@ def from_bytes(data: bytes, name: str) -> Bundle:
         offset=offset,
         scale=scale,
         linear_unit=header.linear_unit,
+        about=About(**{told: getattr(header, told) for told in About.model_fields}),
+        golden=test,
         digest=hashlib.sha256(data).hexdigest(),
     )
 
@@ -167,9 +202,9 @@ def read_header(data: bytes, name: str) -> Header:
             name, f"header length {length}: not a safetensors file, or a header over {MAX_HEADER_BYTES} bytes"
         )
     try:
-        entries = json.loads(data[8 : 8 + length], object_pairs_hook=_object_without_duplicates)
+        entries = json.loads(data[8 : 8 + length], object_pairs_hook=object_without_duplicates)
         own = entries["__metadata__"][_KEY]
-        fields = json.loads(own, object_pairs_hook=_object_without_duplicates)
+        fields = json.loads(own, object_pairs_hook=object_without_duplicates)
     except (KeyError, TypeError):
         raise BadModel(
             name, "a safetensors file, but not a NeuroVE bundle: its header has no 'neurove' entry"
@@ -245,7 +280,8 @@ def _check_tensors(tensors: dict[str, Tensor], wanted: dict[str, Tensor], name: 
             raise BadModel(name, f"tensor {key!r} holds values that are not finite")
 
 
-def _object_without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+def object_without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Hook of `json.loads`: a key that stands twice is a ValueError, for readers differ on which one counts."""
     fields = dict(pairs)
     if len(fields) != len(pairs):
         raise ValueError("a key stands twice in one object")

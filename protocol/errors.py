@@ -157,3 +157,22 @@ class BadModel(NeuroVEError):
 
     def __init__(self, name: str, why: str) -> None:
         super().__init__(f"model {name}: {why}", value=name)
+
+
+class Untrusted(NeuroVEError):
+    """A model's signature does not show that someone trusted made exactly these bytes."""
+
+    code = "untrusted"
+
+    def __init__(self, name: str, reason: str, why: str) -> None:
+        super().__init__(f"model {name}: signature refused ({reason}): {why}", value=name, reason=reason)
+
+
+class Downgrade(NeuroVEError):
+    """A model's release is lower than one that was accepted before, and its signature does not allow that."""
+
+    code = "downgrade"
+
+    def __init__(self, name: str, release: int, highest: int) -> None:
+        why = f"release={release}: release {highest} was here before, and its signature does not allow a downgrade"
+        super().__init__(f"model {name}: {why}", value=release, bound=highest)

@@ -16,6 +16,7 @@ from service import (
     commands_asking,
     commands_bench,
     commands_experiments,
+    commands_models,
     commands_recordings,
     commands_running,
     commands_training,
@@ -56,6 +57,7 @@ def _parser() -> argparse.ArgumentParser:
     commands_asking.add(commands)
     commands_recordings.add(commands)
     commands_training.add(commands)
+    commands_models.add(commands)
     commands_experiments.add(commands)
     commands_bench.add(commands)
     return parser

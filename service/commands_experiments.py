@@ -1,4 +1,4 @@
-"""The commands of models and experiments, which need no service: model, reproduce."""
+"""The commands of experiments, which need no service: reproduce."""
 
 import argparse
 import json
@@ -7,34 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from protocol.errors import InvalidField
 from service.arguments import command, commit
-
-
-def new_model(args: argparse.Namespace) -> int:
-    """Write a bundle with random weights, to try a change of model with."""
-    from neurove_core import bundle
-
-    path: Path = args.file
-    if path.suffix != bundle.SUFFIX:
-        raise InvalidField("model new", "FILE", str(path), f"its name must end in {bundle.SUFFIX}")
-    made = bundle.untrained(args.seed, name=path.stem)
-    try:
-        bundle.save(made, path)
-    except OSError as error:
-        raise InvalidField("model new", "FILE", str(path), error.strerror or str(error)) from None
-    print(f"{path}: {made.name}, {made.digest[:12]}, untrained")
-    return 0
-
-
-def inspect_model(args: argparse.Namespace) -> int:
-    """What a bundle's file holds."""
-    from neurove_core import bundle
-
-    found = bundle.load(args.file)
-    about = found.info.model_dump() | {"config": found.config.model_dump(mode="json")}
-    print(json.dumps(about, indent=None if args.json else 2))
-    return 0
 
 
 def reproduce_firing(args: argparse.Namespace) -> int:
@@ -93,20 +66,6 @@ def _assignment(text: str) -> tuple[str, str]:
 
 def add(commands: Any) -> None:
     """Add these commands to the parser."""
-    _add_model(commands)
-    _add_reproduce(commands)
-
-
-def _add_model(commands: Any) -> None:
-    parser = commands.add_parser("model", help="Model bundles.").add_subparsers(required=True)
-    new = command(parser, "new", new_model, as_json=False)
-    new.add_argument("file", type=Path, metavar="FILE", help="bundle to write, ending in .safetensors")
-    new.add_argument("--seed", type=int, default=0, help="of the weights")
-    inspect = command(parser, "inspect", inspect_model)
-    inspect.add_argument("file", type=Path, metavar="FILE", help="bundle to read")
-
-
-def _add_reproduce(commands: Any) -> None:
     parser = commands.add_parser("reproduce", help="The paper's experiments.").add_subparsers(required=True)
     firing = command(parser, "firing", reproduce_firing)
     firing.add_argument("--seed", type=int, default=0, help="of the first of ten runs; default 0")

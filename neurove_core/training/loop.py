@@ -5,26 +5,33 @@ import math
 import subprocess
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from neurove_core import bundle
+from neurove_core import bundle, golden
+from neurove_core.about import About, MadeBy
 from neurove_core.encoding import to_spikes
+from neurove_core.estimator import Estimator
 from neurove_core.loss import group_loss, scaled_sum
 from neurove_core.network import NetworkState
 from neurove_core.training.batches import Segment, draw
 from neurove_core.training.config import RecipeConfig, TrainingConfig
-from neurove_core.training.data import Cache
-from neurove_core.training.run import Run, write_whole
+from neurove_core.training.data import Cache, Sequences
+from neurove_core.training.run import Run
 
 CHECKPOINT: Final = "checkpoint.safetensors"
 RUN_JSON: Final = "run.json"
 
 _CURVE_STEPS: Final = 100  # the curve has the mean of so many updates
 _PROVENANCE_CHARS: Final = 1000
+_GOLDEN_SEQUENCES: Final = 8
+_GOLDEN_BYTES: Final = 200_000
 
 
 class Progress(NamedTuple):
@@ -94,7 +101,9 @@ def train(
                 _write_run(run, out)
                 saved_s = time.monotonic()
     path = out / f"{config.name}{bundle.SUFFIX}"
-    bundle.save(run.bundle(provenance(run)), path)
+    made = run.bundle(provenance(run), about(run))
+    test = golden.record(Estimator(made), golden_windows(sequences))
+    bundle.save(replace(made, golden=test), path)
     return path
 
 
@@ -148,6 +157,39 @@ def provenance(run: Run) -> str:
     return text[:_PROVENANCE_CHARS]
 
 
+def about(run: Run) -> About:
+    """How this model was made, as fields, and how far off it was at its last updates."""
+    config = run.config
+    made_by = MadeBy(
+        program=f"neurove train {config.name}",
+        seed=config.recipe.seed,
+        commit=commit(),
+        torch=torch.__version__,
+        updates=run.step,
+        cpu_s=round(run.cpu_s, 1),
+        recipe=config.recipe.model_dump(mode="json"),
+        data=config.data.model_dump(mode="json"),
+    )
+    last = run.curve[-1] if run.curve else {}
+    errors = ("linear_error_m_s", "angular_error_rad_s")
+    return About(made_by=made_by, figures={f"training_{name}": last[name] for name in errors if name in last})
+
+
+def golden_windows(sequences: Sequences) -> NDArray[np.uint8]:
+    """Windows (T, 2n, H, W) for the golden test: the busiest ends of the first sequences that fit into a bundle.
+
+    They are fewer than `golden.WINDOWS` where the grid is large.
+    """
+    ends = []
+    for index in range(min(len(sequences), _GOLDEN_SEQUENCES)):
+        stop = len(sequences.twists[index])
+        end = sequences.counts(index, max(0, stop - golden.WINDOWS), stop)
+        while len(end) > 1 and golden.stored_bytes(end) > _GOLDEN_BYTES:
+            end = end[len(end) // 2 :]
+        ends.append(end)
+    return max(ends, key=np.count_nonzero)
+
+
 def commit() -> str | None:
     """The commit of the source that runs, or None where it is no work tree."""
     command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--exclude=*"]
@@ -181,4 +223,4 @@ def _write_run(run: Run, out: Path) -> None:
         "cpu_s": round(run.cpu_s, 1),
         "curve": run.curve,
     }
-    write_whole(out / RUN_JSON, json.dumps(about, indent=1).encode())
+    bundle.write_whole(out / RUN_JSON, json.dumps(about, indent=1).encode())

@@ -5,7 +5,6 @@ state, and holds everything: a run that goes on from one continues bit for bit, 
 """
 
 import json
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -16,7 +15,8 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
-from neurove_core.bundle import PER_HEIGHT, Bundle
+from neurove_core.about import About
+from neurove_core.bundle import PER_HEIGHT, Bundle, write_whole
 from neurove_core.loss import Balance
 from neurove_core.network import NeuroVE
 from neurove_core.training.config import TrainingConfig
@@ -48,7 +48,7 @@ class Run:
         offset, scale = output_scaling(sequences)
         return cls(config, *_network(config), offset, scale, np.random.default_rng((config.recipe.seed, 202)))
 
-    def bundle(self, provenance: str) -> Bundle:
+    def bundle(self, provenance: str, about: About | None = None) -> Bundle:
         """The model as it is now."""
         network = NeuroVE(self.config.model)
         network.load_state_dict(self.network.state_dict())
@@ -61,6 +61,7 @@ class Run:
             offset=self.offset,
             scale=self.scale,
             linear_unit=PER_HEIGHT,
+            about=about or About(),
         ).with_digest()
 
     def save(self, path: Path) -> None:
@@ -108,19 +109,6 @@ def output_scaling(sequences: Sequences) -> tuple[Tensor, Tensor]:
     offset[_SYMMETRIC] = 0
     groups = np.sqrt(((twists - offset) ** 2).reshape(-1, 2, 3).mean((0, 2)))
     return torch.tensor(offset, dtype=torch.float32), torch.tensor(np.repeat(groups, 3), dtype=torch.float32)
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file so that it is whole or what it was before."""
-    part = path.with_name(path.name + ".part")
-    try:
-        with part.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _network(config: TrainingConfig) -> tuple[NeuroVE, torch.optim.Adam]:

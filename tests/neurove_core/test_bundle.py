@@ -5,7 +5,6 @@ import hashlib
 import json
 import os
 import struct
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,71 +17,28 @@ from hypothesis import strategies as st
 
 from neurove_core import bundle
 from neurove_core.bundle import Bundle
-from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
+from neurove_core.config import NetworkConfig
 from neurove_core.estimator import Estimator
 from protocol.errors import BadModel
 from tests.builders import SENSOR, make_events
-
-CONFIG = ModelConfig(
-    window=WindowConfig(duration_us=10_000, bins=2),
-    canonical=CanonicalConfig(width=10, height=8),
-    network=NetworkConfig(channels=(3,), features=4, hidden=4, cells=1),
+from tests.bundles import (
+    CONFIG,
+    DATA,
+    ORIGINAL,
+    make_bundle,
+    packed,
+    refusal,
+    unpacked,
+    with_entries,
+    with_fields,
+    with_tensors,
 )
-
-
-def make_bundle(seed: int = 0, **config: Any) -> Bundle:
-    return bundle.untrained(seed, CONFIG.model_copy(update=config))
-
-
-ORIGINAL = make_bundle()
-DATA = ORIGINAL.to_bytes()
 
 
 def answers_of(model: Bundle) -> list[list[list[float]]]:
     estimator = Estimator(model)
     answer = estimator.push(make_events(2_000, duration_us=50_000), estimator.initial_state(SENSOR), 0)
     return [estimate.twists.tolist() for estimate in answer.estimates]
-
-
-def packed(header: bytes, data: bytes = b"") -> bytes:
-    return struct.pack("<Q", len(header)) + header + data
-
-
-def unpacked(data: bytes = DATA) -> tuple[dict[str, Any], bytes]:
-    (length,) = struct.unpack("<Q", data[:8])
-    return json.loads(data[8 : 8 + length]), data[8 + length :]
-
-
-def with_entries(edit: Callable[[dict[str, Any]], object]) -> bytes:
-    """The bundle's bytes with its safetensors header edited."""
-    entries, tensors = unpacked()
-    edit(entries)
-    return packed(json.dumps(entries).encode(), tensors)
-
-
-def with_fields(edit: Callable[[dict[str, Any]], object]) -> bytes:
-    """The bundle's bytes with its own header, inside that of safetensors, edited."""
-    entries, tensors = unpacked()
-    fields = json.loads(entries["__metadata__"]["neurove"])
-    edit(fields)
-    entries["__metadata__"]["neurove"] = json.dumps(fields)
-    return packed(json.dumps(entries).encode(), tensors)
-
-
-def with_tensors(edit: Callable[[dict[str, torch.Tensor]], object]) -> bytes:
-    """The bundle's bytes with its tensors edited."""
-    tensors = safetensors.torch.load(DATA)
-    edit(tensors)
-    return safetensors.torch.save(tensors, unpacked()[0]["__metadata__"])
-
-
-def refusal(data: bytes) -> str:
-    """The sentence that refuses these bytes."""
-    with pytest.raises(BadModel) as refused:
-        bundle.from_bytes(data, "some.safetensors")
-    assert refused.value.code == "bad_model"
-    assert refused.value.message.startswith("model some.safetensors: ")
-    return refused.value.message
 
 
 def assert_refused_or_another_model(data: bytes) -> None:

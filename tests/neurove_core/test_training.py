@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from neurove_core import bundle
+from neurove_core import bundle, golden
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.estimator import Estimator
 from neurove_core.geometry import lookup_table
@@ -20,7 +20,7 @@ from neurove_core.training import config as configs
 from neurove_core.training import data
 from neurove_core.training.batches import backwards, doubled, draw, mirrored, noisy, polarity_flipped, regained
 from neurove_core.training.config import DataConfig, RecipeConfig, TrainingConfig
-from neurove_core.training.loop import CHECKPOINT, RUN_JSON, learn, learning_rate, train
+from neurove_core.training.loop import CHECKPOINT, RUN_JSON, golden_windows, learn, learning_rate, train
 from neurove_core.training.run import Run
 from protocol.errors import BadModel, InvalidField
 
@@ -222,6 +222,42 @@ def test_the_trained_bundle_says_what_it_is(folder, tmp_path):
     assert made.linear_unit == "1/s per m of height"
     assert "12 updates" in made.provenance
     assert json.loads((tmp_path / RUN_JSON).read_text())["config"] == TINY.model_dump(mode="json")
+
+
+def test_the_trained_bundle_tells_how_it_was_made_and_brings_windows_it_was_trained_on(folder, sequences, tmp_path):
+    made = bundle.load(train(TINY, tmp_path, folder))
+    told = made.about.made_by
+    assert (told.program, told.seed, told.updates) == ("neurove train tiny", 0, 12)
+    assert TrainingConfig(name="tiny", model=made.config, data=told.data, recipe=told.recipe) == TINY
+    curve = json.loads((tmp_path / RUN_JSON).read_text())["curve"]
+    assert made.about.figures == {
+        f"training_{name}": curve[-1][name] for name in ("linear_error_m_s", "angular_error_rad_s")
+    }
+    seen = [sequences.counts(index, 0, 10) for index in range(3)]
+    busiest = max(seen, key=np.count_nonzero)
+    np.testing.assert_array_equal(made.golden.counts, busiest)
+    golden.check(Estimator(made))
+
+
+class Busy:
+    """Sequences whose every cell sees something in every window."""
+
+    def __init__(self, windows, cells):
+        self._seen = np.ones((windows, 10, cells, 10), np.uint8)
+        self.twists = [np.zeros((windows, 5, 6), np.float32)] * 9
+
+    def __len__(self):
+        return len(self.twists)
+
+    def counts(self, index, start, stop):
+        assert index < 8
+        return self._seen[start:stop]
+
+
+@pytest.mark.parametrize(("cells", "windows"), [(100, 12), (300, 3), (1_000, 1), (5_000, 1)])
+def test_golden_windows_are_fewer_where_they_would_make_a_bundle_too_large(cells, windows):
+    assert golden_windows(Busy(20, cells)).shape == (windows, 10, cells, 10)
+    assert golden_windows(Busy(4, 10)).shape == (4, 10, 10, 10)
 
 
 def test_the_learning_rate_rises_falls_and_ends_at_zero():

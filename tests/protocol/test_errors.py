@@ -12,6 +12,7 @@ from protocol.errors import (
     BadModel,
     BlobLength,
     Detail,
+    Downgrade,
     EventOutsideSensor,
     InternalError,
     InvalidField,
@@ -20,6 +21,7 @@ from protocol.errors import (
     UnknownFormat,
     UnknownModel,
     UnsupportedVersion,
+    Untrusted,
     shown,
 )
 from tests.protocol.messages import bounded
@@ -35,6 +37,8 @@ ERRORS: list[NeuroVEError] = [
     TimeBackwards(3, 20, 10),
     UnknownModel("spire-9", ("spire-7",)),
     BadModel("spire-8", "the header names no network"),
+    Untrusted("spire-8", "unknown_key", "signed by a key that is not trusted"),
+    Downgrade("spire-8", 3, 4),
 ]
 every_error = pytest.mark.parametrize("error", ERRORS, ids=lambda error: error.code)
 
@@ -91,6 +95,8 @@ def test_an_error_about_text_of_any_length_still_reaches_the_peer(text: str, tim
         UnknownFormat(text, ("soa6",)),
         UnknownModel(text, (text,) * (times % 9)),
         BadModel(text, text),
+        Untrusted(text, text, text),
+        Downgrade(text, times, times),
     ):
         reply = ErrorReply.decode(ErrorReply.of(error).encode())
         for told in (reply.message, *reply.details.values()):

@@ -1,0 +1,74 @@
+"""A bundle as `neurove model inspect` shows it: fields for machines, lines for people."""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from neurove_core.bundle import Bundle
+
+
+def about(found: "Bundle", data: bytes) -> dict[str, Any]:
+    """Everything that a bundle and its bytes tell, as JSON has it."""
+    import safetensors.torch
+
+    tensors = safetensors.torch.load(data)
+    return {
+        **found.info.model_dump(),
+        "size": len(data),
+        **found.about.model_dump(mode="json"),
+        "prime_windows": found.prime_windows,
+        "linear_unit": found.linear_unit,
+        "config": found.config.model_dump(mode="json"),
+        "golden": found.golden and {"windows": len(found.golden.counts), "tolerance": found.golden.tolerance},
+        "tensors": {
+            name: {"dtype": str(one.dtype).removeprefix("torch."), "shape": list(one.shape), "bytes": one.nbytes}
+            for name, one in sorted(tensors.items())
+        },
+    }
+
+
+def told(about: dict[str, Any]) -> Iterator[str]:
+    """What people read of what `about` gives, with its `signature`."""
+    window, grid, net = (about["config"][part] for part in ("window", "canonical", "network"))
+    rows = {
+        "name": about["name"],
+        "release": about["release"],
+        "digest": about["digest"],
+        "size": f"{about['size']:,} bytes, {len(about['tensors'])} tensors, {about['parameters']:,} parameters",
+        "trained": "yes" if about["trained"] else "no: its numbers mean nothing",
+        "provenance": about["provenance"],
+        "made by": _pairs(about["made_by"], skip=("recipe", "data")),
+        "recipe": _pairs(about["made_by"] and about["made_by"]["recipe"]),
+        "data": _pairs(about["made_by"] and about["made_by"]["data"]),
+        "figures": _pairs(about["figures"]),
+        "answers": f"{about['linear_unit']} and rad/s",
+        "windows": f"{window['duration_us'] / 1e3:g} ms in {window['bins']} bins, settled after "
+        f"{about['config']['settle_windows']}, primed with {about['prime_windows']}",
+        "camera": f"{grid['width']}x{grid['height']}, {grid['hfov_deg']:g} degrees wide",
+        "network": _pairs(net),
+        "limits": _pairs(about["limits"]),
+        "golden": _pairs(about["golden"]),
+        "signature": _signature_told(about["signature"]),
+    }
+    yield from (f"{what:<11}{value}" for what, value in rows.items())
+    yield "tensors"
+    yield from (f"  {name:<32}{one['dtype']:<9}{one['shape']}" for name, one in about["tensors"].items())
+
+
+def release_told(signed: dict[str, Any]) -> str:
+    """What a manifest says, in one line."""
+    downgrade = ", also after a higher one" if signed["allow_downgrade"] else ""
+    return f"release {signed['release']}{downgrade}, signed by key {signed['key_id']} at {signed['created']}"
+
+
+def _pairs(fields: dict[str, Any] | None, skip: tuple[str, ...] = ()) -> str:
+    told = {name: value for name, value in (fields or {}).items() if name not in skip and value is not None}
+    shown = (f"{name} {value:.6g}" if isinstance(value, float) else f"{name} {value}" for name, value in told.items())
+    return ", ".join(shown) or "none"
+
+
+def _signature_told(state: dict[str, Any]) -> str:
+    if "release" not in state:
+        return "none" if state["state"] == "none" else str(state["why"])
+    valid = "valid" if state["state"] == "valid" else "not checked (say whom you trust: --trust PUB)"
+    return f"{valid}, {release_told(state)}"

@@ -1,0 +1,70 @@
+"""A small bundle, and its bytes taken apart, edited and put together again."""
+
+import json
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import safetensors.torch
+import torch
+
+from neurove_core import bundle
+from neurove_core.bundle import Bundle
+from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
+from protocol.errors import BadModel
+
+CONFIG = ModelConfig(
+    window=WindowConfig(duration_us=10_000, bins=2),
+    canonical=CanonicalConfig(width=10, height=8),
+    network=NetworkConfig(channels=(3,), features=4, hidden=4, cells=1),
+)
+
+
+def make_bundle(seed: int = 0, **config: Any) -> Bundle:
+    return bundle.untrained(seed, CONFIG.model_copy(update=config))
+
+
+ORIGINAL = make_bundle()
+DATA = ORIGINAL.to_bytes()
+
+
+def packed(header: bytes, data: bytes = b"") -> bytes:
+    return struct.pack("<Q", len(header)) + header + data
+
+
+def unpacked(data: bytes = DATA) -> tuple[dict[str, Any], bytes]:
+    (length,) = struct.unpack("<Q", data[:8])
+    return json.loads(data[8 : 8 + length]), data[8 + length :]
+
+
+def with_entries(edit: Callable[[dict[str, Any]], object], data: bytes = DATA) -> bytes:
+    """The bundle's bytes with its safetensors header edited."""
+    entries, tensors = unpacked(data)
+    edit(entries)
+    return packed(json.dumps(entries).encode(), tensors)
+
+
+def with_fields(edit: Callable[[dict[str, Any]], object], data: bytes = DATA) -> bytes:
+    """The bundle's bytes with its own header, inside that of safetensors, edited."""
+    entries, tensors = unpacked(data)
+    fields = json.loads(entries["__metadata__"]["neurove"])
+    edit(fields)
+    entries["__metadata__"]["neurove"] = json.dumps(fields)
+    return packed(json.dumps(entries).encode(), tensors)
+
+
+def with_tensors(edit: Callable[[dict[str, torch.Tensor]], object], data: bytes = DATA) -> bytes:
+    """The bundle's bytes with its tensors edited."""
+    tensors = safetensors.torch.load(data)
+    edit(tensors)
+    return safetensors.torch.save(tensors, unpacked(data)[0]["__metadata__"])
+
+
+def refusal(data: bytes) -> str:
+    """The sentence that refuses these bytes."""
+    with pytest.raises(BadModel) as refused:
+        bundle.from_bytes(data, "some.safetensors")
+    assert refused.value.code == "bad_model"
+    assert refused.value.message.startswith("model some.safetensors: ")
+    return refused.value.message

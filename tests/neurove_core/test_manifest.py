@@ -1,0 +1,314 @@
+"""Signatures: what a trusted key signed is taken as it is, and anything else is refused with its own reason."""
+
+import base64
+import hashlib
+import json
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import pytest
+from cryptography.hazmat.primitives import serialization
+from cryptography.hazmat.primitives.asymmetric import ec, ed448, ed25519
+from hypothesis import given
+from hypothesis import strategies as st
+
+from neurove_core import bundle, manifest, signing_keys
+from neurove_core.about import About
+from protocol.errors import BadModel, Downgrade, InvalidField, Untrusted
+from tests.bundles import CONFIG, DATA, ORIGINAL, make_bundle
+
+KEY = ed25519.Ed25519PrivateKey.from_private_bytes(bytes(range(32)))
+OTHER = ed25519.Ed25519PrivateKey.from_private_bytes(bytes(range(1, 33)))
+PUBLIC = KEY.public_key()
+WHEN = datetime(2026, 3, 1, 12, 30, tzinfo=UTC)
+SIGNATURE = manifest.sign(DATA, KEY, release=4, created=WHEN)
+
+
+def refusal(reason, *, data=DATA, signature=SIGNATURE, trusted=(PUBLIC,)):
+    """The sentence that refuses, which must be for this reason."""
+    with pytest.raises(Untrusted) as refused:
+        manifest.verify(data, signature, trusted, "some.safetensors")
+    assert refused.value.code == "untrusted"
+    assert refused.value.details["reason"] == reason
+    assert refused.value.message.startswith("model some.safetensors: ")
+    assert len(refused.value.message) < 500
+    return refused.value.message
+
+
+def file_with(**fields):
+    """The signature file with some fields replaced."""
+    return json.dumps({**json.loads(SIGNATURE), **fields}).encode()
+
+
+def signed_by_hand(text, key=KEY):
+    """A signature file whose manifest is any text, truly signed."""
+    signature = base64.b64encode(key.sign(text.encode())).decode()
+    return json.dumps(
+        {"manifest": text, "signature": signature, "key_id": signing_keys.key_id(key.public_key())}
+    ).encode()
+
+
+def manifest_with(**fields):
+    """The manifest with some fields replaced, truly signed."""
+    return signed_by_hand(manifest.canonical({**json.loads(json.loads(SIGNATURE)["manifest"]), **fields}))
+
+
+def test_what_a_trusted_key_signed_is_told_with_its_release():
+    signed = manifest.verify(DATA, SIGNATURE, [OTHER.public_key(), PUBLIC])
+    assert (signed.name, signed.release, signed.allow_downgrade) == ("untrained", 4, False)
+    assert (signed.sha256, signed.size) == (ORIGINAL.digest, len(DATA))
+    assert signed.key_id == signing_keys.key_id(PUBLIC)
+    assert signed.created == "2026-03-01T12:30:00+00:00"
+    assert manifest.read(SIGNATURE) == signed
+
+
+def test_the_release_is_the_bundles_own_where_none_is_given():
+    data = replace(ORIGINAL, about=About(release=9)).to_bytes()
+    for given_release, want in ((None, 9), (0, 0), (12, 12)):
+        signature = manifest.sign(data, KEY, release=given_release, allow_downgrade=True)
+        signed = manifest.verify(data, signature, [PUBLIC])
+        assert (signed.release, signed.allow_downgrade) == (want, True)
+
+
+def test_signing_again_gives_the_same_bytes_and_another_configuration_another_digest_of_it():
+    assert manifest.sign(DATA, KEY, release=4, created=WHEN) == SIGNATURE
+    other = make_bundle(settle_windows=3).to_bytes()
+    one, two = (manifest.read(manifest.sign(data, KEY)).config_sha256 for data in (DATA, other))
+    assert one != two
+    assert one == hashlib.sha256(manifest.canonical(CONFIG.model_dump(mode="json")).encode()).hexdigest()
+
+
+def test_the_signature_can_be_checked_without_this_program():
+    fields = json.loads(SIGNATURE)
+    PUBLIC.verify(base64.b64decode(fields["signature"]), fields["manifest"].encode())
+    signed = json.loads(fields["manifest"])
+    assert json.dumps(signed, sort_keys=True, separators=(",", ":")) == fields["manifest"]
+    assert signed["sha256"] == hashlib.sha256(DATA).hexdigest()
+
+
+def test_a_key_that_is_not_trusted_is_refused_and_the_trusted_ones_are_named():
+    message = refusal("unknown_key", trusted=[OTHER.public_key()])
+    assert signing_keys.key_id(PUBLIC) in message
+    assert signing_keys.key_id(OTHER.public_key()) in message
+    assert "trusted: none" in refusal("unknown_key", trusted=[])
+
+
+def test_a_key_that_calls_itself_by_a_trusted_ones_name_is_refused():
+    forged = json.loads(manifest.sign(DATA, OTHER, release=4))
+    forged["key_id"] = signing_keys.key_id(PUBLIC)
+    refusal("bad_signature", signature=json.dumps(forged).encode())
+
+
+def test_a_manifest_that_was_changed_is_refused():
+    text = json.loads(SIGNATURE)["manifest"]
+    for changed in (text.replace('"release":4', '"release":5'), text + " ", text.replace("false", "true"), ""):
+        refusal("bad_signature", signature=file_with(manifest=changed))
+
+
+def test_the_signature_of_one_bundle_does_not_serve_another():
+    other = make_bundle(1).to_bytes()
+    assert len(other) == len(DATA)
+    assert "another file, or changed" in refusal("digest", data=other)
+    message = refusal("size", data=DATA + b"\x00")
+    assert str(len(DATA) + 1) in message
+    refusal("size", data=b"")
+
+
+@given(where=st.integers(0, len(DATA) - 1), bit=st.integers(0, 7))
+def test_every_flipped_bit_of_a_signed_bundle_is_refused(where, bit):
+    flipped = bytearray(DATA)
+    flipped[where] ^= 1 << bit
+    refusal("digest", data=bytes(flipped))
+
+
+@given(length=st.integers(0, len(DATA) - 1))
+def test_every_truncation_of_a_signed_bundle_is_refused(length):
+    refusal("size", data=DATA[:length])
+
+
+@given(where=st.integers(0, len(SIGNATURE) - 1), bit=st.integers(0, 7))
+def test_a_flipped_bit_of_a_signature_file_is_refused_or_says_the_same(where, bit):
+    flipped = bytearray(SIGNATURE)
+    flipped[where] ^= 1 << bit
+    assert_refused_or_the_same(bytes(flipped))
+
+
+@given(where=st.integers(0, len(SIGNATURE)), junk=st.binary(max_size=20), cut=st.integers(0, 20))
+def test_bytes_put_into_a_signature_file_are_refused_or_say_the_same(where, junk, cut):
+    assert_refused_or_the_same(SIGNATURE[:where] + junk + SIGNATURE[where + cut :])
+
+
+def assert_refused_or_the_same(signature):
+    try:
+        signed = manifest.verify(DATA, signature, [PUBLIC])
+    except Untrusted:
+        return
+    assert signed == manifest.read(SIGNATURE)
+
+
+@given(st.binary(max_size=300))
+def test_any_bytes_are_no_signature_file(data):
+    refusal("malformed", signature=data)
+
+
+@pytest.mark.parametrize(
+    ("signature", "words"),
+    [
+        (b"", "not JSON that can be read"),
+        (b"\xff\xfe", "not JSON that can be read"),
+        (SIGNATURE.decode().encode("utf-16"), "not JSON that can be read"),
+        (b"[" * 16_000, "not JSON that can be read"),
+        (b"[1]", "an object is expected, not [1]"),
+        (SIGNATURE[:-20], "not JSON that can be read"),
+        (SIGNATURE.replace(b'{"key_id"', b'{"key_id":"","key_id"', 1), "a key stands twice"),
+        (file_with(more=1), "more=1: Extra inputs are not permitted"),
+        (file_with(manifest=None), "manifest=None"),
+        (file_with(manifest={}), "manifest={}"),
+        (file_with(key_id="KEY"), "key_id='KEY'"),
+        (file_with(signature="*" * 88), "signature is not base64"),
+        (file_with(signature="\u00e9" * 88), "signature is not base64"),
+        (file_with(signature="A" * 89), "signature="),
+        (file_with(signature=7), "signature=7"),
+        (json.dumps({"manifest": "{}"}).encode(), "missing"),
+    ],
+    ids=range(16),
+)
+def test_a_signature_file_that_is_none_says_what_is_wrong(signature, words):
+    assert words in refusal("malformed", signature=signature)
+
+
+def test_a_short_signature_is_not_one():
+    refusal("bad_signature", signature=file_with(signature=""))
+    refusal("bad_signature", signature=file_with(signature="AAAA"))
+
+
+def test_a_manifest_that_no_text_encoding_holds_is_refused():
+    refusal("malformed", signature=file_with(manifest="\ud800"))
+
+
+def test_a_huge_signature_file_is_refused_unread():
+    message = refusal("too_large", signature=b"{" * (manifest.MAX_SIGNATURE_BYTES + 1))
+    assert str(manifest.MAX_SIGNATURE_BYTES) in message
+
+
+@pytest.mark.parametrize(
+    ("signature", "words"),
+    [
+        (signed_by_hand("no JSON"), "manifest: not JSON"),
+        (signed_by_hand('{"release":1,"release":2}'), "manifest: not JSON that can be read: a key stands twice"),
+        (signed_by_hand("[]"), "manifest: an object is expected"),
+        (manifest_with(kind="grocery list"), "kind='grocery list'"),
+        (manifest_with(release=-1), "release=-1"),
+        (manifest_with(release="4"), "release='4'"),
+        (manifest_with(release=True), "release=True"),
+        (manifest_with(release=1 << 63), "release="),
+        (manifest_with(allow_downgrade=1), "allow_downgrade=1"),
+        (manifest_with(sha256="A" * 64), "sha256="),
+        (manifest_with(size=bundle.MAX_BYTES + 1), "size="),
+        (manifest_with(expires="soon"), "expires='soon'"),
+        (manifest_with(key_id="0" * 16), "name different keys"),
+    ],
+    ids=range(13),
+)
+def test_a_manifest_that_is_none_is_refused_even_if_it_was_signed(signature, words):
+    assert words in refusal("malformed", signature=signature)
+
+
+@pytest.mark.parametrize("lie", [{"name": "other"}, {"config_sha256": "0" * 64}])
+def test_a_manifest_that_names_another_model_than_the_bundle_does_is_refused(lie):
+    refusal("manifest", signature=manifest_with(**lie))
+
+
+def test_what_is_no_bundle_is_not_signed_and_not_taken_even_if_it_was():
+    with pytest.raises(BadModel):
+        manifest.sign(b"hello", KEY)
+    text = manifest_with(sha256=hashlib.sha256(b"hello").hexdigest(), size=5)
+    with pytest.raises(BadModel, match="size=5"):
+        manifest.verify(b"hello", text, [PUBLIC])
+
+
+@pytest.mark.parametrize("release", [-1, 1 << 63])
+def test_a_release_out_of_bounds_is_not_signed(release):
+    with pytest.raises(InvalidField, match=f"release={release}"):
+        manifest.sign(DATA, KEY, release=release)
+
+
+@pytest.mark.parametrize(
+    ("release", "highest", "flag", "want"),
+    [
+        (0, None, False, True),
+        (0, 0, False, True),
+        (5, 4, False, True),
+        (4, 4, False, True),
+        (3, 4, False, False),
+        (3, 4, True, True),
+        (0, 1 << 62, True, True),
+    ],
+)
+def test_a_release_counter_never_goes_back_unless_a_signed_flag_allows_it(release, highest, flag, want):
+    assert manifest.allowed(release, highest, flag) is want
+    signed = manifest.read(manifest.sign(DATA, KEY, release=release, allow_downgrade=flag))
+    if want:
+        manifest.check_release(signed, highest)
+    else:
+        with pytest.raises(Downgrade, match=f"release={release}: release {highest} was here before") as refused:
+            manifest.check_release(signed, highest)
+        assert refused.value.code == "downgrade"
+
+
+def test_keys_come_back_from_their_files_and_are_known_by_the_same_id():
+    private = signing_keys.read_private(signing_keys.private_pem(KEY), "k")
+    public = signing_keys.read_public(signing_keys.public_pem(PUBLIC), "p")
+    assert signing_keys.key_id(private.public_key()) == signing_keys.key_id(public) == signing_keys.key_id(PUBLIC)
+    manifest.verify(DATA, manifest.sign(DATA, private), [public])
+    assert signing_keys.key_id(signing_keys.new().public_key()) != signing_keys.key_id(PUBLIC)
+
+
+def pem(key, encryption=None):
+    encryption = encryption or serialization.NoEncryption()
+    return key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, encryption)
+
+
+@pytest.mark.parametrize(
+    ("data", "why"),
+    [
+        (b"", "not a private key in PEM"),
+        (signing_keys.private_pem(KEY)[:60], "not a private key in PEM"),
+        (signing_keys.public_pem(PUBLIC), "it is a public key"),
+        (pem(KEY, serialization.BestAvailableEncryption(b"secret")), "locked by a pass phrase"),
+        (pem(ed448.Ed448PrivateKey.generate()), "not an Ed25519 one"),
+        (pem(ec.generate_private_key(ec.SECP256R1())), "not an Ed25519 one"),
+        (b" " * 20_000, "at most 16384"),
+    ],
+    ids=range(7),
+)
+def test_a_file_that_is_no_private_key_says_what_it_is(data, why):
+    with pytest.raises(InvalidField, match=why) as refused:
+        signing_keys.read_private(data, "some.key")
+    assert "some.key" in refused.value.message
+
+
+@pytest.mark.parametrize(
+    ("data", "why"),
+    [
+        (b"", "not a public key in PEM"),
+        (b"-----BEGIN PUBLIC KEY-----\nAAAA\n-----END PUBLIC KEY-----\n", "not a public key in PEM"),
+        (signing_keys.private_pem(KEY), "it is a private key"),
+        (b" " * 20_000, "at most 16384"),
+    ],
+    ids=range(4),
+)
+def test_a_file_that_is_no_public_key_says_what_it_is(data, why):
+    with pytest.raises(InvalidField, match=why):
+        signing_keys.read_public(data, "some.pub")
+
+
+def test_a_public_key_of_another_algorithm_is_refused():
+    other = ec.generate_private_key(ec.SECP256R1()).public_key()
+    data = other.public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)
+    with pytest.raises(InvalidField, match="not an Ed25519 one"):
+        signing_keys.read_public(data, "some.pub")
+
+
+def test_a_name_outside_ascii_is_signed_as_it_is_written():
+    assert manifest.canonical({"é": 1}) == '{"é":1}'
