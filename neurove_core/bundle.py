@@ -6,7 +6,6 @@ tensors for the architecture that the header declares, finite values.
 
 import hashlib
 import json
-import os
 import struct
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +18,7 @@ from safetensors import SafetensorError
 from torch import Tensor, nn
 
 from neurove_core.config import Config, ModelConfig
+from neurove_core.files import write_whole
 from neurove_core.network import NeuroVE
 from protocol.control import ModelInfo
 from protocol.errors import BadModel, shown
@@ -95,15 +95,7 @@ class Bundle:
 
 def save(bundle: Bundle, path: Path) -> None:
     """Write a bundle's file; it is whole or it is not there, and what was there before stays until it is."""
-    data, part = bundle.to_bytes(), path.with_name(path.name + ".part")
-    try:
-        with part.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)  # it is there only where writing failed
+    write_whole(path, bundle.to_bytes())
 
 
 def load(path: Path) -> Bundle:

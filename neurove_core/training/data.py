@@ -9,7 +9,6 @@ import hashlib
 import json
 import math
 import multiprocessing
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurove_core import windows
 from neurove_core.config import ModelConfig
+from neurove_core.files import write_whole
 from neurove_core.geometry import lookup_table
 from neurove_core.io.errors import BrokenRecording
 from neurove_core.sim.camera import Camera, named_camera
@@ -186,13 +186,9 @@ def _make(job: tuple[TrainingConfig, int, Path]) -> str:
 
 def save(sequence: Sequence, path: Path) -> None:
     """Write a sequence's file; it is whole or it is not there."""
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    try:
-        arrays: dict[str, NDArray[Any]] = {"counts": sequence.counts, "twists": sequence.twists}
-        safetensors.numpy.save_file(arrays, part, {"height_m": repr(sequence.height_m), "name": sequence.name})
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    arrays: dict[str, NDArray[Any]] = {"counts": sequence.counts, "twists": sequence.twists}
+    about = {"height_m": repr(sequence.height_m), "name": sequence.name}
+    write_whole(path, safetensors.numpy.save(arrays, about))
 
 
 class Sequences:

@@ -13,12 +13,13 @@ from torch import Tensor
 
 from neurove_core import bundle
 from neurove_core.encoding import to_spikes
+from neurove_core.files import write_whole
 from neurove_core.loss import group_loss, scaled_sum
 from neurove_core.network import NetworkState
 from neurove_core.training.batches import Segment, draw
 from neurove_core.training.config import RecipeConfig, TrainingConfig
 from neurove_core.training.data import Cache
-from neurove_core.training.run import Run, write_whole
+from neurove_core.training.run import Run
 
 CHECKPOINT: Final = "checkpoint.safetensors"
 RUN_JSON: Final = "run.json"

@@ -5,7 +5,6 @@ state, and holds everything: a run that goes on from one continues bit for bit, 
 """
 
 import json
-import os
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Self
@@ -17,6 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from neurove_core.bundle import PER_HEIGHT, Bundle
+from neurove_core.files import write_whole
 from neurove_core.loss import Balance
 from neurove_core.network import NeuroVE
 from neurove_core.training.config import TrainingConfig
@@ -108,19 +108,6 @@ def output_scaling(sequences: Sequences) -> tuple[Tensor, Tensor]:
     offset[_SYMMETRIC] = 0
     groups = np.sqrt(((twists - offset) ** 2).reshape(-1, 2, 3).mean((0, 2)))
     return torch.tensor(offset, dtype=torch.float32), torch.tensor(np.repeat(groups, 3), dtype=torch.float32)
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file so that it is whole or what it was before."""
-    part = path.with_name(path.name + ".part")
-    try:
-        with part.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _network(config: TrainingConfig) -> tuple[NeuroVE, torch.optim.Adam]:
