@@ -44,7 +44,7 @@ class Sequence(NamedTuple):
     """T consecutive windows of one camera."""
 
     counts: NDArray[np.uint8]  # (T, 2n, H, W)
-    twists: NDArray[np.float32]  # (T, n, 6): vx vy vz per metre of camera height [1/s], wx wy wz [rad/s]
+    twists: NDArray[np.float32]  # (T, n, 6): vx vy vz per metre of camera height [1/s], wx wy wz [rad/s]; nan: unknown
     height_m: float
     name: str
 
@@ -141,7 +141,7 @@ class Cache:
 
     def __init__(self, folder: Path, config: TrainingConfig) -> None:
         self._config = config
-        kind = [FORMAT, config.data.model_dump(exclude={"sequences"})]
+        kind = [FORMAT, config.data.model_dump(exclude={"sequences", "recordings"})]
         kind += [config.model.window.model_dump(), config.model.canonical.model_dump()]
         self.folder = folder / hashlib.sha256(json.dumps(kind, sort_keys=True).encode()).hexdigest()[:16]
 
@@ -169,12 +169,16 @@ class Cache:
                 yield done.result()
 
     def open(self) -> "Sequences":
-        """All sequences of the configuration.
+        """All simulated sequences of the configuration.
 
         Raises:
             BrokenRecording: a file is not what this module wrote.
         """
-        return Sequences([self.path(index) for index in range(self._config.data.sequences)])
+        return Sequences(self.paths())
+
+    def paths(self) -> list[Path]:
+        """The files of all simulated sequences, there or not."""
+        return [self.path(index) for index in range(self._config.data.sequences)]
 
 
 def _make(job: tuple[TrainingConfig, int, Path]) -> str:
@@ -202,6 +206,7 @@ class Sequences:
     """
 
     def __init__(self, paths: list[Path]) -> None:
+        self.paths = paths
         self._files: list[Any] = []
         self.twists: list[NDArray[np.float32]] = []  # each (T, n, 6)
         self.height_m: list[float] = []
