@@ -37,7 +37,7 @@ class Scalars:
         except ImportError:
             log.warning("no curve for TensorBoard: %s", MissingExtra("tensorboard", "train").message)
             return
-        self._writer = SummaryWriter(str(folder / TENSORBOARD), purge_step=after_step + 1)  # type: ignore[no-untyped-call]
+        self._writer = SummaryWriter(str(folder / TENSORBOARD), purge_step=after_step + 1)
 
     def __enter__(self) -> Self:
         return self

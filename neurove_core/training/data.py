@@ -240,7 +240,8 @@ def _in_a_hand(rng: np.random.Generator, config: DataConfig, seed: int, slowed: 
     if way == "spun":
         axis = rng.standard_normal(3) * (0.4, 1.0, 0.4)
         rate = _log_uniform(rng, config.spun_rad_s) * axis / np.linalg.norm(axis)
-        return rotation(*(float(one) for one in rate), config.seconds)
+        wx, wy, wz = (float(one) for one in rate)
+        return rotation(wx, wy, wz, config.seconds)
     moved, turned = {"waved": (1.0, 1.0), "turned": (0.0, 1.0), "slid": (1.0, 0.0)}[way]
     return Part(hand_held(seed, config.seconds, moved, turned), 0.0, slowed, config.seconds)
 

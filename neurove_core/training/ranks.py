@@ -63,7 +63,7 @@ class Ranks:
             return
         gradients = [parameter.grad for parameter in parameters if parameter.grad is not None]
         means = self.mean(torch.cat([gradient.reshape(-1) for gradient in gradients]))
-        for gradient, mean in zip(gradients, means.split([one.numel() for one in gradients]), strict=True):
+        for gradient, mean in zip(gradients, torch.split(means, [one.numel() for one in gradients]), strict=True):
             gradient.copy_(mean.view_as(gradient))
 
     def gathered(self, value: Any) -> list[Any]:
@@ -256,7 +256,7 @@ def _joined(ranks: Ranks, store: str) -> Iterator[None]:
             os.environ.setdefault("GLOO_SOCKET_IFNAME", loopback)
     dist.init_process_group(
         "nccl" if ranks.device.type == "cuda" else "gloo",
-        store=dist.FileStore(store, ranks.count),
+        init_method=f"file://{store}",
         rank=ranks.rank,
         world_size=ranks.count,
         timeout=_TIMEOUT,

@@ -64,7 +64,7 @@ class Recorded:
             folder = self._folder_of(found)
             if not (folder / INDEX).exists():
                 folder.mkdir(parents=True, exist_ok=True)
-                lengths = []
+                lengths: list[int] = []
                 for sequence in pieces(found.recording, found.truth, found.height_m, self._config):
                     save(sequence, folder / f"{len(lengths):06d}.safetensors")
                     lengths.append(len(sequence.twists))
