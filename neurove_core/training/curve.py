@@ -81,8 +81,8 @@ def draw_curve(curve: list[dict[str, float]], folder: Path, title: str) -> list[
         if panel is panels[-1]:
             panel.plot(step, values, linewidth=1)
         else:
-            panel.plot(step, values, linewidth=0.6, alpha=0.5, label="mean of 100 updates")
-            panel.plot(step, smooth(values, _SMOOTH), linewidth=1.5, label=f"of the last {_SMOOTH} of these")
+            panel.plot(step, values, linewidth=0.6, alpha=0.5, label="mean since the point before")
+            panel.plot(step, smooth(values, _SMOOTH), linewidth=1.5, label=f"mean of {_SMOOTH} points")
             panel.set_yscale("log")
         panel.set_ylabel(label)
         panel.grid(visible=True, which="both", alpha=0.3)

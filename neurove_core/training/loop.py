@@ -27,7 +27,7 @@ from neurove_core.training.run import Run
 CHECKPOINT: Final = "checkpoint.safetensors"
 RUN_JSON: Final = "run.json"
 
-_CURVE_STEPS: Final = 100  # the curve has the mean of so many updates
+_CURVE_STEPS: Final = 100  # the curve has the mean of so many updates, of a short run of a hundredth of all
 _PROVENANCE_CHARS: Final = 1000
 _NAMES_CHARS: Final = 400  # of the recordings in it
 
@@ -125,7 +125,7 @@ def descend(
         recent += learn(run, draw(run.rng, sequences, share))
         mean = _mean(recent)
         on_progress(Progress(run.step, recipe.steps, 2 * mean.linear, 2 * mean.angular))
-        if len(recent) < _CURVE_STEPS and run.step < recipe.steps:
+        if len(recent) < min(_CURVE_STEPS, recipe.steps / 100) and run.step < recipe.steps:
             continue
         ranks = run.ranks.gathered((run.order, time.process_time() - began_s))
         run.cpu_s = spent_s + sum(cpu_s for _, cpu_s in ranks)
