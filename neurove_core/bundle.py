@@ -6,7 +6,6 @@ tensors for the architecture that the header declares, finite values.
 
 import hashlib
 import json
-import os
 import struct
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from torch import Tensor, nn
 from neurove_core import golden
 from neurove_core.about import About, Limits
 from neurove_core.config import ModelConfig
+from neurove_core.files import write_whole
 from neurove_core.golden import Golden
 from neurove_core.network import NeuroVE
 from protocol.control import ModelInfo
@@ -121,21 +121,8 @@ class Bundle:
 
 
 def save(bundle: Bundle, path: Path) -> None:
-    """Write a bundle's file, as `write_whole`."""
+    """Write a bundle's file; it is whole or it is not there, and what was there before stays until it is."""
     write_whole(path, bundle.to_bytes())
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file; it is whole or it is not there, and what was there before stays until it is."""
-    part = path.with_name(path.name + ".part")
-    try:
-        with part.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)  # it is there only where writing failed
 
 
 def load(path: Path) -> Bundle:

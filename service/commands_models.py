@@ -101,13 +101,14 @@ def keygen(args: argparse.Namespace) -> int:
 def sign_model(args: argparse.Namespace) -> int:
     """Sign a bundle: writes BUNDLE.sig beside it."""
     from neurove_core import bundle, manifest, signing_keys
+    from neurove_core.files import write_whole
 
     key = signing_keys.read_private(_read(args.key, signing_keys.MAX_KEY_BYTES), str(args.key))
     data, path = _bundle(args.bundle), args.bundle.with_name(args.bundle.name + manifest.SUFFIX)
     bundle.from_bytes(data, args.bundle.name)  # nobody vouches for what no node would load
     signature = manifest.sign(data, key, release=args.release, allow_downgrade=args.allow_downgrade)
     try:
-        bundle.write_whole(path, signature)
+        write_whole(path, signature)
     except OSError as error:
         raise InvalidField("model sign", "file", str(path), error.strerror or str(error)) from None
     signed = manifest.read(signature)

@@ -12,14 +12,15 @@ from service.arguments import command, sensor_size
 
 
 def train(args: argparse.Namespace) -> int:
-    """Train a model on simulated sequences, from a configuration and its seed."""
+    """Train a model on simulated sequences and recordings, from a configuration and its seed."""
     import torch
 
     from neurove_core.training import config as configs
-    from neurove_core.training import data, loop
+    from neurove_core.training import data, loop, ranks, recorded
 
     torch.set_num_threads(args.threads)
     config = configs.load(args.config)
+    ranks.device_of(args.device, devices=args.devices)  # told before anything is simulated
     out: Path = args.out or Path("runs") / config.name
     folder: Path = args.data or out / "data"
     with _progress() as show:
@@ -27,12 +28,17 @@ def train(args: argparse.Namespace) -> int:
         wanted = config.data.sequences
         for done, name in enumerate(cache.fill(args.workers), wanted - len(cache.missing()) + 1):
             show("simulated", done, wanted, name)
+        recordings = recorded.Recorded(folder, config)
+        missing = recordings.missing()
+        for done, name in enumerate(recordings.fill(), 1):
+            show("cut", done, missing, name)
 
         def learned(at: loop.Progress) -> None:
             errors = f"{at.linear_m_s:.3f} m/s {at.angular_rad_s:.4f} rad/s"
             show("learned", at.step, at.steps, errors)
 
-        path = loop.train(config, out, folder, resume=args.resume, on_progress=learned)
+        how: dict[str, Any] = {"resume": args.resume, "devices": args.devices, "device": args.device}
+        path = loop.train(config, out, folder, **how, on_progress=learned)
     told = {"bundle": str(path), "bytes": path.stat().st_size, "run": str(out / loop.RUN_JSON)}
     print(json.dumps(told) if args.json else f"wrote {path}, {told['bytes']:,} bytes")
     return 0
@@ -128,11 +134,17 @@ def add(commands: Any) -> None:
     """Add these commands to the parser."""
     parser = command(commands, "train", train)
     parser.add_argument("config", metavar="CONFIG", help="a TOML file, or `default`: that of the built-in model")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="checkpoint, run.json and bundle; default runs/NAME")
-    parser.add_argument("--data", type=Path, metavar="DIR", help="simulated sequences are kept there; default OUT/data")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="bundle, checkpoint, run.json, curve; default runs/NAME"
+    )
+    parser.add_argument("--data", type=Path, metavar="DIR", help="sequences are kept there; default OUT/data")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in OUT, if there is one")
+    parser.add_argument("--devices", type=int, default=1, metavar="N", help="share each batch over so many; default 1")
+    parser.add_argument("--device", default="auto", metavar="KIND", help="auto, cpu or cuda; default auto: GPUs if any")
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes that simulate; default 1")
-    parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads that learn; default 1")
+    parser.add_argument(
+        "--threads", type=int, default=1, metavar="N", help="threads of each device's process; default 1"
+    )
     parser = command(commands, "evaluate", evaluate)
     parser.add_argument("model", metavar="BUNDLE", help="a bundle's file, `default` or `untrained`")
     parser.add_argument("recordings", nargs="+", metavar="RECORDING", help="with truth, such as sim://street?seconds=8")

@@ -4,7 +4,7 @@ import tomllib
 from pathlib import Path
 from typing import Annotated, Final, Self
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
 from neurove_core.config import Config, ModelConfig
 from protocol.errors import InvalidField, shown
@@ -18,10 +18,30 @@ Span = tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]]
 Shares = dict[str, Annotated[float, Field(ge=0)]]
 
 
-class DataConfig(Config):
-    """What is simulated: each sequence draws its own scene, way, camera, mount and pixels (domain randomisation)."""
+class RecordedConfig(Config):
+    """A recording with truth, of any format that is read; in a configuration its source alone is enough."""
 
-    sequences: int = Field(128, ge=1, le=100_000, description="How many.")
+    source: str = Field(min_length=1, description="A file, a folder that is a recording or holds some, or sim://...")
+    height_m: float | None = Field(None, gt=0, le=1000, description="Of its camera; by default what it says itself.")
+    topic: str | None = Field(None, description="Which of several event streams.")
+    truth: str | None = Field(None, description="A file of the camera's poses; by default the truth that it holds.")
+
+
+def _named(value: object) -> object:
+    return {"source": value} if isinstance(value, str) else value
+
+
+class DataConfig(Config):
+    """What is simulated, and which recordings are learned from beside it or instead.
+
+    Each simulated sequence draws its own scene, way, camera, mount and pixels (domain randomisation). A recording is
+    cut into sequences of the same length.
+    """
+
+    sequences: int = Field(128, ge=0, le=100_000, description="How many are simulated.")
+    recordings: tuple[Annotated[RecordedConfig, BeforeValidator(_named)], ...] = Field(
+        (), description="Learned from as well; or alone, with sequences = 0."
+    )
     seconds: float = Field(6.0, gt=0, le=600, description="Length of each.")
     seed: int = Field(1_000_000, ge=0, lt=900_000_000, description="Sequence i has the scene and the way of seed + i.")
     motion_px: float = Field(1.5, ge=0.1, le=4, description="Most motion of a pixel between two of its renders.")
@@ -55,10 +75,16 @@ class DataConfig(Config):
     eps: Span = Field((0.001, 0.02), description="Log-uniform: how much of the log intensity the dark hides.")
 
     @model_validator(mode="after")
+    def _something(self) -> Self:
+        if not self.sequences and not self.recordings:
+            raise ValueError("sequences=0 and no recordings: there is nothing to learn from")
+        return self
+
+    @model_validator(mode="after")
     def _spans_and_shares(self) -> Self:
         for name in type(self).model_fields:
             value = getattr(self, name)
-            if isinstance(value, tuple) and value[0] > value[1]:
+            if name != "recordings" and isinstance(value, tuple) and value[0] > value[1]:
                 raise ValueError(f"{name}={value}: the least value comes first")
             if isinstance(value, dict) and not sum(value.values()) > 0:
                 raise ValueError(f"{name}={value}: some share must be above 0")
@@ -103,6 +129,11 @@ class RecipeConfig(Config):
         """Updates per segment."""
         return self.segment_windows // self.chunk_windows
 
+    @property
+    def most_windows(self) -> int:
+        """Most windows of a sequence that a segment takes."""
+        return self.segment_windows * (2 if self.doubled else 1)
+
 
 class TrainingConfig(Config):
     """A training run; the same configuration gives the same model on one machine and torch version."""
@@ -114,11 +145,15 @@ class TrainingConfig(Config):
 
     @model_validator(mode="after")
     def _segments_fit(self) -> Self:
-        windows = int(self.data.seconds * 1e6) // self.model.window.duration_us
-        takes = self.recipe.segment_windows * (2 if self.recipe.doubled else 1)
+        windows, takes = self.sequence_windows, self.recipe.most_windows
         if windows < takes:
             raise ValueError(f"a sequence has {windows} windows, a segment takes {takes}")
         return self
+
+    @property
+    def sequence_windows(self) -> int:
+        """Windows of a simulated sequence, and most of one that a recording is cut into."""
+        return int(self.data.seconds * 1e6) // self.model.window.duration_us
 
 
 def load(source: str) -> TrainingConfig:

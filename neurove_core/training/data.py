@@ -9,7 +9,6 @@ import hashlib
 import json
 import math
 import multiprocessing
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from neurove_core import windows
 from neurove_core.config import ModelConfig
+from neurove_core.files import write_whole
 from neurove_core.geometry import lookup_table
 from neurove_core.io.errors import BrokenRecording
 from neurove_core.sim.camera import Camera, named_camera
@@ -44,7 +44,7 @@ class Sequence(NamedTuple):
     """T consecutive windows of one camera."""
 
     counts: NDArray[np.uint8]  # (T, 2n, H, W)
-    twists: NDArray[np.float32]  # (T, n, 6): vx vy vz per metre of camera height [1/s], wx wy wz [rad/s]
+    twists: NDArray[np.float32]  # (T, n, 6): vx vy vz per metre of camera height [1/s], wx wy wz [rad/s]; nan: unknown
     height_m: float
     name: str
 
@@ -141,7 +141,7 @@ class Cache:
 
     def __init__(self, folder: Path, config: TrainingConfig) -> None:
         self._config = config
-        kind = [FORMAT, config.data.model_dump(exclude={"sequences"})]
+        kind = [FORMAT, config.data.model_dump(exclude={"sequences", "recordings"})]
         kind += [config.model.window.model_dump(), config.model.canonical.model_dump()]
         self.folder = folder / hashlib.sha256(json.dumps(kind, sort_keys=True).encode()).hexdigest()[:16]
 
@@ -169,12 +169,16 @@ class Cache:
                 yield done.result()
 
     def open(self) -> "Sequences":
-        """All sequences of the configuration.
+        """All simulated sequences of the configuration.
 
         Raises:
             BrokenRecording: a file is not what this module wrote.
         """
-        return Sequences([self.path(index) for index in range(self._config.data.sequences)])
+        return Sequences(self.paths())
+
+    def paths(self) -> list[Path]:
+        """The files of all simulated sequences, there or not."""
+        return [self.path(index) for index in range(self._config.data.sequences)]
 
 
 def _make(job: tuple[TrainingConfig, int, Path]) -> str:
@@ -186,13 +190,9 @@ def _make(job: tuple[TrainingConfig, int, Path]) -> str:
 
 def save(sequence: Sequence, path: Path) -> None:
     """Write a sequence's file; it is whole or it is not there."""
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    try:
-        arrays: dict[str, NDArray[Any]] = {"counts": sequence.counts, "twists": sequence.twists}
-        safetensors.numpy.save_file(arrays, part, {"height_m": repr(sequence.height_m), "name": sequence.name})
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    arrays: dict[str, NDArray[Any]] = {"counts": sequence.counts, "twists": sequence.twists}
+    about = {"height_m": repr(sequence.height_m), "name": sequence.name}
+    write_whole(path, safetensors.numpy.save(arrays, about))
 
 
 class Sequences:
@@ -206,6 +206,7 @@ class Sequences:
     """
 
     def __init__(self, paths: list[Path]) -> None:
+        self.paths = paths
         self._files: list[Any] = []
         self.twists: list[NDArray[np.float32]] = []  # each (T, n, 6)
         self.height_m: list[float] = []
@@ -239,7 +240,8 @@ def _in_a_hand(rng: np.random.Generator, config: DataConfig, seed: int, slowed: 
     if way == "spun":
         axis = rng.standard_normal(3) * (0.4, 1.0, 0.4)
         rate = _log_uniform(rng, config.spun_rad_s) * axis / np.linalg.norm(axis)
-        return rotation(*(float(one) for one in rate), config.seconds)
+        wx, wy, wz = (float(one) for one in rate)
+        return rotation(wx, wy, wz, config.seconds)
     moved, turned = {"waved": (1.0, 1.0), "turned": (0.0, 1.0), "slid": (1.0, 0.0)}[way]
     return Part(hand_held(seed, config.seconds, moved, turned), 0.0, slowed, config.seconds)
 

@@ -18,20 +18,25 @@ from neurove_core import bundle, golden
 from neurove_core.about import About, MadeBy
 from neurove_core.encoding import to_spikes
 from neurove_core.estimator import Estimator
+from neurove_core.files import write_whole
 from neurove_core.loss import group_loss, scaled_sum
 from neurove_core.network import NetworkState
 from neurove_core.training.batches import Segment, draw
 from neurove_core.training.config import RecipeConfig, TrainingConfig
+from neurove_core.training.curve import Scalars, draw_curve
 from neurove_core.training.data import Cache, Sequences
+from neurove_core.training.ranks import Ranks, together
+from neurove_core.training.recorded import Recorded
 from neurove_core.training.run import Run
 
 CHECKPOINT: Final = "checkpoint.safetensors"
 RUN_JSON: Final = "run.json"
 
-_CURVE_STEPS: Final = 100  # the curve has the mean of so many updates
+_CURVE_STEPS: Final = 100  # the curve has the mean of so many updates, of a short run of a hundredth of all
 _PROVENANCE_CHARS: Final = 1000
 _GOLDEN_SEQUENCES: Final = 8
 _GOLDEN_BYTES: Final = 200_000
+_NAMES_CHARS: Final = 400  # of the recordings in it
 
 
 class Progress(NamedTuple):
@@ -66,15 +71,19 @@ def train(
     data: Path,
     *,
     resume: bool = False,
+    devices: int = 1,
+    device: str = "cpu",
     on_progress: Callable[[Progress], None] = lambda _: None,
 ) -> Path:
     """Train a model to the end of its recipe.
 
     Args:
         config: of the run.
-        out: folder for the checkpoint, run.json and the bundle.
-        data: folder of the sequences, filled by `Cache.fill`.
+        out: folder for the checkpoint, run.json, the curve and the bundle.
+        data: folder of the sequences, filled by `Cache.fill` and `Recorded.fill`.
         resume: go on from the checkpoint in `out`, where there is one.
+        devices: processes that share each batch, each with its own device.
+        device: `cpu`, `cuda` or `auto`; see `ranks.device_of`.
         on_progress: told after each segment.
 
     Returns:
@@ -82,24 +91,17 @@ def train(
 
     Raises:
         BrokenRecording: a sequence is missing or broken. BadModel: the checkpoint can not be gone on from.
+        InvalidField: the batch does not split over the devices, or there are not so many. LostRank: one of them ended.
     """
     out.mkdir(parents=True, exist_ok=True)
-    checkpoint = out / CHECKPOINT
-    sequences = Cache(data, config).open()
-    run = Run.restore(checkpoint, config) if resume and checkpoint.exists() else Run.begin(config, sequences)
-    saved_s, began_s, recent = time.monotonic(), time.process_time() - run.cpu_s, list[_Losses]()
-    while run.step < config.recipe.steps:
-        recent += learn(run, draw(run.rng, sequences, config.recipe))
-        run.cpu_s = time.process_time() - began_s
-        mean = _mean(recent)
-        on_progress(Progress(run.step, config.recipe.steps, 2 * mean.linear, 2 * mean.angular))
-        if len(recent) >= _CURVE_STEPS or run.step >= config.recipe.steps:
-            run.curve.append(_point(run, mean))
-            recent = []
-            if time.monotonic() - saved_s >= config.recipe.checkpoint_s or run.step >= config.recipe.steps:
-                run.save(checkpoint)
-                _write_run(run, out)
-                saved_s = time.monotonic()
+    resume = resume and (out / CHECKPOINT).exists()
+    sequences = Sequences([*Cache(data, config).paths(), *Recorded(data, config).paths()])
+    begin(config, out, sequences, resume=resume, ranks=Ranks(count=devices))  # so that what is wrong is told by one
+    with together(devices, device, follow, (config, out, sequences.paths, resume)) as ranks:
+        run = begin(config, out, sequences, resume=resume, ranks=ranks)
+        with Scalars(out, run.step) as scalars:
+            descend(run, sequences, out, on_progress, scalars.add)
+    draw_curve(run.curve, out, f"{config.name}: {run.step} updates")
     path = out / f"{config.name}{bundle.SUFFIX}"
     made = run.bundle(provenance(run), about(run))
     test = golden.record(Estimator(made), golden_windows(sequences))
@@ -107,9 +109,49 @@ def train(
     return path
 
 
+def begin(config: TrainingConfig, out: Path, sequences: Sequences, *, resume: bool, ranks: Ranks) -> Run:
+    """A rank's run at its first update, or at that of the checkpoint."""
+    return Run.restore(out / CHECKPOINT, config, ranks) if resume else Run.begin(config, sequences, ranks)
+
+
+def follow(config: TrainingConfig, out: Path, paths: list[Path], resume: bool, ranks: Ranks) -> None:
+    """What every rank but the first does: learn, and write nothing."""
+    sequences = Sequences(paths)
+    descend(begin(config, out, sequences, resume=resume, ranks=ranks), sequences, out)
+
+
+def descend(
+    run: Run,
+    sequences: Sequences,
+    out: Path,
+    on_progress: Callable[[Progress], None] = lambda _: None,
+    on_point: Callable[[dict[str, float]], None] = lambda _: None,
+) -> None:
+    """Learn to the end of the recipe; the first rank leaves checkpoints and run.json in `out`."""
+    recipe, share = run.config.recipe, run.share
+    spent_s, saved_s, began_s, recent = run.cpu_s, time.monotonic(), time.process_time(), list[_Losses]()
+    while run.step < recipe.steps:
+        recent += learn(run, draw(run.rng, sequences, share))
+        mean = _mean(recent)
+        on_progress(Progress(run.step, recipe.steps, 2 * mean.linear, 2 * mean.angular))
+        if len(recent) < min(_CURVE_STEPS, recipe.steps / 100) and run.step < recipe.steps:
+            continue
+        ranks = run.ranks.gathered((run.order, time.process_time() - began_s))
+        run.cpu_s = spent_s + sum(cpu_s for _, cpu_s in ranks)
+        run.curve.append(_point(run, mean))
+        on_point(run.curve[-1])
+        recent = []
+        due = time.monotonic() - saved_s >= recipe.checkpoint_s or run.step >= recipe.steps
+        if due and run.ranks.first:
+            run.save(out / CHECKPOINT, [order for order, _ in ranks])
+            _write_run(run, out)
+            saved_s = time.monotonic()
+
+
 def learn(run: Run, segment: Segment) -> list[_Losses]:
     """Follow a segment's streams from rest, chunk by chunk, with an update of the weights after each."""
-    recipe = run.config.recipe
+    recipe, ranks = run.config.recipe, run.ranks
+    segment = Segment(*(tensor.to(ranks.device) for tensor in segment))
     state, losses = run.network.initial_state(segment.counts.shape[1]), []
     for first in range(0, recipe.segment_windows, recipe.chunk_windows):
         chunk = slice(first, first + recipe.chunk_windows)
@@ -117,10 +159,11 @@ def learn(run: Run, segment: Segment) -> list[_Losses]:
             group["lr"] = learning_rate(run.step, recipe)
         spikes = to_spikes(segment.counts[chunk], run.config.model.network.encoding)
         answers, state = run.network(spikes, state)
-        linear, angular = errors(run, answers, segment, chunk)
+        linear, angular = (ranks.mean(loss) for loss in errors(run, answers, segment, chunk))
         loss, run.balance = scaled_sum(linear, angular, run.balance, recipe.balance_decay)
         run.optimiser.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]  # torch's own
+        ranks.average_gradients(run.network.parameters())
         torch.nn.utils.clip_grad_norm_(run.network.parameters(), recipe.clip_norm)
         run.optimiser.step()
         run.step += 1
@@ -133,9 +176,10 @@ def errors(run: Run, answers: Tensor, segment: Segment, chunk: slice) -> tuple[T
     """L_l in m/s and L_a in rad/s of a chunk's answers (T, B, n, 6).
 
     The linear part is learned per metre of camera height, but its error counts in m/s: else streams near the ground,
-    whose numbers are large, would be all that is learned.
+    whose numbers are large, would be all that is learned. What the truth does not know is no error.
     """
-    error = answers * run.scale + run.offset - segment.twists[chunk]
+    truth = segment.twists[chunk]
+    error = torch.where(truth.isnan(), 0, answers * run.scale + run.offset - truth)
     return group_loss(error[..., :3] * segment.height_m[:, None, None]), group_loss(error[..., 3:])
 
 
@@ -149,9 +193,12 @@ def detached(state: NetworkState) -> NetworkState:
 def provenance(run: Run) -> str:
     """One line: how this model was made."""
     recipe, data = run.config.recipe, run.config.data
+    names = ", ".join(Path(one.source).name for one in data.recordings)
+    also = f", {len(data.recordings)} recordings ({names[:_NAMES_CHARS]})" if names else ""
+    also += f", {run.ranks.count} devices" if run.ranks.count > 1 else ""
     text = (
         f"neurove train {run.config.name}: {run.step} updates of {recipe.batch} x {recipe.chunk_windows} windows, "
-        f"seed {recipe.seed}, {data.sequences} simulated sequences of {data.seconds:g} s from seed {data.seed}, "
+        f"seed {recipe.seed}, {data.sequences} simulated sequences of {data.seconds:g} s from seed {data.seed}{also}, "
         f"{run.cpu_s:.0f} CPU s, commit {commit() or 'unknown'}, torch {torch.__version__}"
     )
     return text[:_PROVENANCE_CHARS]
@@ -220,7 +267,9 @@ def _write_run(run: Run, out: Path) -> None:
         "commit": commit(),
         "torch": torch.__version__,
         "step": run.step,
+        "devices": run.ranks.count,
+        "device": run.ranks.device.type,
         "cpu_s": round(run.cpu_s, 1),
         "curve": run.curve,
     }
-    bundle.write_whole(out / RUN_JSON, json.dumps(about, indent=1).encode())
+    write_whole(out / RUN_JSON, json.dumps(about, indent=1).encode())

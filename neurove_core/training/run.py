@@ -1,7 +1,8 @@
 """A training run: network, optimiser and all else that the next update depends on; checkpoints; the bundle at the end.
 
 A checkpoint is a safetensors file, so nothing is unpickled. It is written between segments, when no stream carries
-state, and holds everything: a run that goes on from one continues bit for bit, on one machine and torch version.
+state, and holds everything: a run that goes on from one continues bit for bit, on one machine and torch version. Where
+several processes learn, all go on from the one file.
 """
 
 import json
@@ -13,15 +14,18 @@ import numpy as np
 import safetensors
 import safetensors.torch
 import torch
+from pydantic import ValidationError
 from torch import Tensor, nn
 
 from neurove_core.about import About
-from neurove_core.bundle import PER_HEIGHT, Bundle, write_whole
+from neurove_core.bundle import PER_HEIGHT, Bundle
+from neurove_core.files import write_whole
 from neurove_core.loss import Balance
 from neurove_core.network import NeuroVE
-from neurove_core.training.config import TrainingConfig
+from neurove_core.training.config import RecipeConfig, TrainingConfig
 from neurove_core.training.data import Sequences
-from protocol.errors import BadModel
+from neurove_core.training.ranks import ALONE, Ranks, share_norms
+from protocol.errors import BadModel, InvalidField
 
 _KEY = "neurove_run"
 _SYMMETRIC = [0, 4, 5]  # vx wy wz: as often to one side as to the other, for half of what is seen is mirrored
@@ -38,15 +42,27 @@ class Run:
     scale: Tensor  # (6)
     rng: np.random.Generator
     balance: Balance = field(default_factory=Balance.initial)
+    ranks: Ranks = ALONE
     step: int = 0
     cpu_s: float = 0.0
     curve: list[dict[str, float]] = field(default_factory=list)
 
     @classmethod
-    def begin(cls, config: TrainingConfig, sequences: Sequences) -> Self:
-        """A run at its first step; weights and order are drawn from the recipe's seed."""
-        offset, scale = output_scaling(sequences)
-        return cls(config, *_network(config), offset, scale, np.random.default_rng((config.recipe.seed, 202)))
+    def begin(cls, config: TrainingConfig, sequences: Sequences, ranks: Ranks = ALONE) -> Self:
+        """A run at its first step; weights and order are drawn from the recipe's seed, the order anew for each rank.
+
+        Raises:
+            InvalidField: the batch can not be shared evenly, or no sequence knows one of the two velocities.
+        """
+        offset, scale = (one.to(ranks.device) for one in output_scaling(sequences))
+        network, optimiser = _network(config, ranks)
+        return cls(config, network, optimiser, offset, scale, _order(config, ranks), _balance(ranks), ranks)
+
+    @property
+    def share(self) -> RecipeConfig:
+        """The recipe with this rank's part of the batch."""
+        batch = self.config.recipe.batch // self.ranks.count
+        return self.config.recipe.model_copy(update={"batch": batch})
 
     def bundle(self, provenance: str, about: About | None = None) -> Bundle:
         """The model as it is now."""
@@ -58,29 +74,40 @@ class Run:
             provenance=provenance,
             config=self.config.model,
             network=network.eval(),
-            offset=self.offset,
-            scale=self.scale,
+            offset=self.offset.cpu(),
+            scale=self.scale.cpu(),
             linear_unit=PER_HEIGHT,
             about=about or About(),
         ).with_digest()
 
-    def save(self, path: Path) -> None:
-        """Write a checkpoint; it is whole or it is not there, and the one before stays until it is."""
+    def save(self, path: Path, orders: list[Any]) -> None:
+        """Write a checkpoint; it is whole or it is not there, and the one before stays until it is.
+
+        Args:
+            path: of the file.
+            orders: each rank's `order`.
+        """
         tensors = {f"network.{name}": tensor.contiguous() for name, tensor in self.network.state_dict().items()}
         for index, parameter in enumerate(self.network.parameters()):
             for name, value in self.optimiser.state.get(parameter, {}).items():
                 tensors[f"adam.{index}.{name}"] = value
         tensors |= {"offset": self.offset, "scale": self.scale, "balance": torch.stack(list(self.balance))}
         about = {"config": self.config.model_dump(mode="json"), "step": self.step, "cpu_s": self.cpu_s}
-        about |= {"rng": self.rng.bit_generator.state, "curve": self.curve}
-        write_whole(path, safetensors.torch.save(tensors, {_KEY: json.dumps(about)}))
+        about |= {"orders": orders, "curve": self.curve}
+        stored = {name: tensor.cpu() for name, tensor in tensors.items()}
+        write_whole(path, safetensors.torch.save(stored, {_KEY: json.dumps(about)}))
+
+    @property
+    def order(self) -> Any:
+        """What decides which segments this rank draws from here on."""
+        return self.rng.bit_generator.state
 
     @classmethod
-    def restore(cls, path: Path, config: TrainingConfig) -> Self:
-        """The run that a checkpoint holds.
+    def restore(cls, path: Path, config: TrainingConfig, ranks: Ranks = ALONE) -> Self:
+        """The run that a checkpoint holds, as one rank goes on with it.
 
         Raises:
-            BadModel: it is missing, broken, or of another configuration.
+            BadModel: it is missing, broken, of another configuration, or of another number of devices.
         """
         try:
             with safetensors.safe_open(path, "pt") as file:
@@ -88,52 +115,88 @@ class Run:
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
         except (OSError, KeyError, TypeError, ValueError, safetensors.SafetensorError) as error:
             raise BadModel(path.name, f"no checkpoint to go on from: {error}") from None
-        _same_config(path, about["config"], config.model_dump(mode="json"))
-        network, optimiser = _network(config)
+        _same_config(path, about["config"], config)
+        orders = about["orders"] if "orders" in about else [about.get("rng")]  # before `--devices` there was one
+        if len(orders) != ranks.count:
+            raise BadModel(path.name, f"it began with devices={len(orders)}, to go on takes as many, not {ranks.count}")
+        network, optimiser = _network(config, ranks)
         try:
             network.load_state_dict({n[8:]: tensor for n, tensor in tensors.items() if n.startswith("network.")})
             _restore_optimiser(optimiser, list(network.parameters()), tensors)
-            balance = Balance(*tensors["balance"].unbind())
-            run = cls(config, network, optimiser, tensors["offset"], tensors["scale"], np.random.default_rng(), balance)
+            offset, scale, balance = (tensors[name].to(ranks.device) for name in ("offset", "scale", "balance"))
+            run = cls(config, network, optimiser, offset, scale, np.random.default_rng())
+            run.balance, run.ranks = Balance(*balance.unbind()), ranks
             run.step, run.cpu_s, run.curve = int(about["step"]), float(about["cpu_s"]), list(about["curve"])
-            run.rng.bit_generator.state = about["rng"]
+            run.rng.bit_generator.state = orders[ranks.rank]
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise BadModel(path.name, f"a checkpoint that does not hold this run: {error}") from None
         return run
 
 
 def output_scaling(sequences: Sequences) -> tuple[Tensor, Tensor]:
-    """Offset and scale (6) of a network's outputs: mean of the truth, one spread for each group of three."""
+    """Offset and scale (6) of a network's outputs: mean of the truth, one spread for each group of three.
+
+    Raises:
+        InvalidField: no sequence has a truth of the linear, or of the angular velocity.
+    """
     twists = np.concatenate([twist.reshape(-1, 6) for twist in sequences.twists]).astype(np.float64)
-    offset = twists.mean(0)
+    known = np.isfinite(twists)
+    for group, start in (("linear", 0), ("angular", 3)):
+        if not known[:, start : start + 3].any():
+            why = f"none of them has a truth of the {group} velocity; learn from others as well"
+            raise InvalidField("training", "data.recordings", len(sequences), why)
+    offset = np.where(known, twists, 0).sum(0) / np.maximum(known.sum(0), 1)
     offset[_SYMMETRIC] = 0
-    groups = np.sqrt(((twists - offset) ** 2).reshape(-1, 2, 3).mean((0, 2)))
+    squares = np.where(known, (twists - offset) ** 2, 0).reshape(-1, 2, 3).sum((0, 2))
+    groups = np.sqrt(squares / known.reshape(-1, 2, 3).sum((0, 2)))
     return torch.tensor(offset, dtype=torch.float32), torch.tensor(np.repeat(groups, 3), dtype=torch.float32)
 
 
-def _network(config: TrainingConfig) -> tuple[NeuroVE, torch.optim.Adam]:
+def _order(config: TrainingConfig, ranks: Ranks) -> np.random.Generator:
+    """What a rank draws its segments by: its own, so that no two learn from the same ones."""
+    return np.random.default_rng((config.recipe.seed, 202, ranks.rank) if ranks.rank else (config.recipe.seed, 202))
+
+
+def _balance(ranks: Ranks) -> Balance:
+    return Balance(*(mean.to(ranks.device) for mean in Balance.initial()))
+
+
+def _network(config: TrainingConfig, ranks: Ranks) -> tuple[NeuroVE, torch.optim.Adam]:
+    if ranks.count < 1 or config.recipe.batch % ranks.count:
+        bound = f"recipe.batch={config.recipe.batch} does not split into so many equal parts"
+        raise InvalidField("training", "devices", ranks.count, bound)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.recipe.seed)
         network = NeuroVE(config.model)
     for norm in network.modules():
         if isinstance(norm, nn.BatchNorm1d | nn.BatchNorm2d):
             norm.momentum = config.recipe.norm_momentum
-    return network.train(), torch.optim.Adam(network.parameters(), lr=config.recipe.learning_rate)
+    if ranks.count > 1:
+        share_norms(network, ranks)
+    network = network.to(ranks.device).train()
+    return network, torch.optim.Adam(network.parameters(), lr=config.recipe.learning_rate)
 
 
 def _restore_optimiser(optimiser: torch.optim.Adam, parameters: list[Any], tensors: dict[str, Tensor]) -> None:
     for index, parameter in enumerate(parameters):
         prefix = f"adam.{index}."
         state = {name[len(prefix) :]: tensor for name, tensor in tensors.items() if name.startswith(prefix)}
-        if state:
-            optimiser.state[parameter] = state
+        if state:  # Adam counts its steps on the CPU
+            optimiser.state[parameter] = {n: one if n == "step" else one.to(parameter) for n, one in state.items()}
 
 
-def _same_config(path: Path, found: dict[str, Any], wanted: dict[str, Any]) -> None:
-    """Refuse to go on with another recipe than the run began with: its curve would belong to neither."""
-    for part, fields in wanted.items():
+def _same_config(path: Path, began: dict[str, Any], config: TrainingConfig) -> None:
+    """Refuse to go on with another recipe than the run began with: its curve would belong to neither.
+
+    A setting that did not exist when the run began had its default.
+    """
+    try:
+        found = TrainingConfig.model_validate(began).model_dump(mode="json")
+    except ValidationError as error:
+        raise BadModel(path.name, f"it began with a configuration that is none: {error.errors()[0]['msg']}") from None
+    for part, fields in config.model_dump(mode="json").items():
         for name, value in fields.items() if isinstance(fields, dict) else ((part, fields),):
-            was = found.get(part, {}).get(name) if isinstance(fields, dict) else found.get(part)
+            was = found[part][name] if isinstance(fields, dict) else found[part]
             if was != value:
                 why = f"it began with {part}.{name}={was}, the configuration says {value}"
                 raise BadModel(path.name, why)
