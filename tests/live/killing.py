@@ -1,0 +1,97 @@
+"""kill -9 of a service in the middle of a push or an activation, and what it serves after its restart."""
+
+import contextlib
+import signal
+import threading
+import time
+
+from neurove_core import bundle
+from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
+from protocol.errors import NeuroVEError
+from service import ask
+from service.config import ClientConfig
+from service.push_source import PushSource
+from tests.live.conftest import START_S, client, free_endpoint, is_alive, running, wait_until
+
+CONFIG = ModelConfig(
+    canonical=CanonicalConfig(width=24, height=16),
+    network=NetworkConfig(channels=(4, 4), features=128, hidden=128),
+    settle_windows=4,
+    low_activity_events=10,
+)
+"""Small to run, and some chunks to move."""
+
+CHUNK_S = 0.08
+"""What each chunk is made to take, so that a kill can come in between."""
+
+
+class Node:
+    """A service that is killed and started again, over one folder and one endpoint."""
+
+    def __init__(self, folder):
+        self.folder = folder
+        self.endpoint = free_endpoint()
+        self.config = ClientConfig(connect=(self.endpoint,))
+        self.active = None  # digest that it must serve; none: no change was acknowledged yet
+        self.ready_s = 0.0
+        (folder / "models").mkdir(parents=True, exist_ok=True)
+
+    @contextlib.contextmanager
+    def started(self):
+        """The running service, and what it says of its models once it is ready."""
+        began = time.monotonic()
+        arguments = ("--models-dir", str(self.folder / "models"), "--node", "n1", "--log-level", "error")
+        with running("serve", "--listen", self.endpoint, *arguments) as process, client(self.endpoint) as transport:
+            wait_until(lambda: is_alive(transport, self.config), START_S)
+            self.ready_s = time.monotonic() - began
+            (models,) = ask.models(transport, self.config)
+            yield process, transport, models
+
+    def kill_in_a_change(self, seed, *, at_step=None, after_s=None):
+        """Start it, push and activate a new model, and kill it -9 at a step or after a time.
+
+        Returns:
+            digest of the new model, the last step that was heard, and the model that served before.
+        """
+        path = self.folder / f"model{seed}.safetensors"
+        bundle.save(bundle.untrained(seed, CONFIG, f"model{seed}"), path)
+        heard, reached = ["nothing"], threading.Event()
+
+        def on_progress(said):
+            heard.append(said.step)
+            if said.step == at_step:
+                reached.set()
+
+        def change(transport, source):
+            with contextlib.suppress(NeuroVEError):  # the node is killed in the middle of it
+                ask.push(transport, self.config, source.request, "n1", on_progress)
+                ask.activate(transport, self.config, source.digest, "n1", on_progress=on_progress)
+                heard.append("acknowledged")
+                self.active = source.digest
+                reached.set()
+
+        with self.started() as (process, transport, before), PushSource(path) as source:
+            transport.answer(self.config.keys.chunks(source.digest), slowly(source.chunk), bulk=True)
+            thread = threading.Thread(target=change, args=(transport, source))
+            thread.start()
+            reached.wait(after_s if at_step is None else START_S)
+            process.end(signal.SIGKILL)
+            thread.join(START_S)
+            assert not thread.is_alive(), "the client waits for a node that was killed"
+        return source.digest, heard[-1], before.active.digest
+
+    def check(self, new, before):
+        """Start it again: it serves a whole model, the one that it must, and everything that it has is whole."""
+        with self.started() as (_, transport, models):
+            assert models.active.digest in ({self.active} if self.active == new else {new, before}), "another model"
+            assert models.unreadable == {}, models.unreadable
+            assert ask.health(transport, self.config)[0].ok
+            return models
+
+
+def slowly(chunk):
+    def answer(request):
+        threading.Event().wait(CHUNK_S)
+        return chunk(request)
+
+    return answer
