@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from protocol.control import ActivateReply, ErrorReply, PeerError, ProgressReply, PushReply
+from protocol.control import CHUNK_SCHEMA, ActivateReply, ErrorReply, PeerError, ProgressReply, PushReply
 from protocol.errors import NeuroVEError
 from service.arguments import add_client_flags, client_config, command, seconds
 from service.config import ClientConfig
@@ -27,7 +27,9 @@ def push(args: argparse.Namespace) -> int:
                 _print(args, ask.activate(transport, config, source.digest, node, on_progress=_progress(args)))
 
         return _each(
-            args, change, lambda transport, keys: transport.answer(keys.chunks(source.digest), source.chunk, bulk=True)
+            args,
+            change,
+            lambda transport, keys: transport.answer(keys.chunks(source.digest), source.chunk, CHUNK_SCHEMA),
         )
 
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Self
 
 import zenoh
 
-from protocol.control import CHUNK_SCHEMA, CONTROL_SCHEMA, PROGRESS_SCHEMA, ErrorReply, PeerError
+from protocol.control import CONTROL_SCHEMA, PROGRESS_SCHEMA, ErrorReply, PeerError
 from protocol.errors import Busy, InternalError, NeuroVEError
 from service import logs
 
@@ -129,20 +129,18 @@ class Transport:
 
         self._kept.append(self._session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
 
-    def answer(self, key: str, handle: Callable[[bytes], bytes], *, bulk: bool = False) -> None:
+    def answer(self, key: str, handle: Callable[[bytes], bytes], schema: str = CONTROL_SCHEMA) -> None:
         """Answer queries of a key on a thread of their own; what `handle` raises is told to the caller.
 
         Args:
             key: concrete key.
             handle: request payload to reply payload; raises NeuroVEError to refuse.
-            bulk: replies are chunks, sent after all other data.
+            schema: Zenoh Encoding of the replies.
         """
-        schema = CHUNK_SCHEMA if bulk else CONTROL_SCHEMA
-        priority = zenoh.Priority.DATA_LOW if bulk else zenoh.Priority.DATA
 
         def work(query: zenoh.Query) -> None:
             with query:
-                _reply(query, key, handle, schema, priority)
+                _reply(query, key, handle, schema)
 
         self._answer(key, work)
 
@@ -167,11 +165,11 @@ class Transport:
 
         def work_alone(query: zenoh.Query) -> None:
             def tell(payload: bytes) -> None:
-                _send(query, key, payload, PROGRESS_SCHEMA, zenoh.Priority.DATA)
+                _send(query, key, payload, PROGRESS_SCHEMA)
 
             with query:
                 try:
-                    _reply(query, key, lambda request: handle(request, tell), CONTROL_SCHEMA, zenoh.Priority.DATA)
+                    _reply(query, key, lambda request: handle(request, tell), CONTROL_SCHEMA)
                 finally:
                     free.release()
 
@@ -195,7 +193,7 @@ class Transport:
             key: key expression.
             request: payload of the query.
             timeout_s: later replies are not waited for.
-            bulk: the reply is large and in no hurry: it goes after all other data, and is not dropped.
+            bulk: the reply is large and in no hurry: it takes the query's priority, after all other data.
 
         Returns:
             replies, in the order they came; empty where nobody answers the key or nobody did in time.
@@ -250,9 +248,7 @@ class Transport:
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
 
-def _reply(
-    query: zenoh.Query, key: str, handle: Callable[[bytes], bytes], schema: str, priority: zenoh.Priority
-) -> None:
+def _reply(query: zenoh.Query, key: str, handle: Callable[[bytes], bytes], schema: str) -> None:
     try:
         answer = handle(query.payload.to_bytes() if query.payload else b"")
     except NeuroVEError as error:
@@ -260,13 +256,12 @@ def _reply(
     except Exception:  # a bug must not end the loop; the caller still gets an answer
         log.exception("handler failed", key=key)
         return _refuse(query, InternalError())
-    return _send(query, key, answer, schema, priority)
+    return _send(query, key, answer, schema)
 
 
-def _send(query: zenoh.Query, key: str, payload: bytes, schema: str, priority: zenoh.Priority) -> None:
-    block = zenoh.CongestionControl.BLOCK
+def _send(query: zenoh.Query, key: str, payload: bytes, schema: str) -> None:
     with contextlib.suppress(zenoh.ZError):  # the caller has left, or the session was closed
-        query.reply(key, payload, encoding=zenoh.Encoding(schema), priority=priority, congestion_control=block)
+        query.reply(key, payload, encoding=zenoh.Encoding(schema))
 
 
 def _refuse(query: zenoh.Query, error: NeuroVEError) -> None:

@@ -7,11 +7,12 @@ import time
 
 from neurove_core import bundle
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
+from protocol.control import CHUNK_SCHEMA
 from protocol.errors import NeuroVEError
 from service import ask
 from service.config import ClientConfig
 from service.push_source import PushSource
-from tests.live.conftest import START_S, client, free_endpoint, is_alive, running, wait_until
+from tests.live.conftest import START_S, free_endpoint, service
 
 CONFIG = ModelConfig(
     canonical=CanonicalConfig(width=24, height=16),
@@ -37,12 +38,11 @@ class Node:
         (folder / "models").mkdir(parents=True, exist_ok=True)
 
     @contextlib.contextmanager
-    def started(self):
-        """The running service, and what it says of its models once it is ready."""
+    def started(self, *more):
+        """The running service, with `more` arguments, and what it says of its models once it is ready."""
         began = time.monotonic()
-        arguments = ("--models-dir", str(self.folder / "models"), "--node", "n1", "--log-level", "error")
-        with running("serve", "--listen", self.endpoint, *arguments) as process, client(self.endpoint) as transport:
-            wait_until(lambda: is_alive(transport, self.config), START_S)
+        models_dir = str(self.folder / "models")
+        with service(self.endpoint, "--models-dir", models_dir, *more) as (process, transport, _):
             self.ready_s = time.monotonic() - began
             (models,) = ask.models(transport, self.config)
             yield process, transport, models
@@ -71,7 +71,7 @@ class Node:
                 reached.set()
 
         with self.started() as (process, transport, before), PushSource(path) as source:
-            transport.answer(self.config.keys.chunks(source.digest), slowly(source.chunk), bulk=True)
+            transport.answer(self.config.keys.chunks(source.digest), slowly(source.chunk), CHUNK_SCHEMA)
             thread = threading.Thread(target=change, args=(transport, source))
             thread.start()
             reached.wait(after_s if at_step is None else START_S)

@@ -4,7 +4,8 @@ import threading
 import pytest
 
 from neurove_core import bundle
-from protocol.control import PeerError
+from protocol.control import CHUNK_SCHEMA, PeerError
+from protocol.errors import NeuroVEError
 from protocol.events import encode_packet
 from service import ask
 from service.push_source import PushSource
@@ -101,19 +102,36 @@ def test_what_is_no_model_is_refused_by_the_node_and_leaves_nothing(node, files)
 def test_health_and_models_answer_while_a_push_goes_on_and_one_that_was_cut_goes_on_later(node, files):
     transport, config, _ = node
     with PushSource(files / "two.safetensors") as source:
+        gate = Gate(source.chunk, 3)
         with client(config.connect[0]) as pusher:
-            pusher.answer(config.keys.chunks(source.digest), slowly(source.chunk), bulk=True)
+            pusher.answer(config.keys.chunks(source.digest), gate, CHUNK_SCHEMA)
             threading.Thread(target=ignoring(lambda: ask.push(pusher, config, source.request, "n1"))).start()
             wait_until(lambda: partial(transport, config).get(source.digest, 0) > 0)
             assert ask.health(transport, config)[0].node == "n1"
+            gate.shut.set()
         have = partial(transport, config)[source.digest]  # the client has left
         assert 0 < have < source.request.size
         with client(config.connect[0]) as pusher:
-            pusher.answer(config.keys.chunks(source.digest), source.chunk, bulk=True)
+            pusher.answer(config.keys.chunks(source.digest), source.chunk, CHUNK_SCHEMA)
             reply = ask.push(pusher, config, source.request, "n1")  # waits for the first one to give up, or helps it on
             assert reply.fetched < source.request.size
         assert partial(transport, config) == {}
         assert source.digest in {one.digest for one in ask.models(transport, config)[0].staged}
+
+
+class Gate:
+    """Answers some chunks and keeps the next one waiting."""
+
+    def __init__(self, chunk, count):
+        self._chunk, self._left = chunk, count
+        self.shut = threading.Event()
+
+    def __call__(self, request):
+        self._left -= 1
+        if self._left < 0:
+            self.shut.wait(30)
+            raise NeuroVEError("gone")
+        return self._chunk(request)
 
 
 def partial(transport, config):
@@ -140,14 +158,14 @@ def test_two_clients_that_push_one_bundle_at_once_both_succeed_and_it_is_moved_o
     ):
         threads = []
         for transport in (first, second):
-            transport.answer(config.keys.chunks(source.digest), slowly(source.chunk), bulk=True)
+            transport.answer(config.keys.chunks(source.digest), slowly(source.chunk), CHUNK_SCHEMA)
             push = lambda transport=transport: replies.append(ask.push(transport, config, source.request, "n1"))  # noqa: E731
             threads.append(threading.Thread(target=push))
         for thread in threads:
             thread.start()
         for thread in threads:
             thread.join()
-    assert sorted(reply.fetched for reply in replies) == [0, source.request.size]
+        assert sorted(reply.fetched for reply in replies) == [0, source.request.size]
 
 
 def test_a_node_takes_so_many_pushes_at_once_and_says_when_it_is_busy(node, files):
@@ -192,3 +210,5 @@ def test_a_node_that_was_killed_in_a_change_starts_again_on_a_whole_model(tmp_pa
         assert models.active.digest == before
     if at_step == "done":
         assert (models.active.digest, models.previous.digest) == (new, before)
+        with node.started("--model", "untrained") as (_, _, configured):  # a newer decision than the one that was kept
+            assert configured.active.name == "untrained"
