@@ -33,18 +33,24 @@ class Node:
         self.folder = folder
         self.endpoint = free_endpoint()
         self.config = ClientConfig(connect=(self.endpoint,))
-        self.active = None  # digest that it must serve; none: no change was acknowledged yet
+        self.may_serve = set()  # digests after the last kill; empty: anything
         self.ready_s = 0.0
         (folder / "models").mkdir(parents=True, exist_ok=True)
 
     @contextlib.contextmanager
     def started(self, *more):
-        """The running service, with `more` arguments, and what it says of its models once it is ready."""
+        """The running service, with `more` arguments, and what it says of its models once it is ready.
+
+        It must serve a model that the last kill allows, and everything that it has must be whole.
+        """
         began = time.monotonic()
         models_dir = str(self.folder / "models")
         with service(self.endpoint, "--models-dir", models_dir, *more) as (process, transport, _):
             self.ready_s = time.monotonic() - began
             (models,) = ask.models(transport, self.config)
+            assert more or not self.may_serve or models.active.digest in self.may_serve, "another model serves"
+            assert models.unreadable == {}, models.unreadable
+            assert ask.health(transport, self.config)[0].ok
             yield process, transport, models
 
     def kill_in_a_change(self, seed, *, at_step=None, after_s=None):
@@ -67,11 +73,12 @@ class Node:
                 ask.push(transport, self.config, source.request, "n1", on_progress)
                 ask.activate(transport, self.config, source.digest, "n1", on_progress=on_progress)
                 heard.append("acknowledged")
-                self.active = source.digest
+                self.may_serve = {source.digest}
                 reached.set()
 
         with self.started() as (process, transport, before), PushSource(path) as source:
             transport.answer(self.config.keys.chunks(source.digest), slowly(source.chunk), CHUNK_SCHEMA)
+            self.may_serve = {source.digest, before.active.digest}
             thread = threading.Thread(target=change, args=(transport, source))
             thread.start()
             reached.wait(after_s if at_step is None else START_S)
@@ -80,12 +87,9 @@ class Node:
             assert not thread.is_alive(), "the client waits for a node that was killed"
         return source.digest, heard[-1], before.active.digest
 
-    def check(self, new, before):
-        """Start it again: it serves a whole model, the one that it must, and everything that it has is whole."""
-        with self.started() as (_, transport, models):
-            assert models.active.digest in ({self.active} if self.active == new else {new, before}), "another model"
-            assert models.unreadable == {}, models.unreadable
-            assert ask.health(transport, self.config)[0].ok
+    def restarted(self):
+        """What a new start says of its models."""
+        with self.started() as (_, _, models):
             return models
 
 

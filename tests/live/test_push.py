@@ -9,6 +9,7 @@ from protocol.errors import NeuroVEError
 from protocol.events import encode_packet
 from service import ask
 from service.push_source import PushSource
+from service.transport import open_transport
 from tests.builders import make_packets
 from tests.live.conftest import Heard, Source, client, free_endpoint, neurove, running, service, wait_until
 from tests.live.killing import CONFIG, Node, slowly
@@ -168,24 +169,55 @@ def test_two_clients_that_push_one_bundle_at_once_both_succeed_and_it_is_moved_o
         assert sorted(reply.fetched for reply in replies) == [0, source.request.size]
 
 
-def test_a_node_takes_so_many_pushes_at_once_and_says_when_it_is_busy(node, files):
-    _, config, _ = node
-    with client(config.connect[0]) as transport:
-        refused = []
+@pytest.fixture
+def pair():
+    endpoint = free_endpoint()
+    with open_transport("peer", listen=(endpoint,)) as listening, client(endpoint) as asking:
+        yield listening, asking
 
-        def push(number):
-            request = PushSource(files / "one.safetensors").request.model_copy(update={"digest": f"{number:064x}"})
-            try:
-                ask.push(transport, config, request, "n1")
-            except PeerError as error:
-                refused.append(error.code)
 
-        threads = [threading.Thread(target=push, args=(number,)) for number in range(6)]  # nobody answers their chunks
-        for thread in threads:
-            thread.start()
-        for thread in threads:
-            thread.join()
-    assert sorted(refused) == ["busy", "busy", "cut", "cut", "cut", "cut"]
+def test_every_reply_is_heard_as_it_comes_and_of_too_many_at_once_the_last_are_told_so(pair):
+    listening, asking = pair
+    go_on = threading.Event()
+
+    def handle(request, tell):
+        tell(b"began")
+        assert go_on.wait(30)
+        return request
+
+    listening.answer_streaming("t/work", handle, at_once=2)
+    working = [asking.ask_streaming("t/work", name, 30) for name in (b"first", b"second")]
+    assert [(next(one).payload) for one in working] == [b"began", b"began"]  # while they go on
+    with pytest.raises(PeerError, match="at most 2 such requests at once") as refused:
+        list(asking.ask_streaming("t/work", b"third", 30))
+    assert refused.value.code == "busy"
+    go_on.set()
+    assert sorted(next(one).payload for one in working) == [b"first", b"second"]
+    assert [one.payload for one in asking.ask("t/work", b"plain", 30)] == [b"plain"]  # progress was not asked for
+
+
+def test_a_caller_that_leaves_does_not_stop_the_work_nor_the_next_caller(pair):
+    listening, asking = pair
+    go_on, done = threading.Event(), threading.Event()
+
+    def handle(request, tell):
+        assert go_on.wait(30)
+        tell(b"to nobody")
+        done.set()
+        return request
+
+    listening.answer_streaming("t/work", handle, at_once=1)
+    assert list(asking.ask_streaming("t/work", b"first", 0.1)) == []  # the time is over
+    go_on.set()
+    assert done.wait(30)
+    wait_until(lambda: answers(asking))
+
+
+def answers(transport):
+    try:
+        return [one.payload for one in transport.ask("t/work", b"again", 30)] == [b"again"]
+    except PeerError:  # busy: the first one is about to end
+        return False
 
 
 def test_of_several_nodes_a_change_wants_to_know_which(node, files):
@@ -205,7 +237,7 @@ def test_of_several_nodes_a_change_wants_to_know_which(node, files):
 def test_a_node_that_was_killed_in_a_change_starts_again_on_a_whole_model(tmp_path, at_step):
     node = Node(tmp_path)
     new, _, before = node.kill_in_a_change(1, at_step=at_step)
-    models = node.check(new, before)
+    models = node.restarted()
     if at_step == "fetching":
         assert models.active.digest == before
     if at_step == "done":
