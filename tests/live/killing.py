@@ -76,7 +76,7 @@ class Node:
                 self.may_serve = {source.digest}
                 reached.set()
 
-        with self.started() as (process, transport, before), PushSource(path) as source:
+        with PushSource(path) as source, self.started() as (process, transport, before):
             transport.answer(self.config.keys.chunks(source.digest), slowly(source.chunk), CHUNK_SCHEMA)
             self.may_serve = {source.digest, before.active.digest}
             thread = threading.Thread(target=change, args=(transport, source))
