@@ -1,4 +1,4 @@
-"""Requests and replies of a node: health, models, activate; the status of a stream; and the error reply of all."""
+"""Requests and replies of a node: health, models, push, activate, rollback; the status of a stream; the error reply."""
 
 from typing import Annotated, ClassVar, Literal
 
@@ -14,6 +14,24 @@ STATUS_SCHEMA = "application/msgpack;neurove.status.1"
 
 CONTROL_SCHEMA = "application/msgpack;neurove.control.1"
 """Zenoh Encoding of control requests, their replies and error replies."""
+
+PROGRESS_SCHEMA = "application/msgpack;neurove.progress.1"
+"""Zenoh Encoding of a ProgressReply: a reply that is not the last one."""
+
+CHUNK_SCHEMA = "application/octet-stream"
+"""Zenoh Encoding of a chunk: bytes of a bundle, as they are."""
+
+MAX_CHUNK_BYTES = 1 << 20
+MAX_SIGNATURE_BYTES = 1 << 16
+
+Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+"""sha256 of a bundle, hexadecimal."""
+
+DigestPrefix = Annotated[str, Field(pattern="^[0-9a-f]{8,64}$")]
+"""The first 8 or more digits of a digest."""
+
+SignatureState = Literal["unsigned", "unchecked", "trusted", "untrusted"]
+"""None came; one came and this node trusts no key; of a key that it trusts; refused by the node."""
 
 
 class Request(Message):
@@ -40,6 +58,37 @@ class ActivateRequest(Request):
     what: ClassVar[str] = "activate request"
 
     model: Annotated[str, Field(min_length=1, max_length=128)]  # name, or the first 8 or more digits of its digest
+    expect: DigestPrefix | None = None  # of the active model: refused with conflict where it is another
+    shadow_s: Annotated[float, Field(ge=0, le=3600)] = 0.0  # runs beside the active model for so long first
+    canary: Annotated[tuple[Name, ...], Field(strict=False)] = ()  # streams that change; none means all
+
+
+class RollbackRequest(Request):
+    """Make the model before the active one again."""
+
+    what: ClassVar[str] = "rollback request"
+
+    expect: DigestPrefix | None = None  # of the active model: refused with conflict where it is another
+
+
+class PushRequest(Request):
+    """There is a bundle to be pulled, in chunks, from the queryable that its digest names."""
+
+    what: ClassVar[str] = "push request"
+
+    digest: Digest
+    size: Annotated[int, Field(ge=1, lt=1 << 63)]  # bytes
+    name: Annotated[str, Field(min_length=1, max_length=128)]  # for people: what errors call it
+    signature: Annotated[bytes, Field(max_length=MAX_SIGNATURE_BYTES)] | None = None
+
+
+class ChunkRequest(Request):
+    """Ask who pushes for a piece of the bundle; the answer is that many bytes of it, as they are."""
+
+    what: ClassVar[str] = "chunk request"
+
+    offset: Count
+    length: Annotated[int, Field(ge=1, le=MAX_CHUNK_BYTES)]
 
 
 class Losses(Part):
@@ -98,6 +147,9 @@ class ModelInfo(Part):
     trained: bool
     provenance: str  # one line: where it comes from
     parameters: Count
+    release: Count = 0  # counts up; 0 where its maker does not count
+    figures: dict[str, float] = Field(default_factory=dict)  # of its validation, as its maker names them
+    signature: SignatureState = "unsigned"
 
 
 class HealthReply(Message):
@@ -127,6 +179,30 @@ class ModelsReply(Message):
     epoch: Count
     available: Annotated[tuple[ModelInfo, ...], Field(strict=False)]
     unreadable: dict[str, str]  # file name -> why it is no model
+    staged: Annotated[
+        tuple[ModelInfo, ...], Field(strict=False)
+    ] = ()  # pushed and verified, neither active nor previous
+    partial: dict[str, Count] = Field(default_factory=dict)  # digest of a push that was cut -> bytes that are here
+
+
+class ProgressReply(Message):
+    """A step of a push, an activation or a rollback that still goes on; the last reply of the query is its result."""
+
+    what: ClassVar[str] = "progress reply"
+
+    node: Name
+    step: str
+    text: str
+
+
+class PushReply(Message):
+    """The bundle is on the node, whole and verified."""
+
+    what: ClassVar[str] = "push reply"
+
+    node: Name
+    model: ModelInfo
+    fetched: Count  # bytes that this push moved; 0 where the node had it
 
 
 class ActivateReply(Message):

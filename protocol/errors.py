@@ -168,6 +168,87 @@ class Untrusted(NeuroVEError):
         super().__init__(f"model {name}: signature refused ({reason}): {why}", value=name, reason=reason)
 
 
+class NoStore(NeuroVEError):
+    """The node keeps no pushed models: it was given no folder for them, or one that it can not write to."""
+
+    code = "no_store"
+
+    def __init__(self, why: str) -> None:
+        super().__init__(f"this node keeps no pushed models: {why}", why=why)
+
+
+class TooLarge(NeuroVEError):
+    """A bundle is larger than a node takes."""
+
+    code = "too_large"
+
+    def __init__(self, name: str, size: int, cap: int) -> None:
+        super().__init__(f"model {name}: size={size}: a bundle has at most {cap} bytes", value=size, bound=cap)
+
+
+class NoQuota(NeuroVEError):
+    """With this bundle the node's pushed models would take more than they may."""
+
+    code = "no_quota"
+
+    def __init__(self, name: str, size: int, used: int, quota: int) -> None:
+        super().__init__(
+            f"model {name}: size={size}: {used} of {quota} bytes for pushed models are taken",
+            value=size,
+            used=used,
+            bound=quota,
+        )
+
+
+class NoSpace(NeuroVEError):
+    """The node's disk is full."""
+
+    code = "no_space"
+
+    def __init__(self, name: str, need: int, free: int) -> None:
+        super().__init__(f"model {name}: needs {need} bytes, the node's disk has {free}", value=need, bound=free)
+
+
+class Cut(NeuroVEError):
+    """Whoever pushed a bundle stopped to answer; what came is kept, and the next push goes on from there."""
+
+    code = "cut"
+
+    def __init__(self, name: str, have: int, size: int, why: str) -> None:
+        super().__init__(
+            f"model {name}: cut at {have} of {size} bytes: {why}; the next push goes on from there",
+            value=have,
+            bound=size,
+        )
+
+
+class Busy(NeuroVEError):
+    """The node works on as many requests of this kind as it takes."""
+
+    code = "busy"
+
+    def __init__(self, at_once: int) -> None:
+        super().__init__(f"busy: this node works on at most {at_once} such requests at once", bound=at_once)
+
+
+class Conflict(NeuroVEError):
+    """Somebody else changed the model first, or is about to."""
+
+    code = "conflict"
+
+    def __init__(self, why: str) -> None:
+        super().__init__(f"conflict: {why}", why=why)
+
+
+class NothingBefore(NeuroVEError):
+    """There is no model to go back to."""
+
+    code = "nothing_before"
+
+    def __init__(self) -> None:
+        super().__init__("nothing to roll back to: this node has no model before the active one")
+
+
 class Downgrade(NeuroVEError):
     """A model's release is lower than one that was accepted before, and its signature does not allow that."""
 

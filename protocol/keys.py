@@ -11,6 +11,7 @@ from protocol.errors import InvalidField
 DEFAULT_PREFIX = "neurove/v1"
 NAME_RULE = "1 to 64 characters of A-Z a-z 0-9 _ . - and no dot or dash first"
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
+_DIGEST = re.compile(r"[0-9a-f]{64}")
 _PREFIX = re.compile(r"[A-Za-z0-9_.-]{1,64}(/[A-Za-z0-9_.-]{1,64}){0,7}")
 
 
@@ -82,6 +83,24 @@ class Keys:
         """Queryable: change the model of a node. Under `model/`, so that an access list can guard it alone."""
         return self._of_node(node, "model/activate")
 
+    def rollback(self, node: str = "*") -> str:
+        """Queryable: back to the model before."""
+        return self._of_node(node, "model/rollback")
+
+    def push(self, node: str = "*") -> str:
+        """Queryable: tell a node of a bundle that it may pull."""
+        return self._of_node(node, "model/push")
+
+    def chunks(self, digest: str) -> str:
+        """Queryable of whoever pushes a bundle: pieces of its bytes. Verbatim, so that no stream can shadow it.
+
+        Raises:
+            InvalidField: the digest is not 64 digits 0-9 a-f.
+        """
+        if not _DIGEST.fullmatch(digest):
+            raise InvalidField("key", "digest", digest, "64 digits 0-9 a-f")
+        return f"{self.prefix}/@push/{digest}"
+
     def alive(self, node: str = "*") -> str:
         """Liveliness token of a node."""
         return self._of_node(node, "alive")
@@ -89,6 +108,18 @@ class Keys:
     def serves(self, node: str = "*", stream: str = "*") -> str:
         """Liveliness token of a node that serves a stream."""
         return self._of_node(node, f"serves/{stream if stream == '*' else check_name('stream', stream)}")
+
+    def node_of(self, key: str) -> str:
+        """The node that a concrete key below `@node` belongs to.
+
+        Raises:
+            InvalidField: the key is not below `@node` of this prefix, or its node is no valid name.
+        """
+        head = f"{self.prefix}/@node/"
+        name, _, leaf = key.removeprefix(head).partition("/")
+        if not key.startswith(head) or not leaf:
+            raise InvalidField("key", "key", key, f"{head}<node>/<message>")
+        return check_name("node", name)
 
     def stream_of(self, key: str) -> str:
         """The stream that a concrete stream key (events, camera, velocity, status) belongs to.

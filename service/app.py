@@ -4,18 +4,21 @@ import threading
 import time
 from collections.abc import Callable
 
+from neurove_core.bundle import Bundle
 from protocol import CameraInfo
-from protocol.control import STATUS_SCHEMA, StreamStatus
+from protocol.control import STATUS_SCHEMA, ChunkRequest, StreamStatus
 from protocol.errors import NeuroVEError
 from protocol.velocity import SCHEMA as VELOCITY_SCHEMA
 from service import logs
+from service.active_file import Active, ActiveFile
 from service.config import ServiceConfig
 from service.handlers import Handlers
 from service.health import stream_status
 from service.lifecycle import notify
 from service.model_slot import ModelSlot
+from service.model_store import ModelStore
 from service.stream import Stream
-from service.transport import EndpointError, Publisher, Transport, open_transport
+from service.transport import EndpointError, Publisher, Tell, Transport, open_transport
 from service.worker import Inbox, Outlet, StreamWorker
 
 log = logs.get(__name__)
@@ -24,6 +27,7 @@ _TICK_S = 0.1
 _WATCHDOG_S = 1.0
 _WEDGED_S = 10.0
 _ASK_CAMERA_S = 1.0
+_CHUNK_S = 10.0
 _MOST_REFUSED = 1024
 _ROUTER_PATIENCE_S = 365 * 86_400.0
 
@@ -42,11 +46,21 @@ class Service:
     def __init__(self, config: ServiceConfig, stop: threading.Event) -> None:
         self._config, self._stop = config, stop
         self._keys = config.keys
-        self._slot = ModelSlot(config.model, config.models_dir)
+        self._active_file = ActiveFile(config.state_folder)
+        self._store = ModelStore(config.state_folder, config.models_dir, config.store_mib << 20)
+        self._slot = ModelSlot(
+            config.model,
+            config.models_dir,
+            pushed=self._store.bundles,
+            kept=self._kept(),
+            on_changed=self._keep,
+        )
         self._workers: dict[str, StreamWorker] = {}
         self._changing = threading.Lock()  # of the dict; a worker's stream is the worker's alone
         self._refused: dict[str, float] = {}  # stream -> when it was last heard of
-        self._handlers = Handlers(config.node, self._slot, self._statuses, lambda: len(self._refused))
+        self._handlers = Handlers(
+            config.node, self._slot, self._statuses, lambda: len(self._refused), self._store, self._active_file
+        )
 
     def run(self) -> None:
         """Serve until the stop event is set, then end everything in order.
@@ -91,10 +105,42 @@ class Service:
         keys, node = self._keys, self._config.node
         transport.answer(keys.health(node), self._handlers.health)
         transport.answer(keys.models(node), self._handlers.models)
-        transport.answer(keys.activate(node), self._handlers.activate)
+        transport.answer_streaming(keys.activate(node), self._handlers.activate)
+        transport.answer_streaming(keys.rollback(node), self._handlers.rollback)
+        transport.answer_streaming(keys.push(node), self._pushes(transport))
         transport.subscribe(keys.camera(), self._route(transport, StreamWorker.put_camera))
         transport.subscribe(keys.events(), self._route(transport, StreamWorker.put_packet))
         transport.token(keys.alive(node))
+
+    def _pushes(self, transport: Transport) -> Callable[[bytes, Tell], bytes]:
+        """Answers pushes by pulling the bundle from whoever pushes it."""
+
+        def pull(digest: str, request: ChunkRequest) -> bytes | None:
+            answers = transport.ask(self._keys.chunks(digest), request.encode(), _CHUNK_S, bulk=True)
+            return answers[0].payload if answers else None
+
+        return lambda request, tell: self._handlers.push(request, tell, pull, self._stop)
+
+    def _kept(self) -> tuple[str | None, str | None]:
+        """Digests of the model that served last and of the one before, where they go before the configured one."""
+        active = self._active_file.active
+        if active is None:
+            return None, None
+        if active.configured != self._config.model:
+            log.info("configured model is newer than the one that served last", model=self._config.model)
+            return None, None
+        return active.digest, active.previous
+
+    def _keep(self, model: Bundle) -> None:
+        previous, highest = self._slot.previous, self._active_file.highest_release
+        self._active_file.keep(
+            Active(
+                digest=model.digest,
+                previous=previous.digest if previous else None,
+                configured=self._config.model,
+                highest_release=max(highest, model.info.release),
+            )
+        )
 
     def _route(
         self, transport: Transport, put: Callable[[StreamWorker, bytes, int], None]

@@ -14,6 +14,7 @@ from service.config import ClientConfig, ServiceConfig, load
 
 BAD_NEWS: Final = 1
 WRONG_USAGE: Final = 2
+CONFLICT: Final = 3
 """Exit codes; 0 is fine."""
 
 Command = Callable[[argparse.Namespace], int]

@@ -1,7 +1,8 @@
 """neurove: every command. Parse, call one function, print for people or --json for machines.
 
 The commands are in `commands_*`, a module for each group. Exit codes: 0 fine; 1 the answer is bad news (nobody serves,
-a stream loses packets, a recording is broken); 2 wrong usage (an unknown source, setting or file).
+a stream loses packets, a recording is broken); 2 wrong usage (an unknown source, setting or file); 3 somebody else
+changed the model first.
 """
 
 import argparse
@@ -15,13 +16,14 @@ from protocol.errors import NeuroVEError
 from service import (
     commands_asking,
     commands_bench,
+    commands_changing,
     commands_experiments,
     commands_models,
     commands_recordings,
     commands_running,
     commands_training,
 )
-from service.arguments import BAD_NEWS, WRONG_USAGE, Command
+from service.arguments import BAD_NEWS, CONFLICT, WRONG_USAGE, Command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -42,6 +44,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _exit_code(error: NeuroVEError) -> int:
+    if error.code == "conflict":
+        return CONFLICT
     bad_news = {"no_service", "broken_recording", "nothing_recorded", "demo"}
     return BAD_NEWS if isinstance(error, PeerError) or error.code in bad_news else WRONG_USAGE
 
@@ -55,6 +59,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     commands_running.add(commands)
     commands_asking.add(commands)
+    commands_changing.add(commands)
     commands_recordings.add(commands)
     commands_training.add(commands)
     commands_models.add(commands)

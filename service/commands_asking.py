@@ -1,4 +1,4 @@
-"""The commands that ask a running service: watch, health, models, activate."""
+"""The commands that ask a running service: watch, health, models."""
 
 import argparse
 import contextlib
@@ -107,30 +107,12 @@ def _asked(
     return replies
 
 
-def activate(args: argparse.Namespace) -> int:
-    """Change the model of a node while it runs."""
-    from service import ask
-
-    config = client_config(args)
-    with ask.connect(config) as transport:
-        replies = ask.activate(transport, config, args.model, args.node)
-    for reply in replies:
-        if args.json:
-            print(reply.model_dump_json())
-        else:
-            new, old = reply.active, reply.previous
-            print(f"{reply.node}: {new.name} ({new.digest[:12]}) now serves, was {old.name} ({old.digest[:12]})")
-    return 0
-
-
 def add(commands: Any) -> None:
     """Add these commands to the parser."""
     parser = command(commands, "watch", watch)
     add_client_flags(parser)
     parser.add_argument("--count", type=int, default=sys.maxsize, metavar="N", help="end after so many lines")
-    for name, run in (("health", health), ("models", models), ("activate", activate)):
+    for name, run in (("health", health), ("models", models)):
         parser = command(commands, name, run)
         add_client_flags(parser)
         parser.add_argument("--node", default="*", help="one node; default all")
-        if run is activate:
-            parser.add_argument("model", metavar="MODEL", help="its name, or the first 8 digits of its digest")

@@ -84,6 +84,10 @@ class ServiceConfig(_Settings):
     connect: Endpoints = Field((), validate_default=True, description="Endpoints to connect to, such as a router's.")
     model: str = Field("default", min_length=1, description="Active model at start: its name, or a bundle's file.")
     models_dir: Path | None = Field(None, description="Folder of the bundles that may be activated.")
+    state_dir: Path | None = Field(
+        None, description="Folder of pushed models and of what is kept over a restart; by default models_dir."
+    )
+    store_mib: int = Field(2048, ge=1, le=1 << 20, description="Most that pushed models take on the disk [MiB].")
     queue_s: float = Field(1.0, gt=0, le=60, description="Packets that wait longer are dropped, oldest first [s].")
     queue_mib: int = Field(64, ge=1, le=4096, description="Most bytes waiting per stream [MiB].")
     max_streams: int = Field(16, ge=1, le=1024, description="Streams served at once; more are refused and counted.")
@@ -105,6 +109,11 @@ class ServiceConfig(_Settings):
         if info.data.get("mode") == "client" and not connect:
             raise ValueError("client mode needs an endpoint to connect to")
         return connect
+
+    @property
+    def state_folder(self) -> Path | None:
+        """Where pushed models and the active model are kept; None: nowhere."""
+        return self.state_dir or self.models_dir
 
     @property
     def limits(self) -> Limits:

@@ -1,20 +1,37 @@
-"""Request bytes -> reply bytes, one function per queryable; tested without a network."""
+"""Request bytes -> reply bytes, one function per queryable; tested without a network.
 
+What takes time gets a way to tell its progress too, each step as the bytes of a ProgressReply.
+"""
+
+import contextlib
 import importlib.metadata
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
+from neurove_core.bundle import Bundle
 from protocol.control import (
     ActivateReply,
     ActivateRequest,
     HealthReply,
     HealthRequest,
+    ModelInfo,
     ModelsReply,
     ModelsRequest,
+    ProgressReply,
+    PushReply,
+    PushRequest,
+    RollbackRequest,
     StreamStatus,
 )
+from protocol.errors import Downgrade, NeuroVEError
+from service.active_file import ActiveFile
 from service.health import node_verdict
-from service.model_slot import ModelSlot
+from service.model_slot import ModelSlot, Serving
+from service.model_store import ModelStore
+from service.progress import OnProgress, Progress
+from service.pull import Pull
+from service.signatures import Signed
 
 VERSION = importlib.metadata.version("neurove")
 
@@ -27,6 +44,8 @@ class Handlers:
         slot: its models.
         streams: the status of every stream it serves now.
         refused_streams: how many streams it did not take.
+        store: the models that were pushed to it.
+        active_file: what it keeps over a restart.
     """
 
     def __init__(
@@ -35,9 +54,12 @@ class Handlers:
         slot: ModelSlot,
         streams: Callable[[], list[StreamStatus]],
         refused_streams: Callable[[], int],
+        store: ModelStore | None = None,
+        active_file: ActiveFile | None = None,
     ) -> None:
         self._node, self._slot = node, slot
         self._streams, self._refused_streams = streams, refused_streams
+        self._store, self._active_file = store or ModelStore(None), active_file or ActiveFile(None)
         self._began = time.monotonic()
 
     def health(self, request: bytes) -> bytes:
@@ -53,7 +75,7 @@ class Handlers:
             why=why,
             uptime_s=time.monotonic() - self._began,
             version=VERSION,
-            model=active.estimator.bundle.info,
+            model=self._info(active.estimator.bundle.info),
             epoch=active.epoch,
             refused_streams=refused,
             streams=tuple(streams),
@@ -64,21 +86,83 @@ class Handlers:
         """Which models this node has."""
         ModelsRequest.decode(request)
         active, previous, available = self._slot.active, self._slot.previous, self._slot.available()
+        serving = {active.estimator.bundle.digest, previous.digest if previous else ""}
+        pushed = self._store.pushed()
+        models = tuple(self._info(info) for info in available.models)
         reply = ModelsReply(
             node=self._node,
-            active=active.estimator.bundle.info,
-            previous=previous.info if previous else None,
+            active=self._info(active.estimator.bundle.info),
+            previous=self._info(previous.info) if previous else None,
             epoch=active.epoch,
-            available=available.models,
+            available=models,
             unreadable=available.unreadable,
+            staged=tuple(info for info in models if info.digest in pushed - serving),
+            partial=self._store.partial(),
         )
         return reply.encode()
 
-    def activate(self, request: bytes) -> bytes:
+    def push(self, request: bytes, tell: Callable[[bytes], None], pull: Pull, stop: threading.Event) -> bytes:
+        """Pull a bundle, check it and keep it; it serves once it is activated."""
+        wanted = PushRequest.decode(request)
+        with self._progress(tell) as on_progress:
+            model, signed, fetched = self._store.fetch(wanted, pull, stop, on_progress, self._check_release)
+        info = model.info.model_copy(update={"signature": signed.state})
+        return PushReply(node=self._node, model=info, fetched=fetched).encode()
+
+    def activate(self, request: bytes, tell: Callable[[bytes], None] = lambda _: None) -> bytes:
         """Change the model; the old one serves until the new one is ready."""
         wanted = ActivateRequest.decode(request)
-        previous, serving = self._slot.activate(wanted.model)
+        with self._progress(tell) as on_progress:
+            for info in self._slot.available().models:
+                if info.name == wanted.model or info.digest.startswith(wanted.model):
+                    self._check_release(info, self._store.signed(info.digest))
+            previous, serving = self._slot.activate(
+                wanted.model,
+                expect=wanted.expect,
+                shadow_s=wanted.shadow_s,
+                canary=frozenset(wanted.canary),
+                on_progress=on_progress,
+            )
+        return self._changed(previous, serving)
+
+    def rollback(self, request: bytes, tell: Callable[[bytes], None] = lambda _: None) -> bytes:
+        """Back to the model before, whatever its release: it has served on this node."""
+        wanted = RollbackRequest.decode(request)
+        with self._progress(tell) as on_progress:
+            previous, serving = self._slot.rollback(expect=wanted.expect, on_progress=on_progress)
+        return self._changed(previous, serving)
+
+    def _changed(self, previous: Bundle, serving: Serving) -> bytes:
         reply = ActivateReply(
-            node=self._node, active=serving.estimator.bundle.info, previous=previous.info, epoch=serving.epoch
+            node=self._node,
+            active=self._info(serving.estimator.bundle.info),
+            previous=self._info(previous.info),
+            epoch=serving.epoch,
         )
         return reply.encode()
+
+    @contextlib.contextmanager
+    def _progress(self, tell: Callable[[bytes], None]) -> Iterator[OnProgress]:
+        """A way to tell each step; a refusal is the last one."""
+
+        def on_progress(progress: Progress) -> None:
+            tell(ProgressReply(node=self._node, step=progress.step, text=progress.text).encode())
+
+        try:
+            yield on_progress
+        except NeuroVEError as error:
+            on_progress(Progress("refused", error.message))
+            raise
+
+    def _check_release(self, info: ModelInfo, signed: Signed) -> None:
+        """Refuse a release below the highest that has served, unless its maker signed that it may be."""
+        highest = self._active_file.highest_release
+        if info.release < highest and not (signed.state == "trusted" and signed.allow_downgrade):
+            raise Downgrade(info.name, info.release, highest)
+
+    def _info(self, info: ModelInfo) -> ModelInfo:
+        try:
+            state = self._store.signed(info.digest).state
+        except (NeuroVEError, OSError):  # it would be refused now
+            state = "untrusted"
+        return info.model_copy(update={"signature": state})

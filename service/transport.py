@@ -4,19 +4,20 @@ Settings and traps are those measured in eclipse-zenoh 1.10: multicast and share
 direct callbacks that only append, every query answered, sessions always closed.
 """
 
+import contextlib
 import json
 import re
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
 
 import zenoh
 
-from protocol.control import CONTROL_SCHEMA, ErrorReply, PeerError
-from protocol.errors import InternalError, NeuroVEError
+from protocol.control import CONTROL_SCHEMA, PROGRESS_SCHEMA, ErrorReply, PeerError
+from protocol.errors import Busy, InternalError, NeuroVEError
 from service import logs
 
 log = logs.get(__name__)
@@ -46,6 +47,11 @@ class Answered(NamedTuple):
 
     key: str
     payload: bytes
+    schema: str = ""  # Zenoh Encoding
+
+
+Tell = Callable[[bytes], None]
+"""Sends one more reply, ahead of the last one; nothing happens where the caller has left."""
 
 
 class Publisher:
@@ -123,26 +129,71 @@ class Transport:
 
         self._kept.append(self._session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
 
-    def answer(self, key: str, handle: Callable[[bytes], bytes]) -> None:
+    def answer(self, key: str, handle: Callable[[bytes], bytes], schema: str = CONTROL_SCHEMA) -> None:
         """Answer queries of a key on a thread of their own; what `handle` raises is told to the caller.
 
         Args:
             key: concrete key.
             handle: request payload to reply payload; raises NeuroVEError to refuse.
+            schema: Zenoh Encoding of the replies.
         """
+
+        def work(query: zenoh.Query) -> None:
+            with query:
+                _reply(query, key, handle, schema)
+
+        self._answer(key, work)
+
+    def answer_streaming(self, key: str, handle: Callable[[bytes, Tell], bytes], at_once: int = 4) -> None:
+        """Answer queries whose work takes time: each on its own thread, with replies on the way to the last one.
+
+        A caller that leaves does not stop the work.
+
+        Args:
+            key: concrete key.
+            handle: request payload and a way to tell progress, to the last reply's payload; raises as in `answer`.
+            at_once: with so many under way further queries are refused as busy.
+        """
+        free = threading.BoundedSemaphore(at_once)
+
+        def work(query: zenoh.Query) -> None:
+            if free.acquire(blocking=False):
+                threading.Thread(target=work_alone, args=(query,), name=f"work {key}", daemon=True).start()
+            else:
+                with query:
+                    _refuse(query, Busy(at_once))
+
+        def work_alone(query: zenoh.Query) -> None:
+            def tell(payload: bytes) -> None:
+                _send(query, key, payload, PROGRESS_SCHEMA)
+
+            with query:
+                try:
+                    _reply(query, key, lambda request: handle(request, tell), CONTROL_SCHEMA)
+                finally:
+                    free.release()
+
+        self._answer(key, work)
+
+    def _answer(self, key: str, work: Callable[[zenoh.Query], None]) -> None:
         queryable = self._session.declare_queryable(key, zenoh.handlers.FifoChannel(16))
 
         def serve() -> None:
             for query in queryable:
-                with query:
-                    _reply(query, key, handle)
+                work(query)
 
         thread = threading.Thread(target=serve, name=f"answer {key}", daemon=True)
         thread.start()
         self._answering.append((queryable, thread))
 
-    def ask(self, key: str, request: bytes, timeout_s: float) -> list[Answered]:
+    def ask(self, key: str, request: bytes, timeout_s: float, *, bulk: bool = False) -> list[Answered]:
         """Query a key expression and wait for everybody's reply.
+
+        Args:
+            key: key expression.
+            request: payload of the query.
+            timeout_s: later replies are not waited for.
+            bulk: the reply is large and in no hurry: it takes the query's priority, after all other data.
 
         Returns:
             replies, in the order they came; empty where nobody answers the key or nobody did in time.
@@ -150,15 +201,35 @@ class Transport:
         Raises:
             PeerError: a peer refused, with its own code and reason.
         """
+        priority = zenoh.Priority.DATA_LOW if bulk else zenoh.Priority.DATA
+        return list(self._ask(key, request, timeout_s, priority, zenoh.ConsolidationMode.AUTO))
+
+    def ask_streaming(self, key: str, request: bytes, timeout_s: float) -> Iterator[Answered]:
+        """Query one node and hear every reply as it comes; those of PROGRESS_SCHEMA are not the last one.
+
+        Raises:
+            PeerError: as ask.
+        """
+        return self._ask(key, request, timeout_s, zenoh.Priority.DATA, zenoh.ConsolidationMode.NONE)
+
+    def _ask(
+        self, key: str, request: bytes, timeout_s: float, priority: zenoh.Priority, mode: zenoh.ConsolidationMode
+    ) -> Iterator[Answered]:
         channel: Any = zenoh.handlers.FifoChannel(64)
-        replies = self._session.get(key, channel, payload=request, timeout=timeout_s)
-        answered = []
+        replies = self._session.get(
+            key,
+            channel,
+            payload=request,
+            timeout=timeout_s,
+            priority=priority,
+            consolidation=mode,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+        )
         for reply in replies:
             if reply.ok is not None:
-                answered.append(Answered(str(reply.ok.key_expr), reply.ok.payload.to_bytes()))
+                yield Answered(str(reply.ok.key_expr), reply.ok.payload.to_bytes(), str(reply.ok.encoding))
             elif reply.err is not None and reply.err.payload.to_bytes() != b"Timeout":
                 raise PeerError(ErrorReply.decode(reply.err.payload.to_bytes()))
-        return answered
 
     def token(self, key: str) -> Callable[[], None]:
         """Declare a liveliness token; call the result to take it back."""
@@ -177,16 +248,25 @@ class Transport:
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
 
-def _reply(query: zenoh.Query, key: str, handle: Callable[[bytes], bytes]) -> None:
-    encoding = zenoh.Encoding(CONTROL_SCHEMA)
+def _reply(query: zenoh.Query, key: str, handle: Callable[[bytes], bytes], schema: str) -> None:
     try:
         answer = handle(query.payload.to_bytes() if query.payload else b"")
-        query.reply(key, answer, encoding=encoding)
     except NeuroVEError as error:
-        query.reply_err(ErrorReply.of(error).encode(), encoding=encoding)
+        return _refuse(query, error)
     except Exception:  # a bug must not end the loop; the caller still gets an answer
         log.exception("handler failed", key=key)
-        query.reply_err(ErrorReply.of(InternalError()).encode(), encoding=encoding)
+        return _refuse(query, InternalError())
+    return _send(query, key, answer, schema)
+
+
+def _send(query: zenoh.Query, key: str, payload: bytes, schema: str) -> None:
+    with contextlib.suppress(zenoh.ZError):  # the caller has left, or the session was closed
+        query.reply(key, payload, encoding=zenoh.Encoding(schema))
+
+
+def _refuse(query: zenoh.Query, error: NeuroVEError) -> None:
+    with contextlib.suppress(zenoh.ZError):
+        query.reply_err(ErrorReply.of(error).encode(), encoding=zenoh.Encoding(CONTROL_SCHEMA))
 
 
 def open_transport(

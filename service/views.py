@@ -224,13 +224,21 @@ def models_table(replies: list[ModelsReply]) -> RenderableType:
     """Models of every node, the active one marked."""
     parts: list[RenderableType] = []
     for reply in replies:
-        table = Table("", "model", "digest", "trained", "parameters", "made by", **_PLAIN)
+        table = Table("", "model", "digest", "release", "signature", "trained", "parameters", **_PLAIN)
+        made: list[RenderableType] = []
         table.title, table.title_justify = f"{reply.node}, epoch {reply.epoch}", "left"
         previous = reply.previous.digest if reply.previous else ""
         for info in reply.available:
             mark = "active" if info.digest == reply.active.digest else "previous" if info.digest == previous else ""
+            mark = mark or ("staged" if info in reply.staged else "")
             trained = "yes" if info.trained else "no"
-            table.add_row(mark, info.name, info.digest[:12], trained, f"{info.parameters:,}", info.provenance)
-        parts.append(table)
+            about = (str(info.release), info.signature, trained, f"{info.parameters:,}")
+            table.add_row(mark, info.name, info.digest[:12], *about)
+            figures = "".join(f", {name} {value:.3g}" for name, value in info.figures.items())
+            made.append(
+                Text(f"{info.name}: {info.provenance}{figures}", style="dim", no_wrap=True, overflow="ellipsis")
+            )
+        parts += [table, *made]
+        parts.extend(Text(f"{digest[:12]}: {have:,} bytes of a push so far") for digest, have in reply.partial.items())
         parts.extend(Text(f"{name}: {why}", style="yellow") for name, why in reply.unreadable.items())
     return Group(*parts)

@@ -15,7 +15,7 @@ from service import ask
 from service.config import ClientConfig
 from service.transport import open_transport
 
-START_S = 90
+START_S = 180
 
 
 def free_endpoint():

@@ -15,12 +15,17 @@ from protocol.codec import Message
 from protocol.control import (
     ActivateReply,
     ActivateRequest,
+    ChunkRequest,
     ErrorReply,
     HealthReply,
     HealthRequest,
     ModelsReply,
     ModelsRequest,
+    ProgressReply,
+    PushReply,
+    PushRequest,
     Request,
+    RollbackRequest,
     StreamStatus,
 )
 from protocol.events import decode_packet, encode_packet
@@ -47,6 +52,9 @@ MODEL: Fields = {
     "trained": True,
     "provenance": "simulated corridors, seed 7",
     "parameters": 381_446,
+    "release": 7,
+    "figures": {"rmse_linear_m_s": 0.125, "re": 0.25},
+    "signature": "trusted",
 }
 STATUS: Fields = {
     "v": 1,
@@ -140,8 +148,15 @@ EXAMPLES: dict[str, Fields] = {
         "epoch": 2,
         "available": [MODEL],
         "unreadable": {"old.safetensors": "the header names no model"},
+        "staged": [MODEL],
+        "partial": {"6e" * 32: 1_048_576},
     },
-    "ActivateRequest": {"v": 1, "model": "spire-7"},
+    "PushRequest": {"v": 1, "digest": "5e" * 32, "size": 1_526_784, "name": "spire-7.safetensors", "signature": b"{}"},
+    "ChunkRequest": {"v": 1, "offset": 1_048_576, "length": 478_208},
+    "ProgressReply": {"v": 1, "node": "rover-1", "step": "fetching", "text": "1.0 of 1.5 MiB"},
+    "PushReply": {"v": 1, "node": "rover-1", "model": MODEL, "fetched": 1_526_784},
+    "ActivateRequest": {"v": 1, "model": "spire-7", "expect": "6e0a5e5e", "shadow_s": 30.0, "canary": ["cam0"]},
+    "RollbackRequest": {"v": 1, "expect": "5e5e5e5e"},
     "ActivateReply": {"v": 1, "node": "rover-1", "active": MODEL, "previous": MODEL, "epoch": 3},
     "ErrorReply": {
         "v": 1,
@@ -187,8 +202,13 @@ MODELS: tuple[type[Message], ...] = (
     HealthReply,
     ModelsRequest,
     ModelsReply,
+    PushRequest,
+    ChunkRequest,
+    ProgressReply,
+    PushReply,
     ActivateRequest,
     ActivateReply,
+    RollbackRequest,
     ErrorReply,
 )
 EVENT_PACKET = Kind("EventPacket", decode_packet, encode_packet, strict=False, optional=frozenset())
@@ -243,8 +263,18 @@ positives = floats.filter(lambda value: value > 0)
 sentences = st.text(st.characters(exclude_categories=["Cs"]), max_size=40)
 names = st.from_regex(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}", fullmatch=True)
 digests = st.from_regex(r"[0-9a-f]{64}", fullmatch=True)
+prefixes = st.from_regex(r"[0-9a-f]{8,64}", fullmatch=True)
 models = st.fixed_dictionaries(
-    {"name": sentences, "digest": sentences, "trained": st.booleans(), "provenance": sentences, "parameters": counts}
+    {
+        "name": sentences,
+        "digest": sentences,
+        "trained": st.booleans(),
+        "provenance": sentences,
+        "parameters": counts,
+        "release": counts,
+        "figures": st.dictionaries(sentences, floats, max_size=3),
+        "signature": st.sampled_from(["unsigned", "unchecked", "trusted", "untrusted"]),
+    }
 )
 statuses = st.fixed_dictionaries(
     {
@@ -327,9 +357,30 @@ ANY: dict[str, st.SearchStrategy[Fields]] = {
             "epoch": counts,
             "available": st.lists(models, max_size=3),
             "unreadable": st.dictionaries(sentences, sentences, max_size=3),
+            "staged": st.lists(models, max_size=2),
+            "partial": st.dictionaries(digests, counts, max_size=2),
         }
     ),
-    "ActivateRequest": st.fixed_dictionaries({"model": sentences.filter(bool)}),
+    "PushRequest": st.fixed_dictionaries(
+        {
+            "digest": digests,
+            "size": st.integers(1, 2**63 - 1),
+            "name": sentences.filter(bool),
+            "signature": st.none() | st.binary(max_size=40),
+        }
+    ),
+    "ChunkRequest": st.fixed_dictionaries({"offset": counts, "length": st.integers(1, 1 << 20)}),
+    "ProgressReply": st.fixed_dictionaries({"node": names, "step": sentences, "text": sentences}),
+    "PushReply": st.fixed_dictionaries({"node": names, "model": models, "fetched": counts}),
+    "ActivateRequest": st.fixed_dictionaries(
+        {
+            "model": sentences.filter(bool),
+            "expect": st.none() | prefixes,
+            "shadow_s": st.floats(0, 3600),
+            "canary": st.lists(names, max_size=3),
+        }
+    ),
+    "RollbackRequest": st.fixed_dictionaries({"expect": st.none() | prefixes}),
     "ActivateReply": st.fixed_dictionaries({"node": names, "active": models, "previous": models, "epoch": counts}),
     "ErrorReply": st.fixed_dictionaries(
         {

@@ -13,7 +13,15 @@ from protocol.keys import DEFAULT_PREFIX, NAME_RULE, Keys, check_name, is_name
 from tests.protocol.messages import bounded, names
 
 STREAM_KEYS: list[Callable[..., str]] = [Keys.events, Keys.camera, Keys.velocity, Keys.status]
-NODE_KEYS: list[Callable[..., str]] = [Keys.health, Keys.models, Keys.activate, Keys.alive, Keys.serves]
+NODE_KEYS: list[Callable[..., str]] = [
+    Keys.health,
+    Keys.models,
+    Keys.push,
+    Keys.activate,
+    Keys.rollback,
+    Keys.alive,
+    Keys.serves,
+]
 NO_NAMES = ["", "*", "**", "@node", "@", "a/b", "/", "a/", "/a", "..", ".", "-", "$*", "a$*", "a b", "#", "?", "a" * 65]
 NO_NAMES += ["a\n", "\n", "caf\u00e9", "\u0661", "a\x00"]
 prefixes = st.lists(st.sampled_from(["neurove", "v1", "site-1", "_", "."]), min_size=1, max_size=8).map("/".join)
@@ -21,7 +29,7 @@ prefixes = st.lists(st.sampled_from(["neurove", "v1", "site-1", "_", "."]), min_
 
 def test_the_lists_of_this_test_are_complete() -> None:
     built = {name for name, member in inspect.getmembers(Keys, inspect.isfunction) if not name.startswith("_")}
-    assert built - {"stream_of"} == {build.__name__ for build in (*STREAM_KEYS, *NODE_KEYS)}
+    assert built - {"stream_of", "node_of", "chunks"} == {build.__name__ for build in (*STREAM_KEYS, *NODE_KEYS)}
 
 
 @pytest.mark.parametrize("build", STREAM_KEYS)
@@ -125,7 +133,41 @@ def test_a_wildcard_stands_for_any_one_name_and_never_for_a_node() -> None:
 
 def test_the_model_of_a_node_is_changed_below_a_chunk_of_its_own() -> None:
     assert Keys().activate("n1") == "neurove/v1/@node/n1/model/activate"
+    assert Keys().push("n1") == "neurove/v1/@node/n1/model/push"
+    assert Keys().rollback("n1") == "neurove/v1/@node/n1/model/rollback"
     assert not Keys().models("n1").startswith("neurove/v1/@node/n1/model/")
+
+
+@pytest.mark.parametrize("build", [build for build in NODE_KEYS if build is not Keys.serves])
+@bounded
+@given(prefix=prefixes, node=names)
+def test_the_node_of_a_built_key_is_the_node_it_was_built_for(
+    build: Callable[..., str], prefix: str, node: str
+) -> None:
+    assert Keys(prefix).node_of(build(Keys(prefix), node)) == node
+
+
+@pytest.mark.parametrize(
+    "key", ["", "n1/alive", "neurove/v1/@node/n1", "neurove/v1/@node/*/alive", Keys().events("cam0")]
+)
+def test_a_key_that_is_no_node_key_has_no_node(key: str) -> None:
+    with pytest.raises(InvalidField):
+        Keys().node_of(key)
+
+
+@bounded
+@given(st.text(max_size=70))
+@example("5e" * 32)
+@example("5e" * 32 + "\n")
+@example("*")
+@example("../" * 20)
+def test_chunks_are_asked_for_by_digest_and_by_nothing_else(digest: str) -> None:
+    if len(digest) == 64 and set(digest) <= set("0123456789abcdef"):
+        assert Keys("p").chunks(digest) == f"p/@push/{digest}"
+    else:
+        with pytest.raises(InvalidField) as caught:
+            Keys("p").chunks(digest)
+        assert caught.value.details["field"] == "digest"
 
 
 def test_all_keys_of_one_stream_and_node_are_different() -> None:

@@ -24,6 +24,7 @@ from protocol.control import Latency, Losses, ModelInfo, Verdict
 from protocol.events import FORMATS, decode_packet, encode_packet
 from protocol.keys import Keys
 from protocol.velocity import AXES
+from service.progress import Step
 from tests.protocol.messages import KINDS, MODELS, assert_same_packet
 from tests.protocol.test_errors import ERRORS
 
@@ -138,11 +139,11 @@ def assert_fields(rows: list[list[str]], model: type[BaseModel]) -> None:
 
 
 def test_the_table_of_keys_has_all_keys_and_no_other() -> None:
-    names = {"prefix": Keys().prefix, "stream": "cam0", "node": "n1"}
+    names = {"prefix": Keys().prefix, "stream": "cam0", "node": "n1", "digest": "5e" * 32}
     told = {re.sub(r"<(\w+)>", lambda part: names[part[1]], key) for key in column(table("key"))}
     built = set()
     for name, _ in inspect.getmembers(Keys, inspect.isfunction):  # of the class: Python 3.11.2 fails on a Keys()
-        if not name.startswith("_") and name != "stream_of":
+        if not name.startswith("_") and name not in ("stream_of", "node_of"):
             build = getattr(Keys(), name)
             built.add(build(**{part: names[part] for part in inspect.signature(build).parameters}))
     assert told == built
@@ -151,8 +152,9 @@ def test_the_table_of_keys_has_all_keys_and_no_other() -> None:
 
 def test_the_table_of_encodings_has_all_schemas() -> None:
     schemas = [events.SCHEMA, camera.SCHEMA, velocity.SCHEMA, control.STATUS_SCHEMA, control.CONTROL_SCHEMA]
+    schemas += [control.PROGRESS_SCHEMA, control.CHUNK_SCHEMA]
     assert column(table("encoding")) == schemas
-    assert all(schema.endswith(f".{PROTOCOL_VERSION}") for schema in schemas)
+    assert all(schema.endswith(f".{PROTOCOL_VERSION}") for schema in schemas if schema != control.CHUNK_SCHEMA)
 
 
 def test_the_table_of_error_codes_has_all_codes_with_their_details() -> None:
@@ -162,6 +164,10 @@ def test_the_table_of_error_codes_has_all_codes_with_their_details() -> None:
 
 def test_the_table_of_flags_has_all_flags() -> None:
     assert column(table("`flags`")) == [flag.value for flag in Flag]
+
+
+def test_the_table_of_steps_has_all_steps() -> None:
+    assert column(table("`step`")) == list(get_args(Step))
 
 
 def test_the_verdicts_and_the_lenses_are_all_told() -> None:

@@ -1,5 +1,9 @@
+import hashlib
+import threading
+
 import pytest
 
+from neurove_core import bundle
 from protocol.control import (
     ActivateReply,
     ActivateRequest,
@@ -8,12 +12,21 @@ from protocol.control import (
     Losses,
     ModelsReply,
     ModelsRequest,
+    ProgressReply,
+    PushReply,
+    PushRequest,
+    RollbackRequest,
 )
-from protocol.errors import InvalidField, Malformed, UnknownModel
+from protocol.errors import Downgrade, InvalidField, Malformed, NeuroVEError, NoStore, NothingBefore, UnknownModel
+from service.active_file import Active, ActiveFile
 from service.handlers import Handlers
 from service.health import stream_status
+from service.model_slot import ModelSlot
+from service.model_store import ModelStore
+from service.signatures import Signed
 from service.stream import Arrival, Stream
 from tests.builders import make_packets
+from tests.service.conftest import SMALL
 
 SECOND_NS = 1_000_000_000
 
@@ -100,3 +113,108 @@ def test_a_request_that_is_not_one_is_refused(handlers):
         handlers.activate(HealthRequest().encode())
     with pytest.raises(UnknownModel):
         handlers.activate(ActivateRequest(model="three").encode())
+
+
+RUNS = threading.Event()
+
+
+def trusts_a_flag(_, signature):
+    return Signed("trusted", allow_downgrade=True) if signature == b"flag" else Signed("unsigned")
+
+
+class Told:
+    """Progress replies that a caller hears."""
+
+    def __init__(self):
+        self.replies = []
+
+    def __call__(self, payload):
+        self.replies.append(ProgressReply.decode(payload))
+
+    @property
+    def steps(self):
+        return [reply.step for reply in self.replies]
+
+
+@pytest.fixture
+def told():
+    return Told()
+
+
+@pytest.fixture
+def storing(models_dir, tmp_path):
+    """Handlers of a node that keeps pushed models, has served release 7, and trusts the signature `flag`."""
+
+    def make(highest_release=0):
+        store = ModelStore(tmp_path, models_dir, verify=trusts_a_flag)
+        active_file = ActiveFile(None)
+        active_file.keep(Active(digest="0" * 64, previous=None, configured="one", highest_release=highest_release))
+        slot = ModelSlot("one", models_dir, pushed=store.bundles)
+        return Handlers("edge", slot, list, lambda: 0, store, active_file)
+
+    return make
+
+
+def push_of(name, signature=None):
+    data = bundle.untrained(8, SMALL, name).to_bytes()
+    request = PushRequest(digest=hashlib.sha256(data).hexdigest(), size=len(data), name=name, signature=signature)
+    return request.encode(), lambda _, chunk: data[chunk.offset : chunk.offset + chunk.length]
+
+
+def test_a_pushed_model_is_staged_until_it_serves(storing, told):
+    handlers = storing()
+    request, pull = push_of("eight")
+    reply = PushReply.decode(handlers.push(request, told, pull, RUNS))
+    assert (reply.model.name, reply.fetched > 0) == ("eight", True)
+    assert told.steps == ["fetching", "staged", "verified"]
+    models = ModelsReply.decode(handlers.models(ModelsRequest().encode()))
+    assert [info.name for info in models.staged] == ["eight"]
+    assert models.staged[0] in models.available
+    changed = ActivateReply.decode(handlers.activate(ActivateRequest(model=reply.model.digest[:8]).encode(), told))
+    assert (changed.active.name, changed.previous.name) == ("eight", "one")
+    assert ModelsReply.decode(handlers.models(ModelsRequest().encode())).staged == ()
+    back = ActivateReply.decode(handlers.rollback(RollbackRequest(expect=reply.model.digest[:8]).encode(), told))
+    assert (back.active.name, back.epoch) == ("one", 2)
+    assert told.replies[-1].step == "rolled_back"
+    assert {reply.node for reply in told.replies} == {"edge"}
+
+
+def test_an_older_release_is_neither_taken_nor_activated_unless_a_trusted_signature_allows_it(storing, told, tmp_path):
+    handlers = storing(highest_release=7)
+    request, pull = push_of("eight")
+    with pytest.raises(Downgrade, match="release=0: this node has seen release 7"):
+        handlers.push(request, told, pull, RUNS)
+    assert told.steps[-1] == "refused"
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+    with pytest.raises(Downgrade):
+        handlers.activate(ActivateRequest(model="two").encode(), told)
+    request, pull = push_of("eight", b"flag")
+    assert PushReply.decode(handlers.push(request, told, pull, RUNS)).model.signature == "trusted"
+    changed = ActivateReply.decode(handlers.activate(ActivateRequest(model="eight").encode()))
+    assert (changed.active.name, changed.active.signature) == ("eight", "trusted")
+    assert ActivateReply.decode(handlers.rollback(RollbackRequest().encode())).active.name == "one"
+
+
+def test_a_refusal_is_the_last_step_that_is_told(handlers, told):
+    with pytest.raises(UnknownModel):
+        handlers.activate(ActivateRequest(model="three").encode(), told)
+    with pytest.raises(NothingBefore):
+        handlers.rollback(RollbackRequest().encode(), told)
+    request, pull = push_of("eight")
+    with pytest.raises(NoStore):
+        handlers.push(request, told, pull, RUNS)
+    assert told.steps == ["refused"] * 3
+    assert "model='three'" in told.replies[0].text
+
+
+def test_a_model_whose_signature_is_refused_is_listed_as_untrusted(models_dir):
+    def refuses(_, __):
+        raise NeuroVEError("untrusted")
+
+    slot = ModelSlot("one", models_dir)
+    handlers = Handlers("edge", slot, list, lambda: 0, ModelStore(None, models_dir, verify=refuses))
+    models = ModelsReply.decode(handlers.models(ModelsRequest().encode()))
+    states = {info.name: info.signature for info in models.available}
+    assert states == {"default": "unsigned", "untrained": "unsigned", "one": "untrusted", "two": "untrusted"}
+    with pytest.raises(NeuroVEError, match="untrusted"):
+        handlers.activate(ActivateRequest(model="two").encode())

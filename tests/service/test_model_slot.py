@@ -3,7 +3,7 @@ import threading
 
 import pytest
 
-from protocol.errors import BadModel, UnknownModel
+from protocol.errors import BadModel, Conflict, NothingBefore, UnknownModel
 from service.model_slot import ModelSlot
 
 
@@ -60,10 +60,64 @@ def test_the_model_given_at_the_start_stays_available_without_a_folder(models_di
         ModelSlot(str(models_dir / "none.safetensors"))
 
 
-def test_changes_at_once_are_made_one_after_the_other(slot):
-    threads = [threading.Thread(target=slot.activate, args=(name,)) for name in ("one", "two") * 4]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert slot.active.epoch == 8
+def test_of_changes_at_once_those_that_come_late_are_told_of_a_conflict(slot):
+    told, began, go_on = [], threading.Event(), threading.Event()
+
+    def first_step(_):
+        began.set()
+        assert go_on.wait(30)
+
+    winner = threading.Thread(target=slot.activate, args=("two",), kwargs={"on_progress": first_step})
+    winner.start()
+    assert began.wait(30)
+    with pytest.raises(Conflict, match="another model change is under way"):
+        slot.activate("untrained")
+    with pytest.raises(Conflict):
+        slot.rollback()
+    go_on.set()
+    winner.join()
+    slot.activate("one", on_progress=told.append)
+    assert (slot.active.epoch, slot.previous.name) == (2, "two")
+    assert [progress.step for progress in told] == ["loaded", "warmed", "active", "done"]
+
+
+def test_a_change_that_expects_another_model_is_a_conflict_and_changes_nothing(slot):
+    before = slot.active
+    digest = before.estimator.bundle.digest
+    for change in (lambda: slot.activate("two", expect="0" * 8), lambda: slot.rollback(expect="0" * 8)):
+        with pytest.raises(Conflict, match=f"expect=00000000, but the active model is {digest[:12]}"):
+            change()
+    assert slot.active is before
+    assert slot.activate("two", expect=digest[:8])[1].epoch == 1
+
+
+def test_a_rollback_goes_back_once(slot):
+    with pytest.raises(NothingBefore):
+        slot.rollback()
+    slot.activate("two")
+    before, serving = slot.rollback()
+    assert (before.name, serving.estimator.bundle.name, serving.epoch) == ("two", "one", 2)
+    with pytest.raises(NothingBefore):
+        slot.rollback()
+
+
+def test_every_model_that_serves_is_told_with_the_one_before(models_dir):
+    told = []
+    slot = ModelSlot("one", models_dir, on_changed=lambda model: told.append((model.name, slot.previous)))
+    slot.activate("two")
+    slot.rollback()
+    assert [name for name, _ in told] == ["two", "one"]
+    assert [previous and previous.name for _, previous in told] == ["one", None]
+
+
+def test_the_model_that_served_last_goes_before_the_configured_one_if_it_can_be_loaded(models_dir, slot):
+    two = slot.activate("two")[1].estimator.bundle.digest
+    one = slot.previous.digest
+    again = ModelSlot("one", models_dir, kept=(two, one))
+    assert (again.active.estimator.bundle.name, again.previous.name) == ("two", "one")
+    assert again.rollback()[1].estimator.bundle.name == "one"
+    gone = ModelSlot("one", models_dir, kept=("0" * 64, "1" * 64))
+    assert (gone.active.estimator.bundle.name, gone.previous) == ("one", None)
+    assert ModelSlot("three", models_dir, kept=(two, None)).active.estimator.bundle.name == "two"
+    with pytest.raises(UnknownModel):
+        ModelSlot("three", models_dir, kept=("0" * 64, None))

@@ -1,0 +1,65 @@
+"""A bundle that is pushed: the file, and the chunks of it that nodes ask for."""
+
+import hashlib
+import mmap
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from protocol.control import MAX_SIGNATURE_BYTES, ChunkRequest, PushRequest
+from protocol.errors import BadModel, InvalidField
+
+SIGNATURE = ".sig"
+
+
+class PushSource:
+    """Maps a bundle's file into memory; use it in a `with` block. A signature beside it goes with it.
+
+    Args:
+        path: of the bundle; its signature is `<path>.sig`, where there is one.
+
+    Raises:
+        BadModel: it is missing, empty or can not be read. What it holds the node checks.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            with path.open("rb") as file:
+                self._bytes = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+            signature = path.with_name(path.name + SIGNATURE)
+            self._signature = signature.read_bytes() if signature.exists() else None
+        except (OSError, ValueError) as error:  # the second: an empty file
+            raise BadModel(path.name, getattr(error, "strerror", None) or str(error)) from None
+        if self._signature is not None and len(self._signature) > MAX_SIGNATURE_BYTES:
+            size = len(self._signature)
+            raise BadModel(signature.name, f"size={size}: a signature has at most {MAX_SIGNATURE_BYTES} bytes")
+        self._name = path.name
+        self.digest = hashlib.sha256(self._bytes).hexdigest()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bytes.close()
+
+    @property
+    def request(self) -> PushRequest:
+        """What tells a node of it."""
+        name = self._name[-128:]
+        return PushRequest(digest=self.digest, size=len(self._bytes), name=name, signature=self._signature)
+
+    def chunk(self, request: bytes) -> bytes:
+        """The piece that a ChunkRequest asks for.
+
+        Raises:
+            InvalidField: it ends behind the file's end.
+        """
+        wanted = ChunkRequest.decode(request)
+        end, size = wanted.offset + wanted.length, len(self._bytes)
+        if end > size:
+            raise InvalidField(
+                wanted.what, "offset", wanted.offset, f"with length it ends at {end}, the bundle at {size}"
+            )
+        return self._bytes[wanted.offset : end]

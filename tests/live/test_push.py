@@ -1,0 +1,246 @@
+import json
+import threading
+
+import pytest
+
+from neurove_core import bundle
+from protocol.control import CHUNK_SCHEMA, PeerError
+from protocol.errors import NeuroVEError
+from protocol.events import encode_packet
+from service import ask
+from service.push_source import PushSource
+from service.transport import open_transport
+from tests.builders import make_packets
+from tests.live.conftest import Heard, Source, client, free_endpoint, neurove, running, service, wait_until
+from tests.live.killing import CONFIG, Node, slowly
+
+pytestmark = pytest.mark.live
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("bundles")
+    bundle.save(bundle.untrained(1, name="one"), folder / "one.safetensors")  # sees as the default model does
+    for seed, name in ((2, "two"), (3, "three")):
+        bundle.save(bundle.untrained(seed, CONFIG, name), folder / f"{name}.safetensors")
+    (folder / "foreign.safetensors").write_text("hello, I am no model at all")
+    (folder / "empty.safetensors").touch()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def node(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("state")
+    with service(free_endpoint(), "--models-dir", str(folder)) as (_, transport, config):
+        yield transport, config, folder
+
+
+def steps(text):
+    return [json.loads(line)["step"] for line in text.splitlines() if "step" in json.loads(line)]
+
+
+def test_an_operator_pushes_activates_and_rolls_back_while_events_flow_without_a_hole(node, files):
+    _, config, _ = node
+    at = ("--connect", config.connect[0])
+    stop = threading.Event()
+    with client(config.connect[0]) as transport, client(config.connect[0]) as driver:
+        heard = Heard(transport, config)
+        thread = threading.Thread(target=keep_driving, args=(driver, config, stop))
+        thread.start()
+        try:
+            wait_until(lambda: heard.of("cam0"))
+            pushed = neurove("push", str(files / "one.safetensors"), *at, "--activate", "--json")
+            assert (pushed.returncode, pushed.stderr) == (0, "")
+            told = steps(pushed.stdout)
+            assert told[0] == "fetching"
+            assert [step for step in told if step in ("staged", "verified", "active", "done")] == [
+                "staged",
+                "verified",
+                "active",
+                "done",
+            ]
+            digest = json.loads(pushed.stdout.splitlines()[-1])["active"]["digest"]
+            wait_until(lambda: heard.of("cam0")[-1].digest == digest)
+
+            (models,) = json.loads(neurove("models", *at, "--json").stdout)
+            assert (models["active"]["digest"], models["previous"]["name"]) == (digest, "default")
+            late = neurove("activate", "default", *at, "--expect", "00000000")
+            assert (late.returncode, "n1: conflict: expect=00000000" in late.stderr) == (3, True)
+            back = neurove("rollback", *at, "--expect", digest[:8])
+            assert (back.returncode, "n1: rolled_back: default" in back.stdout) == (0, True)
+            nothing = neurove("rollback", *at)
+            assert (nothing.returncode, "nothing to roll back to" in nothing.stderr) == (1, True)
+            wait_until(lambda: heard.of("cam0")[-1].model == "default")
+        finally:
+            stop.set()
+            thread.join()
+        estimates = heard.of("cam0")
+        assert [one.seq for one in estimates] == list(range(estimates[0].seq, estimates[0].seq + len(estimates)))
+        (status,) = [one for one in ask.health(transport, config)[0].streams if one.stream == "cam0"]
+        assert status.lost.nonzero() == {}
+
+
+def keep_driving(transport, config, stop):
+    source = Source(transport, config, "cam0")
+    for packet in make_packets(20_000, n=20):
+        source.put(encode_packet(packet))
+        if stop.wait(0.004):
+            return
+
+
+def test_what_is_no_model_is_refused_by_the_node_and_leaves_nothing(node, files):
+    _, config, folder = node
+    at = ("--connect", config.connect[0], "--node", "n1")
+    foreign = neurove("push", str(files / "foreign.safetensors"), *at)
+    assert (foreign.returncode, foreign.stderr.count("\n")) == (1, 1)
+    assert "n1: model foreign.safetensors: " in foreign.stderr
+    empty = neurove("push", str(files / "empty.safetensors"), *at)
+    assert "model empty.safetensors: " in empty.stderr
+    assert "No such file" in neurove("push", "nowhere.safetensors", *at).stderr
+    assert list((folder / "staging").iterdir()) == []
+
+
+def test_health_and_models_answer_while_a_push_goes_on_and_one_that_was_cut_goes_on_later(node, files):
+    transport, config, _ = node
+    with PushSource(files / "two.safetensors") as source:
+        gate = Gate(source.chunk, 3)
+        with client(config.connect[0]) as pusher:
+            pusher.answer(config.keys.chunks(source.digest), gate, CHUNK_SCHEMA)
+            threading.Thread(target=ignoring(lambda: ask.push(pusher, config, source.request, "n1"))).start()
+            wait_until(lambda: partial(transport, config).get(source.digest, 0) > 0)
+            assert ask.health(transport, config)[0].node == "n1"
+            gate.shut.set()
+        have = partial(transport, config)[source.digest]  # the client has left
+        assert 0 < have < source.request.size
+        with client(config.connect[0]) as pusher:
+            pusher.answer(config.keys.chunks(source.digest), source.chunk, CHUNK_SCHEMA)
+            reply = ask.push(pusher, config, source.request, "n1")  # waits for the first one to give up, or helps it on
+            assert reply.fetched < source.request.size
+        assert partial(transport, config) == {}
+        assert source.digest in {one.digest for one in ask.models(transport, config)[0].staged}
+
+
+class Gate:
+    """Answers some chunks and keeps the next one waiting."""
+
+    def __init__(self, chunk, count):
+        self._chunk, self._left = chunk, count
+        self.shut = threading.Event()
+
+    def __call__(self, request):
+        self._left -= 1
+        if self._left < 0:
+            self.shut.wait(30)
+            raise NeuroVEError("gone")
+        return self._chunk(request)
+
+
+def partial(transport, config):
+    return ask.models(transport, config)[0].partial
+
+
+def ignoring(run):
+    def quietly():
+        try:
+            run()
+        except Exception:  # noqa: BLE001  # its session is closed under it
+            return
+
+    return quietly
+
+
+def test_two_clients_that_push_one_bundle_at_once_both_succeed_and_it_is_moved_once(node, files):
+    _, config, _ = node
+    replies = []
+    with (
+        PushSource(files / "three.safetensors") as source,
+        client(config.connect[0]) as first,
+        client(config.connect[0]) as second,
+    ):
+        threads = []
+        for transport in (first, second):
+            transport.answer(config.keys.chunks(source.digest), slowly(source.chunk), CHUNK_SCHEMA)
+            push = lambda transport=transport: replies.append(ask.push(transport, config, source.request, "n1"))  # noqa: E731
+            threads.append(threading.Thread(target=push))
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        assert sorted(reply.fetched for reply in replies) == [0, source.request.size]
+
+
+@pytest.fixture
+def pair():
+    endpoint = free_endpoint()
+    with open_transport("peer", listen=(endpoint,)) as listening, client(endpoint) as asking:
+        yield listening, asking
+
+
+def test_every_reply_is_heard_as_it_comes_and_of_too_many_at_once_the_last_are_told_so(pair):
+    listening, asking = pair
+    go_on = threading.Event()
+
+    def handle(request, tell):
+        tell(b"began")
+        assert go_on.wait(30)
+        return request
+
+    listening.answer_streaming("t/work", handle, at_once=2)
+    working = [asking.ask_streaming("t/work", name, 30) for name in (b"first", b"second")]
+    assert [(next(one).payload) for one in working] == [b"began", b"began"]  # while they go on
+    with pytest.raises(PeerError, match="at most 2 such requests at once") as refused:
+        list(asking.ask_streaming("t/work", b"third", 30))
+    assert refused.value.code == "busy"
+    go_on.set()
+    assert sorted(next(one).payload for one in working) == [b"first", b"second"]
+    assert [one.payload for one in asking.ask("t/work", b"plain", 30)] == [b"plain"]  # progress was not asked for
+
+
+def test_a_caller_that_leaves_does_not_stop_the_work_nor_the_next_caller(pair):
+    listening, asking = pair
+    go_on, done = threading.Event(), threading.Event()
+
+    def handle(request, tell):
+        assert go_on.wait(30)
+        tell(b"to nobody")
+        done.set()
+        return request
+
+    listening.answer_streaming("t/work", handle, at_once=1)
+    assert list(asking.ask_streaming("t/work", b"first", 0.1)) == []  # the time is over
+    go_on.set()
+    assert done.wait(30)
+    wait_until(lambda: answers(asking))
+
+
+def answers(transport):
+    try:
+        return [one.payload for one in transport.ask("t/work", b"again", 30)] == [b"again"]
+    except PeerError:  # busy: the first one is about to end
+        return False
+
+
+def test_of_several_nodes_a_change_wants_to_know_which(node, files):
+    _, config, _ = node
+    at = ("--connect", config.connect[0])
+    with running("serve", "--mode", "client", *at, "--node", "n2", "--log-level", "warning"):
+        with client(config.connect[0]) as transport:
+            wait_until(lambda: len(transport.tokens(config.keys.alive(), 1.0)) == 2, timeout_s=90)
+        told = neurove("activate", "untrained", *at)
+        assert (told.returncode, "n1, n2; name one with --node, or say --all" in told.stderr) == (2, True)
+        both = neurove("push", str(files / "one.safetensors"), *at, "--all")
+        assert (both.returncode, "n2: this node keeps no pushed models" in both.stderr) == (1, True)
+        assert "n1: one" in both.stdout
+
+
+@pytest.mark.parametrize("at_step", ["fetching", "loaded", "done"])
+def test_a_node_that_was_killed_in_a_change_starts_again_on_a_whole_model(tmp_path, at_step):
+    node = Node(tmp_path)
+    new, _, before = node.kill_in_a_change(1, at_step=at_step)
+    models = node.restarted()
+    if at_step == "fetching":
+        assert models.active.digest == before
+    if at_step == "done":
+        assert (models.active.digest, models.previous.digest) == (new, before)
+        with node.started("--model", "untrained") as (_, _, configured):  # a newer decision than the one that was kept
+            assert configured.active.name == "untrained"

@@ -1,0 +1,52 @@
+"""kill -9 at random points of a push and its activation: `python -m tests.long.kills [--rounds 20] [--seed 0]`.
+
+Every round starts the service over one folder, checks that it serves a whole model, the acknowledged one if there
+is one, pushes and activates another, and kills it at a random time. Not part of `make test`: it takes minutes.
+"""
+
+import argparse
+import collections
+import random
+import sys
+import tempfile
+from pathlib import Path
+
+from tests.live.killing import Node
+
+SPAN_S = 4.0
+"""A push and its activation take about so long here, chunks slowed down."""
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rounds", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    draw = random.Random(args.seed)
+    steps: collections.Counter[str] = collections.Counter()
+    served: collections.Counter[str] = collections.Counter()
+    ready_s = []
+    with tempfile.TemporaryDirectory() as folder:
+        node = Node(Path(folder))
+        last = told = ""
+        for number in range(
+            args.rounds + 1
+        ):  # each start shows what the kill before it left; the last kill is for nothing
+            after_s = draw.uniform(0, SPAN_S)
+            new, step, before = node.kill_in_a_change(args.seed * 1000 + number, after_s=after_s)
+            if last:
+                which = "the new" if before == last else "an earlier"
+                served[which] += 1
+                ready_s.append(node.ready_s)
+                print(f"{number}: {told}; serves {which} model after the restart", flush=True)
+            steps[step] += number < args.rounds
+            last, told = new, f"killed after {after_s:.2f} s at {step}"
+    print(
+        f"{args.rounds} kills, each start on a whole model; last step heard: {dict(steps)}; then serves: {dict(served)}"
+    )
+    print(f"longest start until ready: {max(ready_s):.1f} s")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,291 @@
+import dataclasses
+import hashlib
+import shutil
+import threading
+from pathlib import Path
+
+import pytest
+
+from neurove_core import bundle
+from neurove_core.config import NetworkConfig
+from protocol.control import PushRequest
+from protocol.errors import BadModel, Cut, Downgrade, NeuroVEError, NoQuota, NoSpace, NoStore, TooLarge
+from service import model_store
+from service.model_slot import ModelSlot
+from service.model_store import ModelStore
+from service.signatures import Signed
+from tests.service.conftest import SMALL
+
+RUNS = threading.Event()
+
+
+BIGGER = SMALL.model_copy(update={"network": NetworkConfig(channels=(4, 4), features=96, hidden=96)})
+
+
+def bytes_of(seed, name):
+    """A bundle that takes several chunks."""
+    return bundle.untrained(seed, BIGGER, name).to_bytes()
+
+
+@pytest.fixture(scope="module")
+def data():
+    return bytes_of(3, "three")
+
+
+@pytest.fixture
+def store(tmp_path):
+    return ModelStore(tmp_path, patience_s=0.6)
+
+
+def wanted(data, **other):
+    digest = hashlib.sha256(data).hexdigest()
+    return PushRequest(**{"digest": digest, "size": len(data), "name": "three.safetensors"} | other)
+
+
+def source(data, *, until=None, asked=None):
+    """Answers chunks of these bytes, up to a place where it is cut."""
+
+    def pull(_, request):
+        if asked is not None:
+            asked.append(request)
+        end = request.offset + request.length
+        return None if until is not None and end > until else data[request.offset : end]
+
+    return pull
+
+
+def fetch(store, request, pull, steps=None, stop=RUNS, **other):
+    return store.fetch(request, pull, stop, (steps if steps is not None else []).append, **other)
+
+
+def files(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+def test_a_pushed_bundle_is_whole_on_the_disk_and_can_be_activated(store, tmp_path, data):
+    steps = []
+    model, signed, moved = fetch(store, wanted(data), source(data), steps)
+    assert (model.name, signed.state, moved) == ("three", "unsigned", len(data))
+    assert [step.step for step in steps] == ["fetching", "staged", "verified"]
+    assert files(tmp_path) == [f"pushed/{model.digest}/bundle.safetensors"]
+    slot = ModelSlot("untrained", pushed=store.bundles)
+    assert slot.activate("three")[1].estimator.bundle.digest == model.digest
+    assert fetch(store, wanted(data), source(b""))[2] == 0  # it is there: not one chunk is asked for
+
+
+def test_a_cut_push_goes_on_where_it_stopped_in_another_process_too(store, tmp_path, data):
+    with pytest.raises(Cut, match=r"cut at \d+ of \d+ bytes: whoever pushed it does not answer"):
+        fetch(store, wanted(data), source(data, until=len(data) - 1))
+    have = store.partial()[wanted(data).digest]
+    assert 0 < have < len(data)
+    asked = []
+    assert fetch(ModelStore(tmp_path), wanted(data), source(data, asked=asked))[2] == len(data) - have
+    assert asked[0].offset == have
+    assert ModelStore(tmp_path).partial() == {}
+
+
+def test_left_over_bytes_that_do_not_fit_are_fetched_anew(store, tmp_path, data):
+    staging = tmp_path / "staging" / wanted(data).digest
+    for left_over in (b"\0" * 1000, b"\0" * len(data), b"\0" * (len(data) + 1)):
+        staging.mkdir(parents=True)
+        (staging / "bundle.safetensors").write_bytes(left_over)
+        assert fetch(store, wanted(data), source(data))[0].name == "three"
+        shutil.rmtree(tmp_path / "pushed")
+
+
+def flipped(data):
+    return data[:-1] + bytes([data[-1] ^ 1])
+
+
+def with_nan():
+    model = bundle.untrained(3, SMALL, "three")
+    return dataclasses.replace(model, offset=model.offset * float("nan")).to_bytes()
+
+
+@pytest.mark.parametrize(
+    ("bad", "claimed", "telling"),
+    [
+        (flipped, None, "the sha256 of what came is"),
+        (lambda data: data[: len(data) // 2], "itself", "not a whole safetensors file"),
+        (lambda _: b"hello, I am no model at all", "itself", "not a safetensors file"),
+        (lambda _: with_nan(), "itself", "not finite"),
+    ],
+)
+def test_a_bad_bundle_is_refused_with_its_reason_and_leaves_nothing(store, tmp_path, data, bad, claimed, telling):
+    sent = bad(data)
+    request = wanted(sent if claimed else data, size=len(sent))
+    with pytest.raises(BadModel, match=telling):
+        fetch(store, request, source(sent))
+    assert files(tmp_path) == []
+    assert store.bundles() == ([], {})
+
+
+def test_what_can_not_be_kept_is_refused_before_the_first_byte(tmp_path, data, monkeypatch):
+    never = source(data, until=0)
+    with pytest.raises(NoStore, match="neither models_dir nor state_dir"):
+        fetch(ModelStore(None), wanted(data), never)
+    with pytest.raises(TooLarge, match=f"at most {bundle.MAX_BYTES} bytes"):
+        fetch(ModelStore(tmp_path), wanted(data, size=bundle.MAX_BYTES + 1), never)
+    with pytest.raises(NoQuota, match=f"0 of {len(data) - 1} bytes for pushed models are taken"):
+        fetch(ModelStore(tmp_path, quota_bytes=len(data) - 1), wanted(data), never)
+    monkeypatch.setattr(model_store, "SPARE_BYTES", 1 << 62)  # no disk of a test is full
+    with pytest.raises(NoSpace, match=f"needs {len(data)} bytes"):
+        fetch(ModelStore(tmp_path), wanted(data), never)
+    assert files(tmp_path) == []
+
+
+def test_a_folder_that_can_not_be_written_to_is_a_refusal(tmp_path, data):
+    (tmp_path / "staging").write_text("a file where a folder should be")
+    with pytest.raises(NoStore, match="its folder can not be written to"):
+        fetch(ModelStore(tmp_path), wanted(data), source(data))
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no full device")
+def test_a_disk_that_is_full_on_the_way_is_a_refusal_and_leaves_nothing(store, tmp_path, data):
+    staging = tmp_path / "staging" / wanted(data).digest
+    staging.mkdir(parents=True)
+    (staging / "bundle.safetensors").symlink_to("/dev/full")
+    with pytest.raises(NoSpace):
+        fetch(store, wanted(data), source(data))
+    assert files(tmp_path) == []
+    assert fetch(store, wanted(data), source(data))[0].name == "three"
+
+
+def test_left_over_pushes_give_way_to_a_new_one_but_whole_models_do_not(tmp_path, data):
+    store = ModelStore(tmp_path, quota_bytes=2 * len(data), patience_s=0.1)
+    other = bytes_of(4, "four")
+    third = bytes_of(5, "five")
+    with pytest.raises(Cut):
+        fetch(store, wanted(other), source(other, until=len(other) - 1))
+    fetch(store, wanted(data), source(data))
+    assert store.partial()
+    fetch(store, wanted(third), source(third))
+    assert store.partial() == {}
+    with pytest.raises(NoQuota):
+        fetch(store, wanted(other), source(other))
+    assert {one.name for one in store.bundles()[0]} == {"three", "five"}
+
+
+def test_two_pushes_of_one_bundle_at_once_move_it_once(tmp_path, data):
+    store, results, gate = ModelStore(tmp_path), [], threading.Event()
+    steps = [[], []]
+
+    def slow(digest, request):
+        assert gate.wait(30)
+        return source(data)(digest, request)
+
+    def push(number):
+        results.append(fetch(store, wanted(data), slow, steps[number])[2])
+
+    first = threading.Thread(target=push, args=(0,))
+    first.start()
+    while not steps[0]:
+        threading.Event().wait(0.01)
+    second = threading.Thread(target=push, args=(1,))
+    second.start()
+    while not steps[1]:
+        threading.Event().wait(0.01)
+    gate.set()
+    first.join()
+    second.join()
+    assert results == [len(data), 0]
+    assert steps[1][0].text == "another push of the same model is under way"
+
+
+def test_a_source_that_answers_wrongly_is_asked_again_and_then_given_up(store, data):
+    def pull(digest, request):
+        return source(data)(digest, request) + b"\0"
+
+    with pytest.raises(Cut, match="asked for were"):
+        fetch(store, wanted(data), pull)
+
+    def refuses(_, __):
+        raise NeuroVEError("the file has gone")
+
+    with pytest.raises(Cut, match="the file has gone"):
+        fetch(store, wanted(data), refuses)
+
+
+def test_a_node_that_stops_does_not_wait_for_chunks(tmp_path, data):
+    stopping = threading.Event()
+    stopping.set()
+    with pytest.raises(Cut, match="this node stops"):
+        fetch(ModelStore(tmp_path, patience_s=600), wanted(data), source(data, until=0), stop=stopping)
+
+
+def test_chunks_that_take_long_become_small_and_quick_ones_large(tmp_path):
+    big = b"x" * (5 << 20)
+    asked = []
+    with pytest.raises(BadModel):
+        fetch(ModelStore(tmp_path), wanted(big), source(big, asked=asked))
+    assert asked[0].length == 64 << 10
+    assert max(one.length for one in asked) == 1 << 20
+
+    def slow(digest, request):
+        threading.Event().wait(0.06)
+        return source(big, asked=slowly)(digest, request)
+
+    slowly = []
+    with pytest.raises(BadModel):
+        fetch(ModelStore(tmp_path), wanted(big[: 1 << 20]), slow)
+    assert {one.length for one in slowly} == {64 << 10}
+
+
+def test_a_model_that_rotted_on_the_disk_is_listed_with_its_reason_and_can_be_pushed_again(store, tmp_path, data):
+    digest = fetch(store, wanted(data), source(data))[0].digest
+    file = tmp_path / "pushed" / digest / "bundle.safetensors"
+    for rotten in (flipped(data), data[:-1]):
+        file.write_bytes(rotten)
+        (unreadable,) = store.bundles()[1].items()
+        assert unreadable[0] == digest
+        with pytest.raises(BadModel):
+            ModelSlot("untrained", pushed=store.bundles).activate(digest)
+        assert fetch(store, wanted(data), source(data))[2] == len(data)
+        assert store.bundles()[1] == {}
+
+
+def test_only_folders_named_by_a_digest_are_looked_at(store, tmp_path, data):
+    fetch(store, wanted(data), source(data))
+    for foreign in ("pushed/readme", "pushed/" + "x" * 64, "staging/.." + "5e" * 31):
+        (tmp_path / foreign).mkdir(parents=True)
+    (tmp_path / "pushed" / ("5e" * 32)).write_text("a file")
+    assert [one.name for one in store.bundles()[0]] == ["three"]
+    assert store.partial() == {}
+
+
+def trusts(data, signature):
+    """A node that wants the signature `good`, and honours its flag."""
+    if signature is None or not signature.startswith(b"good"):
+        raise Downgrade("x", 0, 1) if signature == b"old" else NeuroVEError("untrusted")
+    return Signed("trusted", allow_downgrade=signature.endswith(b"flag"))
+
+
+def test_a_signature_is_asked_before_a_model_is_kept_and_kept_beside_it(tmp_path, data):
+    store = ModelStore(tmp_path / "state", tmp_path, verify=trusts)
+    for signature in (None, b"bad"):
+        with pytest.raises(NeuroVEError, match="untrusted"):
+            fetch(store, wanted(data, signature=signature), source(data))
+    assert files(tmp_path) == []
+    model, signed, _ = fetch(store, wanted(data, signature=b"good"), source(data))
+    assert signed == store.signed(model.digest) == Signed("trusted")
+    with pytest.raises(NeuroVEError):
+        fetch(store, wanted(data, signature=b"bad"), source(data))
+    assert fetch(store, wanted(data, signature=b"good, flag"), source(data))[2] == 0
+    assert store.signed(model.digest).allow_downgrade
+    assert ModelStore(tmp_path / "state", None, verify=trusts).signed(model.digest).allow_downgrade
+
+
+def test_signatures_beside_the_operators_own_files_count_too(tmp_path, data):
+    (tmp_path / "mine.safetensors").write_bytes(data)
+    store = ModelStore(None, tmp_path, verify=trusts)
+    digest = hashlib.sha256(data).hexdigest()
+    with pytest.raises(NeuroVEError):
+        store.signed(digest)
+    (tmp_path / "mine.safetensors.sig").write_bytes(b"good")
+    assert store.signed(digest).state == "trusted"
+    assert store.signed("0" * 64).state == "unsigned"  # a built-in one
+
+
+def test_a_node_without_trusted_keys_says_whether_a_signature_came(store, data):
+    assert fetch(store, wanted(data), source(data))[1].state == "unsigned"
+    assert fetch(store, wanted(data, signature=b"{}"), source(data))[1].state == "unchecked"
