@@ -11,12 +11,17 @@ from protocol.errors import (
     MAX_TEXT_BYTES,
     BadModel,
     BlobLength,
+    Conflict,
     Detail,
+    Diverged,
     EventOutsideSensor,
     InternalError,
     InvalidField,
     Malformed,
+    NoMemory,
+    NothingBefore,
     TimeBackwards,
+    TooSlow,
     UnknownFormat,
     UnknownModel,
     UnsupportedVersion,
@@ -35,6 +40,12 @@ ERRORS: list[NeuroVEError] = [
     TimeBackwards(3, 20, 10),
     UnknownModel("spire-9", ("spire-7",)),
     BadModel("spire-8", "the header names no network"),
+    Conflict("another one is under way"),
+    NoMemory("spire-8", 1_000, 2_000),
+    TooSlow("spire-8", 61.23456, 50.0),
+    Diverged("spire-8", "divergence", 2.34567, 1.0),
+    Diverged("spire-8", "fault", "not finite", "none"),
+    NothingBefore(),
 ]
 every_error = pytest.mark.parametrize("error", ERRORS, ids=lambda error: error.code)
 
@@ -50,7 +61,7 @@ def test_the_table_of_this_test_is_complete() -> None:
 
 
 def test_every_error_has_a_code_of_its_own() -> None:
-    codes = [vars(type(error))["code"] for error in ERRORS]
+    codes = [vars(kind)["code"] for kind in {type(error) for error in ERRORS}]
     assert len(set(codes)) == len(codes)
     assert all(code.replace("_", "").isalpha() and code.islower() for code in codes)
 
