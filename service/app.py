@@ -9,11 +9,13 @@ from protocol.control import STATUS_SCHEMA, StreamStatus
 from protocol.errors import NeuroVEError
 from protocol.velocity import SCHEMA as VELOCITY_SCHEMA
 from service import logs
+from service.comparison import Limits
 from service.config import ServiceConfig
 from service.handlers import Handlers
 from service.health import stream_status
+from service.lanes import RingSize
 from service.lifecycle import notify
-from service.model_slot import ModelSlot
+from service.model_slot import ModelSlot, Rules
 from service.stream import Stream
 from service.transport import EndpointError, Publisher, Transport, open_transport
 from service.worker import Inbox, Outlet, StreamWorker
@@ -26,6 +28,14 @@ _WEDGED_S = 10.0
 _ASK_CAMERA_S = 1.0
 _MOST_REFUSED = 1024
 _ROUTER_PATIENCE_S = 365 * 86_400.0
+
+
+def _rules(config: ServiceConfig) -> Rules:
+    return Rules(
+        probation_s=config.probation_s,
+        shadow=Limits(config.shadow_divergence),
+        probation=Limits(config.probation_divergence),
+    )
 
 
 class Service:
@@ -42,11 +52,11 @@ class Service:
     def __init__(self, config: ServiceConfig, stop: threading.Event) -> None:
         self._config, self._stop = config, stop
         self._keys = config.keys
-        self._slot = ModelSlot(config.model, config.models_dir)
+        self._slot = ModelSlot(config.model, config.models_dir, _rules(config))
         self._workers: dict[str, StreamWorker] = {}
         self._changing = threading.Lock()  # of the dict; a worker's stream is the worker's alone
         self._refused: dict[str, float] = {}  # stream -> when it was last heard of
-        self._handlers = Handlers(config.node, self._slot, self._statuses, lambda: len(self._refused))
+        self._handlers = Handlers(config.node, self._slot, self._statuses, lambda: len(self._refused), self._is_ready)
 
     def run(self) -> None:
         """Serve until the stop event is set, then end everything in order.
@@ -72,6 +82,7 @@ class Service:
                 self._keep_house(transport)
             finally:
                 notify("STOPPING=1")
+                self._slot.close()
                 self._end_workers(list(self._workers))
         log.info("stopped", node=config.node)
 
@@ -120,7 +131,7 @@ class Service:
         if name == key or len(self._workers) >= self._config.max_streams:
             self._refuse(name)
             return None
-        stream = Stream(name, self._slot)
+        stream = Stream(name, self._slot, ring=RingSize(self._config.ring_windows, self._config.ring_mib << 20))
         worker = StreamWorker(
             stream,
             lambda: self._outlet(name, transport),
@@ -207,6 +218,10 @@ class Service:
             worker.stop()
         for worker in ending:
             worker.join(timeout_s=1.0)
+
+    def _is_ready(self) -> bool:
+        """Whether the next packet gets its estimate: the model is warm before anything is declared."""
+        return not self._stop.is_set() and self._alive()
 
     def _alive(self) -> bool:
         """Whether every worker's loop has turned lately: what the watchdog wants to know."""

@@ -27,6 +27,7 @@ class Handlers:
         slot: its models.
         streams: the status of every stream it serves now.
         refused_streams: how many streams it did not take.
+        ready: whether the next packet gets its estimate.
     """
 
     def __init__(
@@ -35,9 +36,10 @@ class Handlers:
         slot: ModelSlot,
         streams: Callable[[], list[StreamStatus]],
         refused_streams: Callable[[], int],
+        ready: Callable[[], bool] = lambda: True,
     ) -> None:
         self._node, self._slot = node, slot
-        self._streams, self._refused_streams = streams, refused_streams
+        self._streams, self._refused_streams, self._ready = streams, refused_streams, ready
         self._began = time.monotonic()
 
     def health(self, request: bytes) -> bytes:
@@ -57,6 +59,9 @@ class Handlers:
             epoch=active.epoch,
             refused_streams=refused,
             streams=tuple(streams),
+            ready=self._ready(),
+            change=self._slot.last_change,
+            rollbacks=self._slot.rollbacks,
         )
         return reply.encode()
 

@@ -1,5 +1,4 @@
 import shutil
-import threading
 
 import pytest
 
@@ -58,12 +57,3 @@ def test_the_model_given_at_the_start_stays_available_without_a_folder(models_di
     assert slot.activate("one")[1].epoch == 2
     with pytest.raises(BadModel, match="No such file"):
         ModelSlot(str(models_dir / "none.safetensors"))
-
-
-def test_changes_at_once_are_made_one_after_the_other(slot):
-    threads = [threading.Thread(target=slot.activate, args=(name,)) for name in ("one", "two") * 4]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert slot.active.epoch == 8
