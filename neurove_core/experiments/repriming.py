@@ -31,11 +31,12 @@ from protocol import Sensor
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-PRIMED = (8, 16, 32, 64, 128)
+PRIMED = (8, 16, 32, 64)
 SETTLED = 0.02  # of the standard deviation of the estimates
 SHIFT = 0.02  # of each weight, between the old model and the new one
 FIRST_SEED = 5000  # the default model has seen no street of these seeds
 AFTER = 48  # windows after the change that are looked at
+CAMERA = "davis346-half"
 SWAPS = 4  # per street
 APART = 12  # windows between them
 
@@ -80,7 +81,7 @@ def run(
     seconds = windows * bundle.config.window.duration_us / 1e6
     squares: dict[str, list[NDArray[np.float64]]] = {}
     for street in range(streets):
-        simulation = simulation_of(f"sim://street?seed={FIRST_SEED + street}&seconds={seconds + 0.1:g}")
+        simulation = simulation_of(f"sim://street?seed={FIRST_SEED + street}&camera={CAMERA}&seconds={seconds + 0.1:g}")
         for way, errors in _ways(new, old, windows_of(simulation, new)[:windows], swaps_at, replayed).items():
             squares.setdefault(way, []).extend(errors)
         progress(simulation.name)
