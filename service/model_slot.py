@@ -151,15 +151,17 @@ class ModelSlot:
             self._expected(expect)
             found = self._find(model)
             candidate = self._promoted(found, canary)
-            if candidate is None:
-                tell("verified", f"{found.name} {found.digest[:12]}")
-                estimator = self._fit(found, tell)
-                self._accept_trial()
-                candidate = Serving(estimator, self._epoch + 1)
-            self._prime(candidate, canary, tell)
-            if shadow_s > 0:
-                self._shadow(candidate, canary, shadow_s, tell)
-            before = self._switch(candidate, canary, tell)
+            try:
+                if candidate is not None:  # it was tried on the canary's streams
+                    self._prime(candidate, canary, tell)
+                else:
+                    candidate = self._tried(found, canary, shadow_s, tell)
+                before = self._switch(candidate, canary, tell)
+            except BaseException:
+                with self._turn:
+                    if self._plan.phase == "shadow":
+                        self._set(Plan(self._plan.active), self.last_change)
+                raise
             self._watch(candidate, on_progress)
             return before.estimator.bundle, candidate
 
@@ -258,6 +260,19 @@ class ModelSlot:
             raise Conflict(f"a canary of {on.name} {on.digest} is on: promote it or roll it back first")
         return plan.other
 
+    def _tried(
+        self, found: Bundle, canary: frozenset[str], shadow_s: float, tell: Callable[[Step, str], None]
+    ) -> Serving:
+        """A model that is ready to answer: loaded, fast enough, primed, and where asked compared in shadow."""
+        tell("verified", f"{found.name} {found.digest[:12]}")
+        estimator = self._fit(found, tell)
+        self._accept_trial()
+        candidate = Serving(estimator, self._epoch + 1)
+        self._prime(candidate, canary, tell)
+        if shadow_s > 0:
+            self._shadow(candidate, canary, shadow_s, tell)
+        return candidate
+
     def _fit(self, found: Bundle, tell: Callable[[Step, str], None]) -> Estimator:
         admission.check_memory(found.name, admission.weight_bytes(found), self._free_bytes())
         estimator = Estimator(found)
@@ -281,31 +296,20 @@ class ModelSlot:
             tell("priming", f"{primed} streams replayed their newest windows, {left} had none")
             return
         tell("priming", "it cuts or sees otherwise than the active model: nothing to replay, it starts cold beside it")
-        with self._beside(candidate, canary):
-            deadline = time.monotonic() + swap.settling_s(candidate)
-            while not swap.settled(candidate, self._streams(canary)) and time.monotonic() < deadline:
-                if self._closing.wait(swap.POLL_S):
-                    break
+        self._set(Plan(plan.active, candidate, canary, "shadow"), self.last_change)
+        deadline = time.monotonic() + swap.settling_s(candidate)
+        while not swap.settled(candidate, self._streams(canary)) and time.monotonic() < deadline:
+            if self._closing.wait(swap.POLL_S):
+                break
 
     def _shadow(
         self, candidate: Serving, canary: frozenset[str], seconds: float, tell: Callable[[Step, str], None]
     ) -> None:
         tell("shadow", f"for {seconds:g} s beside {self.active.estimator.bundle.name}")
-        with self._beside(candidate, canary):
-            limits, wait = self._rules.shadow, self._closing.wait
-            found = swap.shadow(candidate, lambda: self._streams(canary), seconds, limits, wait)
+        self._set(Plan(self._plan.active, candidate, canary, "shadow"), self.last_change)
+        limits, wait = self._rules.shadow, self._closing.wait
+        found = swap.shadow(candidate, lambda: self._streams(canary), seconds, limits, wait)
         tell("shadow", "; ".join(f"{name}: {one}" for name, one in found.items()))
-
-    @contextlib.contextmanager
-    def _beside(self, candidate: Serving, canary: frozenset[str]) -> Iterator[None]:
-        """Run a model beside the active one; it stays there until the switch, and goes where that does not come."""
-        plan = self._plan
-        self._set(Plan(plan.active, candidate, canary, "shadow"), self.last_change)
-        try:
-            yield
-        except BaseException:
-            self._set(plan, self.last_change)
-            raise
 
     def _switch(self, candidate: Serving, canary: frozenset[str], tell: Callable[[Step, str], None]) -> Serving:
         with self._turn:

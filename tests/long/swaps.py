@@ -14,6 +14,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -131,7 +132,7 @@ class Camera:
                 packet = self._packets[seq % len(self._packets)]
                 by_us = seq * WINDOW_US - packet.t0_us
                 events = packet.events._replace(t=packet.events.t + by_us)
-                source.put(encode_packet(packet._replace(seq=seq, t0_us=seq * WINDOW_US, events=events)))
+                source.put(encode_packet(replace(packet, seq=seq, t0_us=seq * WINDOW_US, events=events)))
                 seq += 1
 
     def end(self) -> None:

@@ -283,6 +283,26 @@ def test_a_shadow_without_streams_tells_nothing_and_is_refused(slots):
         slots().activate("two", shadow_s=0.01)
 
 
+def test_a_refused_shadow_of_a_model_that_sees_otherwise_leaves_nothing_running(slots):
+    slot = slots()
+    with pytest.raises(Diverged):
+        slot.activate("wide", shadow_s=0.01)
+    assert (slot.plan.phase, slot.active.epoch) == ("steady", 0)
+
+
+def test_a_caller_that_fails_to_hear_leaves_nothing_running(slots):
+    slot = slots()
+
+    def deaf(progress):
+        if progress.step == "shadow":
+            raise RuntimeError("planted")
+
+    with pytest.raises(RuntimeError):
+        slot.activate("two", shadow_s=0.01, on_progress=deaf)
+    assert slot.plan.phase == "steady"
+    assert slot.activate("three")[1].epoch == 1
+
+
 def test_a_shadow_that_the_node_has_no_time_for_is_given_up_and_the_feed_goes_on(slots):
     slot = slots()
     stream, packets = Stream("cam0", slot), make_packets(9_000, n=5)
