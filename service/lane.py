@@ -18,8 +18,8 @@ MOST_OWED_WINDOWS, MOST_OWED_PACKETS, MOST_OWED_EVENTS = 128, 4096, 4_000_000
 """A lane beside that owes more than this is given up: the node can not run two models."""
 
 
-PRIME_WINDOWS = 32
-"""So many windows from rest settle the default model; experiments/repriming.py measures it (decision 29)."""
+PRIME_WINDOWS = 64
+"""Windows that are replayed: more leave less of the change, and none of those tried leaves nothing (decision 29)."""
 
 Pace = Callable[[float], object]
 
@@ -120,7 +120,7 @@ class Primed(NamedTuple):
 
 
 def windows_to_prime(estimator: Estimator) -> int:
-    """Windows after which a model that began at rest is as settled as one that ran from the start."""
+    """Windows that a model replays before it answers a stream."""
     return max(estimator.config.settle_windows, PRIME_WINDOWS)
 
 

@@ -18,7 +18,9 @@ class Packed(NamedTuple):
     events: int
     outside: int
     shape: tuple[int, ...]
-    cells: NDArray[np.unsignedinteger] | None  # flat numbers of the cells that counted; None: values has all cells
+    cells: (
+        NDArray[np.uint16] | NDArray[np.uint32] | None
+    )  # flat numbers of the cells that counted; None: values has all cells
     values: NDArray[np.uint8]
 
     @property
@@ -38,7 +40,8 @@ class Packed(NamedTuple):
 def packed(window: Window) -> Packed:
     """A window in the smaller of two forms: the cells that counted and their counts, or the counts of all cells."""
     flat = window.counts.reshape(-1)
-    cells = np.flatnonzero(flat).astype(np.uint16 if flat.size <= 1 << 16 else np.uint32)
+    found = np.flatnonzero(flat)
+    cells = found.astype(np.uint16) if flat.size <= 1 << 16 else found.astype(np.uint32)
     sparse = cells.nbytes + cells.size < flat.size
     about = window.start_us, window.events, window.outside, window.counts.shape
     return Packed(*about, cells, flat[cells]) if sparse else Packed(*about, None, flat)

@@ -147,6 +147,6 @@ def shadow(
         raise Diverged(name, "compared windows", compared, f"at least {LEAST_WINDOWS}")
     wrong = worst(found, limits, newest=1 << 30)
     if wrong is not None:
-        stream, one = wrong
-        raise Diverged(name, f"{one.field} on stream {stream}", one.value, one.bound)
+        stream, broken = wrong
+        raise Diverged(name, f"{broken.field} on stream {stream}", broken.value, broken.bound)
     return found

@@ -3,8 +3,7 @@
 Not of the paper. What a change costs is measured against a run of the new model that was never swapped, on streets that
 the default model has not seen, in standard deviations of that run's own estimates, per axis. The old model of the
 carried state is the new one with every weight moved by 2 %: about as far as two trainings of one model lie apart at
-their end. The error of the first estimate after N windows from rest is all that N decides; the least N that keeps it
-within 2 % is what streams replay (decision 29).
+their end. The error of the first estimate after N windows from rest is all that N decides (decision 29).
 """
 
 import json
