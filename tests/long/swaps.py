@@ -183,6 +183,7 @@ def run(swaps: int, bad: int, streams: int, quiet_s: float = 5.0, pause_s: float
                 active = "two" if active == "one" else "one"
                 ask.activate(transport, config, active)
             resident.append(resident_kib(process.child.pid))
+            print(f"change {number + 1} of {swaps}: {resident[-1] >> 10} MiB", file=sys.stderr)
             time.sleep(pause_s)
         time.sleep(1.0)
         health = ask.health(transport, config)[0]
