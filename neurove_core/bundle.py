@@ -80,6 +80,8 @@ class Bundle:
             trained=self.trained,
             provenance=self.provenance,
             parameters=parameters,
+            release=self.release,
+            figures=self.about.figures,
         )
 
     @property

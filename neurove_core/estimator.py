@@ -1,5 +1,6 @@
 """Estimator.push: the one entry for inference; the same windows and encoding as training."""
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from neurove_core.encoding import to_spikes
 from neurove_core.engine import Engine
 from neurove_core.geometry import lookup_table
 from neurove_core.network import NetworkState
-from neurove_core.windows import Window, WindowsState
+from neurove_core.windows import Pushed, Window, WindowsState
 from protocol import CameraInfo, Events, Sensor
 from protocol.errors import BadModel
 
@@ -26,7 +27,7 @@ class StreamState(NamedTuple):
     windows: WindowsState
     network: NetworkState
     age: int  # windows since the network state began
-    recent: tuple[NDArray[np.uint8], ...]  # counts of the newest windows, to prime another model with
+    end_us: int | None = None  # end of the newest window that the network has seen
 
 
 class WindowEstimate(NamedTuple):
@@ -77,7 +78,7 @@ class Estimator:
             InvalidField: the camera info is of another sensor.
         """
         lut = lookup_table(self.config.canonical, sensor, camera)
-        return StreamState(sensor, camera, lut, WindowsState(), self.network.initial_state(), 0, ())
+        return StreamState(sensor, camera, lut, WindowsState(), self.network.initial_state(), 0)
 
     def push(self, events: Events, state: StreamState, horizon_us: int) -> Answer:
         """Take a packet's events and answer every window that they complete.
@@ -90,35 +91,34 @@ class Estimator:
             state: of the stream; used up by this call.
             horizon_us: sensor time reached even without events, such as the packet's t0_us.
         """
-        pushed = windows.push(events, horizon_us, state.windows, state.lut, self.config.window, self.config.canonical)
-        network, age, recent = state.network, state.age, state.recent
+        pushed = self.cut(events, state, horizon_us)
+        estimates, following = self.follow(pushed.windows, state._replace(windows=pushed.state))
+        outside = sum(window.outside for window in pushed.windows)
+        return Answer(estimates, following, pushed.late_events, outside, pushed.skipped_windows)
+
+    def cut(self, events: Events, state: StreamState, horizon_us: int) -> Pushed:
+        """The first half of push: the windows that some events complete; the network has not seen them yet."""
+        return windows.push(events, horizon_us, state.windows, state.lut, self.config.window, self.config.canonical)
+
+    def follow(self, complete: Iterable[Window], state: StreamState) -> tuple[list[WindowEstimate], StreamState]:
+        """The second half of push: answer windows, from this model's own cutting or from another's that cuts alike.
+
+        A window that does not begin where the one before ended begins the network's state anew.
+        """
+        network, age, end_us = state.network, state.age, state.end_us
         estimates: list[WindowEstimate] = []
-        end_us: int | None = None
-        for window in pushed.windows:
+        for window in complete:
             if end_us is not None and window.start_us != end_us:
-                network, age, recent = self.network.initial_state(), 0, ()
+                network, age = self.network.initial_state(), 0
             twists, network = self._step(window.counts, network)
             estimates.append(self._estimate(window, twists * self._metres(state.camera), age))
             age += 1
-            recent = (*recent, window.counts)[max(0, len(recent) + 1 - self.config.settle_windows) :]
             end_us = window.start_us + self.config.window.duration_us
-        if end_us is not None and pushed.state.start_us != end_us:
-            network, age, recent = self.network.initial_state(), 0, ()
-        outside = sum(window.outside for window in pushed.windows)
-        following = state._replace(windows=pushed.state, network=network, age=age, recent=recent)
-        return Answer(estimates, following, pushed.late_events, outside, pushed.skipped_windows)
+        return estimates, state._replace(network=network, age=age, end_us=end_us)
 
-    def primed(self, state: StreamState, before: "Estimator") -> StreamState:
-        """The state of a stream that another model served until now, as if this model had seen its recent windows.
-
-        Windows and their counts go over unchanged where both models cut and see alike; else the stream starts anew.
-        """
-        if (before.config.window, before.config.canonical) != (self.config.window, self.config.canonical):
-            return self.initial_state(state.sensor, state.camera)
-        network = self.network.initial_state()
-        for counts in state.recent:
-            _, network = self._step(counts, network)
-        return state._replace(network=network, age=len(state.recent))
+    def cuts_like(self, other: "Estimator") -> bool:
+        """Whether both models cut and see alike, so that the windows of one are those of the other."""
+        return (self.config.window, self.config.canonical) == (other.config.window, other.config.canonical)
 
     def warm_up(self) -> None:
         """Compile and touch all that the first packet would otherwise wait for.

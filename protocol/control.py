@@ -166,6 +166,9 @@ class HealthReply(Message):
     epoch: Count
     refused_streams: Count  # streams not served, because the node serves as many as it is configured to
     streams: Annotated[tuple[StreamStatus, ...], Field(strict=False)]
+    ready: bool = True  # the next packet of a stream gets its estimate: false while the node ends
+    change: str = ""  # one sentence on the newest change of model: what is under way, or how it ended
+    rollbacks: Count = 0  # models that were taken back by themselves since the start
 
 
 class ModelsReply(Message):

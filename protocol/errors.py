@@ -240,6 +240,54 @@ class Conflict(NeuroVEError):
         super().__init__(f"conflict: {why}", why=why)
 
 
+class NoMemory(NeuroVEError):
+    """A model is refused, for it might not fit beside the one that serves."""
+
+    code = "no_memory"
+
+    def __init__(self, model: str, free_bytes: int, need_bytes: int) -> None:
+        super().__init__(
+            f"model {model}: free_bytes={free_bytes}: a change of model needs {need_bytes} bytes of memory",
+            field="free_bytes",
+            value=free_bytes,
+            bound=need_bytes,
+        )
+
+
+class TooSlow(NeuroVEError):
+    """A model is refused, for this node can not run it in time."""
+
+    code = "too_slow"
+
+    def __init__(self, model: str, p99_ms: float, bound_ms: float) -> None:
+        p99_ms, bound_ms = round(p99_ms, 3), round(bound_ms, 3)
+        super().__init__(
+            f"model {model}: p99_ms={p99_ms}: a window may take at most {bound_ms} ms here",
+            field="p99_ms",
+            value=p99_ms,
+            bound=bound_ms,
+        )
+
+
+class Diverged(NeuroVEError):
+    """A model is refused, for beside the active one on live streams it did not behave alike."""
+
+    code = "diverged"
+
+    def __init__(self, model: str, field: str, value: float | str, bound: float | str) -> None:
+        value, bound = (round(one, 3) if isinstance(one, float) else one for one in (value, bound))
+        super().__init__(f"model {model}: {field}={value}: the bound is {bound}", field=field, value=value, bound=bound)
+
+
+class RolledBack(NeuroVEError):
+    """A model served, and was taken back by itself on its probation; the one before serves on."""
+
+    code = "rolled_back"
+
+    def __init__(self, why: str) -> None:
+        super().__init__(f"model change: {why}", why=why)
+
+
 class NothingBefore(NeuroVEError):
     """There is no model to go back to."""
 

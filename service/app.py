@@ -11,12 +11,15 @@ from protocol.errors import NeuroVEError
 from protocol.velocity import SCHEMA as VELOCITY_SCHEMA
 from service import logs
 from service.active_file import Active, ActiveFile
+from service.comparison import Limits
 from service.config import ServiceConfig
 from service.handlers import Handlers
 from service.health import stream_status
+from service.lanes import RingSize
 from service.lifecycle import notify
-from service.model_slot import ModelSlot
+from service.model_slot import ModelSlot, Rules
 from service.model_store import ModelStore
+from service.signatures import verifier
 from service.stream import Stream
 from service.transport import EndpointError, Publisher, Tell, Transport, open_transport
 from service.worker import Inbox, Outlet, StreamWorker
@@ -30,6 +33,14 @@ _ASK_CAMERA_S = 1.0
 _CHUNK_S = 10.0
 _MOST_REFUSED = 1024
 _ROUTER_PATIENCE_S = 365 * 86_400.0
+
+
+def _rules(config: ServiceConfig) -> Rules:
+    return Rules(
+        probation_s=config.probation_s,
+        shadow=Limits(config.shadow_divergence),
+        probation=Limits(config.probation_divergence),
+    )
 
 
 class Service:
@@ -47,19 +58,28 @@ class Service:
         self._config, self._stop = config, stop
         self._keys = config.keys
         self._active_file = ActiveFile(config.state_folder)
-        self._store = ModelStore(config.state_folder, config.models_dir, config.store_mib << 20)
+        self._store = ModelStore(
+            config.state_folder, config.models_dir, config.store_mib << 20, verifier(config.trusted_keys)
+        )
         self._slot = ModelSlot(
             config.model,
             config.models_dir,
-            pushed=self._store.bundles,
-            kept=self._kept(),
+            _rules(config),
             on_changed=self._keep,
+            pushed=self._store.files,
+            kept=self._kept(),
         )
         self._workers: dict[str, StreamWorker] = {}
         self._changing = threading.Lock()  # of the dict; a worker's stream is the worker's alone
         self._refused: dict[str, float] = {}  # stream -> when it was last heard of
         self._handlers = Handlers(
-            config.node, self._slot, self._statuses, lambda: len(self._refused), self._store, self._active_file
+            config.node,
+            self._slot,
+            self._statuses,
+            lambda: len(self._refused),
+            self._store,
+            self._active_file,
+            self._is_ready,
         )
 
     def run(self) -> None:
@@ -86,6 +106,7 @@ class Service:
                 self._keep_house(transport)
             finally:
                 notify("STOPPING=1")
+                self._slot.close()
                 self._end_workers(list(self._workers))
         log.info("stopped", node=config.node)
 
@@ -129,16 +150,22 @@ class Service:
         if active.configured != self._config.model:
             log.info("configured model is newer than the one that served last", model=self._config.model)
             return None, None
+        try:
+            self._store.signed(active.digest)
+        except NeuroVEError as error:
+            log.warning("model that served last is not taken", digest=active.digest, why=error.message)
+            return None, None
         return active.digest, active.previous
 
     def _keep(self, model: Bundle) -> None:
         previous, highest = self._slot.previous, self._active_file.highest_release
+        release = self._store.signed(model.digest).release_of(model.info)
         self._active_file.keep(
             Active(
                 digest=model.digest,
                 previous=previous.digest if previous else None,
                 configured=self._config.model,
-                highest_release=max(highest, model.info.release),
+                highest_release=max(highest, release),
             )
         )
 
@@ -166,7 +193,7 @@ class Service:
         if name == key or len(self._workers) >= self._config.max_streams:
             self._refuse(name)
             return None
-        stream = Stream(name, self._slot)
+        stream = Stream(name, self._slot, ring=RingSize(self._config.ring_windows, self._config.ring_mib << 20))
         worker = StreamWorker(
             stream,
             lambda: self._outlet(name, transport),
@@ -253,6 +280,10 @@ class Service:
             worker.stop()
         for worker in ending:
             worker.join(timeout_s=1.0)
+
+    def _is_ready(self) -> bool:
+        """Whether the next packet gets its estimate: the model is warm before anything is declared."""
+        return not self._stop.is_set() and self._alive()
 
     def _alive(self) -> bool:
         """Whether every worker's loop has turned lately: what the watchdog wants to know."""

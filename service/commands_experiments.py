@@ -22,6 +22,21 @@ def reproduce_firing(args: argparse.Namespace) -> int:
     return 0
 
 
+def reproduce_repriming(args: argparse.Namespace) -> int:
+    """How settled a model's first estimates are after a change of model."""
+    from neurove_core.experiments import repriming
+
+    told = sys.stderr.isatty()
+    report = repriming.run(
+        args.model, args.streets, progress=lambda name: print(name, file=sys.stderr) if told else None
+    )
+    files = repriming.save(report, args.out) if args.out else []
+    print(repriming.to_json(report) if args.json else repriming.to_markdown(report), end="")
+    for file in files:
+        print(f"wrote {file}", file=sys.stderr)
+    return 0 if report.least_primed is not None else 1
+
+
 def reproduce_sine(args: argparse.Namespace) -> int:
     """Tables I and II: regression and forecast of a sine by ASLSTM, ASLSTM-w/o, SLSTM and LTC."""
     from rich.console import Console
@@ -70,6 +85,10 @@ def add(commands: Any) -> None:
     firing = command(parser, "firing", reproduce_firing)
     firing.add_argument("--seed", type=int, default=0, help="of the first of ten runs; default 0")
     firing.add_argument("--out", type=Path, metavar="DIR", help="write table and figure (PNG, SVG) into this folder")
+    repriming = command(parser, "repriming", reproduce_repriming)
+    repriming.add_argument("--model", default="default", help="name of a built-in model, or a bundle's file")
+    repriming.add_argument("--streets", type=int, default=6, metavar="N", help="so many held-out streets; default 6")
+    repriming.add_argument("--out", type=Path, metavar="DIR", help="write table, figures and picture into this folder")
     sine = command(parser, "sine", reproduce_sine)
     sine.add_argument("--models", default="aslstm,aslstm-spiking,aslstm-wo,slstm,ltc", help="which, joined by commas")
     sine.add_argument("--seed", type=int, default=0, help="the first seed; default 0")

@@ -36,6 +36,7 @@ def _listed(value: object) -> object:
 
 
 Endpoints = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_listed)]
+Paths = Annotated[tuple[Path, ...], NoDecode, BeforeValidator(_listed)]
 
 
 class _Settings(BaseSettings):
@@ -87,6 +88,9 @@ class ServiceConfig(_Settings):
     state_dir: Path | None = Field(
         None, description="Folder of pushed models and of what is kept over a restart; by default models_dir."
     )
+    trusted_keys: Paths = Field(
+        (), description="Public keys (PEM): only models signed by one of them are pushed or activated; none: any model."
+    )
     store_mib: int = Field(2048, ge=1, le=1 << 20, description="Most that pushed models take on the disk [MiB].")
     queue_s: float = Field(1.0, gt=0, le=60, description="Packets that wait longer are dropped, oldest first [s].")
     queue_mib: int = Field(64, ge=1, le=4096, description="Most bytes waiting per stream [MiB].")
@@ -95,6 +99,17 @@ class ServiceConfig(_Settings):
     max_side_px: int = Field(4096, ge=16, le=32768, description="Larger sensors are refused.")
     idle_evict_s: float = Field(30.0, gt=0, le=86_400, description="A stream silent for so long is forgotten [s].")
     status_period_s: float = Field(1.0, gt=0, le=60, description="Period of the status messages [s].")
+    ring_windows: int = Field(64, ge=1, le=1024, description="Newest windows kept per stream, to prime a new model.")
+    ring_mib: int = Field(4, ge=1, le=1024, description="Most bytes that these windows take per stream [MiB].")
+    probation_s: float = Field(
+        10.0, ge=0, le=3600, description="A new model may be taken back exactly for so long [s]."
+    )
+    shadow_divergence: float = Field(
+        1.0, gt=0, description="Largest RMS difference to the active model in a shadow run, in its own RMS."
+    )
+    probation_divergence: float = Field(
+        3.0, gt=0, description="And on probation: beyond it a new model is taken back by itself."
+    )
 
     @model_validator(mode="before")
     @classmethod

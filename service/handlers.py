@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
+from neurove_core import manifest
 from neurove_core.bundle import Bundle
 from protocol.control import (
     ActivateReply,
@@ -24,7 +25,7 @@ from protocol.control import (
     RollbackRequest,
     StreamStatus,
 )
-from protocol.errors import Downgrade, NeuroVEError
+from protocol.errors import Downgrade, NeuroVEError, RolledBack
 from service.active_file import ActiveFile
 from service.health import node_verdict
 from service.model_slot import ModelSlot, Serving
@@ -34,6 +35,8 @@ from service.pull import Pull
 from service.signatures import Signed
 
 VERSION = importlib.metadata.version("neurove")
+
+_POLL_S = 0.02
 
 
 class Handlers:
@@ -46,6 +49,7 @@ class Handlers:
         refused_streams: how many streams it did not take.
         store: the models that were pushed to it.
         active_file: what it keeps over a restart.
+        ready: whether the next packet gets its estimate.
     """
 
     def __init__(
@@ -56,9 +60,10 @@ class Handlers:
         refused_streams: Callable[[], int],
         store: ModelStore | None = None,
         active_file: ActiveFile | None = None,
+        ready: Callable[[], bool] = lambda: True,
     ) -> None:
         self._node, self._slot = node, slot
-        self._streams, self._refused_streams = streams, refused_streams
+        self._streams, self._refused_streams, self._ready = streams, refused_streams, ready
         self._store, self._active_file = store or ModelStore(None), active_file or ActiveFile(None)
         self._began = time.monotonic()
 
@@ -79,6 +84,9 @@ class Handlers:
             epoch=active.epoch,
             refused_streams=refused,
             streams=tuple(streams),
+            ready=self._ready(),
+            change=self._slot.last_change,
+            rollbacks=self._slot.rollbacks,
         )
         return reply.encode()
 
@@ -110,9 +118,20 @@ class Handlers:
         return PushReply(node=self._node, model=info, fetched=fetched).encode()
 
     def activate(self, request: bytes, tell: Callable[[bytes], None] = lambda _: None) -> bytes:
-        """Change the model; the old one serves until the new one is ready."""
+        """Change the model; the old one serves until the new one is ready. Answers when its probation has ended.
+
+        Raises:
+            RolledBack: it did not end well. Besides what ModelSlot.activate raises, and Untrusted, Downgrade.
+        """
         wanted = ActivateRequest.decode(request)
-        with self._progress(tell) as on_progress:
+        with self._progress(tell) as tell_step:
+            ended: list[Progress] = []
+
+            def on_progress(progress: Progress) -> None:
+                tell_step(progress)
+                if progress.step in ("done", "rolled_back"):
+                    ended.append(progress)
+
             for info in self._slot.available().models:
                 if info.name == wanted.model or info.digest.startswith(wanted.model):
                     self._check_release(info, self._store.signed(info.digest))
@@ -123,6 +142,10 @@ class Handlers:
                 canary=frozenset(wanted.canary),
                 on_progress=on_progress,
             )
+            while not (ended or wanted.canary or self._slot.closing):
+                time.sleep(_POLL_S)
+            if ended and ended[0].step == "rolled_back":
+                raise RolledBack(ended[0].text)
         return self._changed(previous, serving)
 
     def rollback(self, request: bytes, tell: Callable[[bytes], None] = lambda _: None) -> bytes:
@@ -143,22 +166,25 @@ class Handlers:
 
     @contextlib.contextmanager
     def _progress(self, tell: Callable[[bytes], None]) -> Iterator[OnProgress]:
-        """A way to tell each step; a refusal is the last one."""
+        """A way to tell each step; one of the last three is the last one."""
+        last: list[str] = []
 
         def on_progress(progress: Progress) -> None:
+            last.append(progress.step)
             tell(ProgressReply(node=self._node, step=progress.step, text=progress.text).encode())
 
         try:
             yield on_progress
         except NeuroVEError as error:
-            on_progress(Progress("refused", error.message))
+            if not last or last[-1] not in ("refused", "rolled_back"):
+                on_progress(Progress("refused", error.message))
             raise
 
     def _check_release(self, info: ModelInfo, signed: Signed) -> None:
         """Refuse a release below the highest that has served, unless its maker signed that it may be."""
-        highest = self._active_file.highest_release
-        if info.release < highest and not (signed.state == "trusted" and signed.allow_downgrade):
-            raise Downgrade(info.name, info.release, highest)
+        release, highest = signed.release_of(info), self._active_file.highest_release
+        if not manifest.allowed(release, highest, signed.allow_downgrade):
+            raise Downgrade(info.name, release, highest)
 
     def _info(self, info: ModelInfo) -> ModelInfo:
         try:

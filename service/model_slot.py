@@ -1,36 +1,35 @@
-"""ModelSlot: the active estimator, the one before, and the models that may take its place."""
+"""ModelSlot: which model answers, which came before, and how one takes the place of another while streams run."""
 
 import contextlib
 import threading
+import time
+import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from neurove_core import bundle, models
+from neurove_core import golden
 from neurove_core.bundle import Bundle
 from neurove_core.estimator import Estimator
-from protocol.control import ModelInfo
-from protocol.errors import BadModel, Conflict, NothingBefore, UnknownModel
-from service import logs
-from service.progress import OnProgress, Progress
+from protocol.errors import BadModel, Conflict, InvalidField, NeuroVEError, NothingBefore, UnknownModel
+from service import admission, logs, swap
+from service.comparison import Limits
+from service.lane import Serving
+from service.lanes import Roles
+from service.library import MIN_DIGEST, Available, Files, Library, nothing_pushed
+from service.progress import OnProgress, Progress, Step, silent
+from service.swap import Plan, Subject
 
 log = logs.get(__name__)
 
-_MIN_DIGEST = 8
 
+class Rules(NamedTuple):
+    """How a model change is judged."""
 
-class Serving(NamedTuple):
-    """What streams answer with: they read it once per packet and notice a change by the epoch."""
-
-    estimator: Estimator
-    epoch: int
-
-
-class Available(NamedTuple):
-    """Models that could be activated now."""
-
-    models: tuple[ModelInfo, ...]
-    unreadable: dict[str, str]  # file name -> why it is no model
+    probation_s: float = 10.0
+    shadow: Limits = Limits()
+    probation: Limits = Limits(divergence=3.0)  # it acts by itself: only on what can not be meant
+    warm_up_share: float = 1.0  # 99th percentile of the time for a window, in the window's duration
 
 
 class ModelSlot:
@@ -39,9 +38,12 @@ class ModelSlot:
     Args:
         model: name of a built-in model or of one in the folder, or the path of a bundle's file.
         models_dir: folder of bundles that may be activated.
-        pushed: the bundles that were pushed to this node, and by name why others of them are none.
+        rules: how a change is judged.
+        on_changed: told the model that may be kept, when its probation has ended well or after a rollback; on a thread
+            of the slot or of the caller, never on a stream's.
+        free_bytes: memory that may still be taken.
+        pushed: the files of bundles that were pushed to this node, by digest.
         kept: digests of the models that served last and before that, which go before `model` where they can be loaded.
-        on_changed: hears of every model that serves from now on; runs on the thread that changed it.
 
     Raises:
         BadModel, UnknownModel: the first model can not be loaded.
@@ -51,33 +53,64 @@ class ModelSlot:
         self,
         model: str,
         models_dir: Path | None = None,
-        *,
-        pushed: Callable[[], tuple[list[Bundle], dict[str, str]]] = lambda: ([], {}),
-        kept: tuple[str | None, str | None] = (None, None),
+        rules: Rules = Rules(),  # noqa: B008  # immutable
         on_changed: Callable[[Bundle], None] = lambda _: None,
+        free_bytes: Callable[[], int | None] = admission.free_bytes,
+        *,
+        pushed: Files = nothing_pushed,
+        kept: tuple[str | None, str | None] = (None, None),
     ) -> None:
-        self._models_dir, self._pushed, self._on_changed = models_dir, pushed, on_changed
-        self._changing = threading.Lock()
-        self._given = models.built_in()[0]
+        self._library, self._rules = Library(models_dir, pushed), rules
+        self._on_changed, self._free_bytes = on_changed, free_bytes
+        self._changing = threading.Lock()  # held by the one change that is under way
+        self._turn = threading.Condition()  # of the plan
+        self._closing = threading.Event()
+        self._subjects: weakref.WeakSet[Subject] = weakref.WeakSet()
+        self.rollbacks = 0  # by itself
+        self._fallen: Serving | None = None  # the newest that was taken back
+        self.last_change = ""
         active, self.previous = (self._kept(digest) if digest else None for digest in kept)
-        path = Path(model)
-        try:
-            self._given = bundle.load(path) if path.suffix == bundle.SUFFIX else self._find(model)
-        except (BadModel, UnknownModel) as error:
-            if active is None:
-                raise
-            log.warning("configured model not loaded", model=model, why=error.message, serves=active.name)
-        self._active = Serving(_warm(active or self._given), 0)
+        estimator = Estimator(self._first(model, active))
+        estimator.warm_up()
+        self._epoch = 0
+        self._plan = Plan(Serving(estimator, 0))
+
+    # --- what streams ask
 
     @property
     def active(self) -> Serving:
-        """The model that serves now."""
-        return self._active
+        """The model that serves now; while a canary is on, the one that serves all other streams."""
+        return self._plan.active
+
+    @property
+    def plan(self) -> Plan:
+        """Which models are at work."""
+        return self._plan
+
+    def roles(self, stream: str) -> Roles:
+        """What a stream answers with from its next packet on, and what runs beside."""
+        return self._plan.roles(stream)
+
+    def join(self, stream: Subject) -> None:
+        """Have a stream be part of every change from now on, for as long as it lives."""
+        with self._turn:
+            self._subjects.add(stream)
+
+    def fault(self, serving: Serving, why: str) -> None:
+        """Take a model on probation back at once, for all streams; nothing where it is not on probation any more."""
+        with self._turn:
+            plan = self._plan
+            if plan.tried is None or plan.tried.estimator is not serving.estimator:
+                return
+            self._retreat(f"{serving.estimator.bundle.name} was rolled back by itself: {why}")
+            self.rollbacks += 1
+        log.error("model rolled back", model=serving.estimator.bundle.name, why=why, rollbacks=self.rollbacks)
+
+    # --- what operators ask
 
     def available(self) -> Available:
-        """The built-in models, the one given at start, and every bundle of the folder, read anew."""
-        bundles, unreadable = self._bundles()
-        return Available(tuple(found.info for found in bundles), unreadable)
+        """Every model that could be activated, and what lies among them but is none."""
+        return self._library.available()
 
     def activate(
         self,
@@ -86,112 +119,288 @@ class ModelSlot:
         expect: str | None = None,
         shadow_s: float = 0.0,
         canary: frozenset[str] = frozenset(),
-        on_progress: OnProgress = lambda _: None,
+        on_progress: OnProgress = silent,
     ) -> tuple[Bundle, Serving]:
         """Make a model the active one; until it is ready the old one serves, and if it is not fit it stays.
 
+        Returns when streams answer with the new model; its probation goes on, and `on_progress` is told how it ends.
+        A change during a probation ends it well.
+
         Args:
             model: its name, or at least the first 8 digits of its digest.
-            expect: how the digest of the active model begins, where the caller relies on it.
-            shadow_s: for how long it should run beside the active model first; 0 not at all.
-            canary: streams that should change; none means all.
-            on_progress: hears each step.
+            expect: the first 8 or more digits of the digest of the model that must be active for the change to be made.
+            shadow_s: run it beside the active one for so long first, and compare.
+            canary: switch these streams alone; a second call without it switches the others too.
+            on_progress: told every step; on this thread, after the return on one of the slot.
 
         Returns:
-            the model before, and what serves now.
+            the model before, and what the streams concerned answer with now.
 
         Raises:
-            UnknownModel, BadModel, Conflict: nothing was changed.
+            UnknownModel, BadModel, Conflict, NoMemory, TooSlow, Diverged: nothing was changed.
         """
-        with self._alone(expect):
-            before = self._active.estimator.bundle
-            serving = self._switch(self._find(model), on_progress)
-            self.previous = before
-            self._on_changed(serving.estimator.bundle)
-            on_progress(Progress("done", serving.estimator.bundle.name))
-            return before, serving
+        with self._change(on_progress), self._told(model, on_progress) as tell:
+            self._expected(expect)
+            found = self._library.find(model)
+            candidate = self._promoted(found, canary)
+            try:
+                if candidate is not None:  # it was tried on the canary's streams
+                    self._prime(candidate, canary, tell)
+                else:
+                    candidate = self._tried(found, canary, shadow_s, tell)
+                before = self._switch(candidate, canary, tell)
+            except BaseException:
+                with self._turn:
+                    if self._plan.phase == "shadow":
+                        self._set(Plan(self._plan.active), self.last_change)
+                raise
+            self._watch(candidate, on_progress)
+            return before.estimator.bundle, candidate
 
-    def rollback(
-        self, *, expect: str | None = None, on_progress: OnProgress = lambda _: None
-    ) -> tuple[Bundle, Serving]:
-        """Make the model before the active one again; it can be done once per change.
+    def rollback(self, *, expect: str | None = None, on_progress: OnProgress = silent) -> tuple[Bundle, Serving]:
+        """Go back to the model before; on probation and from a canary it was kept fed, and goes on as if never swapped.
 
         Args:
-            expect: how the digest of the active model begins, where the caller relies on it.
-            on_progress: hears each step.
+            expect: as of activate; of the model that is tried, where one is.
+            on_progress: told every step.
 
         Returns:
-            the model before, and what serves now.
+            the model that was taken back, and what serves now.
 
         Raises:
-            NothingBefore, Conflict: nothing was changed.
+            Conflict: another change is under way, or another model is active.
+            NothingBefore: there is none before it.
         """
-        with self._alone(expect):
+        with self._change(on_progress):
+            plan = self._expected(expect)
+            if plan.tried is not None:
+                with self._turn:
+                    taken = (self._plan.tried or plan.tried).estimator.bundle
+                    if self._plan.tried is not None:  # it may have fallen by itself meanwhile
+                        self._retreat(f"{taken.name} was rolled back")
+                on_progress(Progress("rolled_back", f"to {self._plan.active.estimator.bundle.name}"))
+                return taken, self._plan.active
             if self.previous is None:
                 raise NothingBefore
-            before = self._active.estimator.bundle
-            serving = self._switch(self.previous, on_progress)
-            self.previous = None
+            with self._told(self.previous.name, on_progress) as tell:
+                taken = plan.active.estimator.bundle
+                estimator = self._fit(self.previous, tell)
+                self._epoch += 1
+                serving = Serving(estimator, self._epoch)
+                self._prime(serving, frozenset(), tell)
+                self._set(Plan(serving), f"{taken.name} was rolled back")
+                self.previous = None
+                tell("rolled_back", f"to {serving.estimator.bundle.name}; primed, not kept fed")
             self._on_changed(serving.estimator.bundle)
-            on_progress(Progress("rolled_back", serving.estimator.bundle.name))
-            return before, serving
+            return taken, serving
+
+    @property
+    def closing(self) -> bool:
+        """Whether the node ends; a probation then ends without a word."""
+        return self._closing.is_set()
+
+    def await_probation(self, timeout_s: float) -> bool:
+        """Wait until no model is on probation; whether that came about in time."""
+        with self._turn:
+            return self._turn.wait_for(lambda: self._plan.phase != "probation", timeout_s)
+
+    def close(self) -> None:
+        """End what runs behind: no probation ends well after this."""
+        with self._turn:
+            self._closing.set()
+            self._turn.notify_all()
+
+    # --- one change, step by step
 
     @contextlib.contextmanager
-    def _alone(self, expect: str | None) -> Iterator[None]:
-        """One change at a time, and only of the model that the caller knows of."""
+    def _change(self, on_progress: OnProgress) -> Iterator[None]:
         if not self._changing.acquire(blocking=False):
-            raise Conflict("another model change is under way")
+            error = Conflict("another one is under way")
+            on_progress(Progress("refused", error.message))
+            raise error
         try:
-            digest = self._active.estimator.bundle.digest
-            if expect is not None and not digest.startswith(expect):
-                raise Conflict(f"expect={expect}, but the active model is {digest[:12]}")
             yield
         finally:
             self._changing.release()
 
-    def _switch(self, candidate: Bundle, on_progress: OnProgress) -> Serving:
-        on_progress(Progress("loaded", f"{candidate.name}, {candidate.digest[:12]}"))
-        estimator = _warm(candidate)
-        on_progress(Progress("warmed", candidate.name))
-        self._active = Serving(estimator, self._active.epoch + 1)
-        log.info("model changed", model=candidate.name, digest=candidate.digest[:12])
-        on_progress(Progress("active", f"{candidate.name}, epoch {self._active.epoch}"))
-        return self._active
+    @contextlib.contextmanager
+    def _told(self, model: str, on_progress: OnProgress) -> Iterator[Callable[[Step, str], None]]:
+        def tell(step: Step, text: str) -> None:
+            log.info("model change", step=step, text=text)
+            on_progress(Progress(step, text))
+
+        try:
+            yield tell
+        except NeuroVEError as error:
+            self.last_change = f"{model} was refused: {error.message}"
+            tell("refused", error.message)
+            raise
+
+    def _expected(self, expect: str | None) -> Plan:
+        plan = self._plan
+        if expect is None:
+            return plan
+        if len(expect) < MIN_DIGEST:
+            raise InvalidField("model change", "expect", expect, f"at least {MIN_DIGEST} digits of a digest")
+        active = (plan.tried or plan.active).estimator.bundle
+        if not active.digest.startswith(expect):
+            raise Conflict(f"{expect} is expected to be active, but {active.name} {active.digest} is")
+        return plan
+
+    def _promoted(self, found: Bundle, canary: frozenset[str]) -> Serving | None:
+        """The canary of this model, which needs no loading to serve all streams."""
+        plan = self._plan
+        if plan.phase != "canary" or plan.other is None:
+            return None
+        on = plan.other.estimator.bundle
+        if canary or on.digest != found.digest:
+            raise Conflict(f"a canary of {on.name} {on.digest} is on: promote it or roll it back first")
+        return plan.other
+
+    def _tried(
+        self, found: Bundle, canary: frozenset[str], shadow_s: float, tell: Callable[[Step, str], None]
+    ) -> Serving:
+        """A model that is ready to answer: loaded, fast enough, primed, and where asked compared in shadow."""
+        tell("verified", f"{found.name} {found.digest[:12]}")
+        estimator = self._fit(found, tell)
+        self._accept_trial()
+        candidate = Serving(estimator, self._epoch + 1)
+        self._prime(candidate, canary, tell)
+        if shadow_s > 0:
+            self._shadow(candidate, canary, shadow_s, tell)
+        return candidate
+
+    def _fit(self, found: Bundle, tell: Callable[[Step, str], None]) -> Estimator:
+        admission.check_memory(found.name, admission.weight_bytes(found), self._free_bytes())
+        estimator = Estimator(found)
+        tell("loaded", f"{found.info.parameters:,} parameters")
+        estimator.warm_up()
+        golden.check(estimator)
+        p99_ms = admission.check_speed(estimator, self._rules.warm_up_share)
+        tell("warmed", f"p99 {p99_ms:.1f} ms of a window of {estimator.config.window.duration_us / 1e3:g} ms")
+        return estimator
+
+    def _accept_trial(self) -> None:
+        with self._turn:
+            if self._plan.phase == "probation":
+                self._set(Plan(self._plan.active), self.last_change)
+
+    def _prime(self, candidate: Serving, canary: frozenset[str], tell: Callable[[Step, str], None]) -> None:
+        streams = self._streams(canary)
+        tell("priming", f"{len(streams)} streams")
+        plan = self._plan
+        primed, left = swap.prime(candidate, streams)
+        if plan.active.estimator.cuts_like(candidate.estimator) or plan.phase != "steady":
+            tell("priming", f"{primed} streams replayed their newest windows, {left} had none")
+            return
+        tell("priming", "it cuts or sees otherwise than the active model: nothing to replay, it starts cold beside it")
+        self._set(Plan(plan.active, candidate, canary, "shadow"), self.last_change)
+        deadline = time.monotonic() + swap.settling_s(candidate)
+        while not swap.settled(candidate, self._streams(canary)) and time.monotonic() < deadline:
+            if self._closing.wait(swap.POLL_S):
+                break
+
+    def _shadow(
+        self, candidate: Serving, canary: frozenset[str], seconds: float, tell: Callable[[Step, str], None]
+    ) -> None:
+        tell("shadow", f"for {seconds:g} s beside {self.active.estimator.bundle.name}")
+        self._set(Plan(self._plan.active, candidate, canary, "shadow"), self.last_change)
+        limits, wait = self._rules.shadow, self._closing.wait
+        found = swap.shadow(candidate, lambda: self._streams(canary), seconds, limits, wait)
+        tell("shadow", "; ".join(f"{name}: {one}" for name, one in found.items()))
+
+    def _switch(self, candidate: Serving, canary: frozenset[str], tell: Callable[[Step, str], None]) -> Serving:
+        with self._turn:
+            old, new = self._plan.active, candidate.estimator.bundle
+            self._epoch = max(self._epoch, candidate.epoch)
+            if canary:
+                self._set(Plan(old, candidate, canary, "canary"), f"{new.name} is a canary")
+            else:
+                self.previous = old.estimator.bundle
+                self._set(Plan(candidate, old, phase="probation"), f"{new.name} is active")
+        log.info("model changed", model=new.name, digest=new.digest[:12], canary=sorted(canary))
+        missing = canary - {stream.name for stream in self._streams(canary)}
+        where = f"on {', '.join(sorted(canary))}" if canary else "on all streams"
+        tell("active", f"{where}{f'; not here yet: {sorted(missing)}' if missing else ''}")
+        tell("probation", "until it is promoted or rolled back" if canary else f"for {self._rules.probation_s:g} s")
+        return old
+
+    def _watch(self, candidate: Serving, on_progress: OnProgress) -> None:
+        watcher = threading.Thread(target=self._probation, args=(candidate, on_progress), name="probation", daemon=True)
+        watcher.start()
+
+    def _probation(self, candidate: Serving, on_progress: OnProgress) -> None:
+        """Until a trial has ended: look at streams, take the model back where it broke a limit."""
+        phase, deadline = self._plan.phase, time.monotonic() + self._rules.probation_s
+        while True:
+            with self._turn:
+                plan = self._plan
+                if plan.tried is not candidate or plan.phase != phase or self._closing.is_set():
+                    break
+                if phase == "probation" and time.monotonic() >= deadline:
+                    self._set(Plan(candidate), f"{candidate.estimator.bundle.name} is active, its probation ended well")
+                    break
+            found = swap.measured(candidate, self._streams(plan.only), front_is_tried=True)
+            wrong = swap.worst(found, self._rules.probation, swap.JUDGED_WINDOWS)
+            if wrong is not None:
+                self.fault(candidate, f"stream {wrong[0]}: {wrong[1]}")
+                continue
+            with self._turn:
+                if self._plan is plan:
+                    self._turn.wait(min(swap.POLL_S, max(0.001, deadline - time.monotonic())))
+        if self._closing.is_set():
+            return
+        self._end(candidate, on_progress)
+
+    def _end(self, candidate: Serving, on_progress: OnProgress) -> None:
+        with self._turn:
+            plan, how = self._plan, self.last_change
+        name = candidate.estimator.bundle.name
+        if plan.active is candidate:
+            if plan.phase == "steady":
+                log.info("probation ended well", model=name)
+                self._on_changed(candidate.estimator.bundle)
+                on_progress(Progress("done", how))
+            return  # promoted: another watcher goes on
+        if self._fallen is candidate:
+            self._on_changed(plan.active.estimator.bundle)
+            on_progress(Progress("rolled_back", how))
+        else:
+            on_progress(Progress("done", f"{name}: a later change ended its probation"))
+
+    def _retreat(self, how: str) -> None:
+        """To the proven model; the caller holds the turn."""
+        proven = self._plan.proven
+        assert proven is not None
+        self._fallen = self._plan.tried
+        self._epoch += 1
+        self.previous = None
+        self._set(Plan(Serving(proven.estimator, self._epoch)), how)
+
+    def _set(self, plan: Plan, how: str) -> None:
+        with self._turn:
+            self._plan, self.last_change = plan, how
+            self._turn.notify_all()
+
+    def _streams(self, only: frozenset[str]) -> list[Subject]:
+        with self._turn:
+            return [stream for stream in self._subjects if not only or stream.name in only]
+
+    # --- the first model
+
+    def _first(self, model: str, kept: Bundle | None) -> Bundle:
+        try:
+            configured = self._library.open(model)
+        except (BadModel, UnknownModel) as error:
+            if kept is None:
+                raise
+            log.warning("configured model not loaded", model=model, why=error.message, serves=kept.name)
+            return kept
+        return kept or configured
 
     def _kept(self, digest: str) -> Bundle | None:
         try:
-            return self._find(digest)
+            return self._library.find(digest)
         except (BadModel, UnknownModel) as error:
             log.warning("model that served last not loaded", digest=digest, why=error.message)
             return None
-
-    def _find(self, model: str) -> Bundle:
-        bundles, unreadable = self._bundles()
-        by_digest = len(model) >= _MIN_DIGEST
-        found = {
-            one.digest: one for one in bundles if one.name == model or (by_digest and one.digest.startswith(model))
-        }
-        if len(found) > 1:
-            raise BadModel(model, f"{len(found)} models have this name; say which by digest: {', '.join(found)}")
-        for one in found.values():
-            return one
-        for name, why in unreadable.items():
-            if Path(name).stem == model:
-                raise BadModel(name, why)
-        raise UnknownModel(model, tuple(one.name for one in bundles))
-
-    def _bundles(self) -> tuple[list[Bundle], dict[str, str]]:
-        pushed, unreadable = self._pushed()
-        bundles = [*models.built_in(), self._given, *pushed]
-        for path in sorted(self._models_dir.glob(f"*{bundle.SUFFIX}")) if self._models_dir else ():
-            try:
-                bundles.append(bundle.load(path))
-            except BadModel as error:
-                unreadable[path.name] = error.message.partition(": ")[2]
-        return list({one.digest: one for one in bundles}.values()), unreadable
-
-
-def _warm(model: Bundle) -> Estimator:
-    estimator = Estimator(model)
-    estimator.warm_up()
-    return estimator

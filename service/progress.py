@@ -28,3 +28,7 @@ class Progress(NamedTuple):
 
 OnProgress = Callable[[Progress], None]
 """Hears each step as it is reached; it must not raise."""
+
+
+def silent(_: Progress) -> None:
+    """Tell nobody."""

@@ -6,12 +6,14 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from neurove_core.estimator import StreamState, WindowEstimate
+from neurove_core.estimator import WindowEstimate
 from protocol import CameraInfo, EventPacket, Flag, Sensor, Trace, Twist, TwistEstimate
 from protocol.control import Losses
 from protocol.errors import InvalidField
 from service import logs
-from service.model_slot import ModelSlot, Serving
+from service.lane import Serving
+from service.lanes import Lanes, Pushing, RingSize, Unfit
+from service.model_slot import ModelSlot
 
 log = logs.get(__name__)
 
@@ -81,9 +83,16 @@ class Stream:
         name: of the stream.
         slot: read once per packet; a change of model takes effect at the next one.
         now_ns: our monotonic clock.
+        ring: what it keeps of its newest windows, to prime another model with.
     """
 
-    def __init__(self, name: str, slot: ModelSlot, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+    def __init__(
+        self,
+        name: str,
+        slot: ModelSlot,
+        now_ns: Callable[[], int] = time.monotonic_ns,
+        ring: RingSize = RingSize(),  # noqa: B008  # immutable
+    ) -> None:
         self.name = name
         self.counters = Counters()
         self.sensor: Sensor | None = None
@@ -92,11 +101,11 @@ class Stream:
         self.last_packet_ns = self.last_estimate_ns = self.flow_began_ns = now_ns()
         self.last_loss_ns: int | None = None
         self._slot, self._now_ns = slot, now_ns
-        self._serving: Serving = slot.active
-        self._state: StreamState | None = None
+        self.lanes = Lanes(name, ring)
         self._sequence = _Sequence()
         self._holes: list[_Hole] = []
         self._pending: set[Flag] = set()
+        slot.join(self)
 
     def accept(self, packet: EventPacket, arrival: Arrival) -> list[TwistEstimate]:
         """Take one packet; answer every window that it completes.
@@ -111,14 +120,21 @@ class Stream:
         self._heard(arrival.received_ns)
         if not self._in_sequence(packet):
             return []
-        state = self._ready(packet)
-        serving = self._serving
-        answer = serving.estimator.push(packet.events, state, packet.t0_us)
-        self._state = answer.state
-        self.counters.outside_events += answer.outside_events
-        self._count("late_events", answer.late_events)
-        self._count("skipped_windows", answer.skipped_windows)
-        return [self._estimate(window, serving, arrival) for window in answer.estimates]
+        self._look_at(packet)
+        pushing = self._push(packet)
+        self.counters.outside_events += pushing.outside_events
+        self._count("late_events", pushing.late_events)
+        self._count("skipped_windows", pushing.skipped_windows)
+        return [self._estimate(window, pushing.serving, arrival) for window in pushing.estimates]
+
+    @property
+    def owes(self) -> bool:
+        """Whether a model that runs beside the one that answers has something to catch up on."""
+        return self.lanes.owes
+
+    def attend(self) -> None:
+        """Let the model beside do one piece of its work: for when no packet waits."""
+        self.lanes.attend()
 
     def refused(self, received_ns: int) -> int:
         """Count a packet that could not be read; returns how many these are by now."""
@@ -143,7 +159,7 @@ class Stream:
         if camera == self.camera:
             return
         self.camera = camera
-        if self._state is not None:
+        if self.lanes.front is not None:
             self._pending.add(Flag.SENSOR_CHANGED)
             self._restart()
         log.info("camera info", stream=self.name, sensor=str(camera.sensor), lens=camera.lens)
@@ -208,36 +224,42 @@ class Stream:
         if Flag.OVERLOAD in self._pending:
             flags |= {Flag.OVERLOAD, Flag.GAP}
             self._pending.discard(Flag.OVERLOAD)
-        if self._state is not None and flags:
-            self._holes.append(_Hole(self._state.windows.horizon_us, until_us, frozenset(flags)))
+        horizon_us = self.lanes.horizon_us
+        if horizon_us is not None and flags:
+            self._holes.append(_Hole(horizon_us, until_us, frozenset(flags)))
 
     def _restart(self) -> None:
         """Forget the recurrent state and the open window: the next packet begins anew."""
-        self._state = None
+        self.lanes.restart()
         self._holes.clear()
         self.counters.resets += 1
 
-    def _ready(self, packet: EventPacket) -> StreamState:
-        """The state to push into: of this sensor, this clock, and the model that serves now."""
+    def _look_at(self, packet: EventPacket) -> None:
+        """Begin anew where the packet is of another sensor or another clock than those before."""
         if self.sensor != packet.sensor:
             if self.sensor is not None:
                 log.warning("sensor changed", stream=self.name, before=str(self.sensor), now=str(packet.sensor))
                 self._pending.add(Flag.SENSOR_CHANGED)
                 self._restart()
             self.sensor = packet.sensor
-        state = self._state
-        if state is not None and packet.t0_us < state.windows.horizon_us - CLOCK_RESET_US:
-            log.warning("sensor clock went back", stream=self.name, by_us=state.windows.horizon_us - packet.t0_us)
+        horizon_us = self.lanes.horizon_us
+        if horizon_us is not None and packet.t0_us < horizon_us - CLOCK_RESET_US:
+            log.warning("sensor clock went back", stream=self.name, by_us=horizon_us - packet.t0_us)
             self._restart()
-            state = None
-        active = self._slot.active
-        if state is not None and active.epoch != self._serving.epoch:
-            open_events = state.windows.events
-            state = active.estimator.primed(state, self._serving.estimator)
-            if open_events and not state.windows.events:  # the models cut differently: the open window is given up
-                self._count("skipped_windows", 1)
-        self._serving = active
-        return state or active.estimator.initial_state(packet.sensor, self._camera_of(packet.sensor))
+
+    def _push(self, packet: EventPacket) -> Pushing:
+        self._arrange(packet)
+        try:
+            return self.lanes.push(packet)
+        except Unfit as unfit:
+            assert self.lanes.front is not None
+            self._slot.fault(self.lanes.front.serving, f"stream {self.name}: {unfit}")
+            self._arrange(packet)
+            return self.lanes.push(packet)
+
+    def _arrange(self, packet: EventPacket) -> None:
+        about = packet.sensor, self._camera_of(packet.sensor)
+        self._count("skipped_windows", self.lanes.arrange(self._slot.roles(self.name), about, packet))
 
     def _camera_of(self, sensor: Sensor) -> CameraInfo | None:
         """The CameraInfo, if it is of this sensor."""

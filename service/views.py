@@ -156,6 +156,10 @@ def health_table(replies: list[HealthReply]) -> RenderableType:
         model = f"{reply.model.name} ({'trained' if reply.model.trained else 'untrained'}, {reply.model.digest[:12]})"
         about = f": {reply.why}. Up {reply.uptime_s:.0f} s, version {reply.version}, model {model}, epoch {reply.epoch}"
         parts.append(Text.assemble((f"{reply.node} ", "bold"), verdict, about))
+        if not reply.ready:
+            parts.append(Text("not ready: the node ends", style="yellow"))
+        if reply.change:
+            parts.append(Text(f"model change: {reply.change}. Rolled back by itself: {reply.rollbacks}", style="dim"))
         if reply.streams:
             parts.append(_streams_table(reply.streams))
     return Group(*parts)

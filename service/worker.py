@@ -128,11 +128,13 @@ class StreamWorker:
             self._see_through(outlet.ask_camera)
             while not self._stopping.is_set():
                 self.beat_ns = time.monotonic_ns()
-                sample, dropped = self._inbox.take(_IDLE_BEAT_S)
+                sample, dropped = self._inbox.take(0.0 if self.stream.owes else _IDLE_BEAT_S)
                 if dropped:
                     self.stream.overloaded(dropped)
                 if sample is not None:
                     self._work(sample, outlet)
+                else:  # a model beside the one that answers has what time is left
+                    self.stream.attend()
         finally:
             outlet.close()
 

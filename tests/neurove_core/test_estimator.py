@@ -92,8 +92,6 @@ def assert_same_estimates(got: list[WindowEstimate], want: list[WindowEstimate])
 def assert_same_state(got: StreamState, want: StreamState) -> None:
     assert got.age == want.age
     np.testing.assert_array_equal(got.lut, want.lut)
-    for one, other in zip(got.recent, want.recent, strict=True):
-        np.testing.assert_array_equal(one, other)
     for field in ("membranes", "cells"):
         for one, other in zip(chain(*getattr(got.network, field)), chain(*getattr(want.network, field)), strict=True):
             assert torch.equal(one, other)
@@ -221,33 +219,42 @@ def test_twists_are_the_networks_answers_times_scale_plus_offset():
         np.testing.assert_allclose(one.twists, other.twists * scale.numpy() + offset.numpy(), rtol=1e-6)
 
 
-@pytest.mark.parametrize("age", range(SETTLE + 1))
-def test_priming_the_same_model_gives_exactly_the_state_a_young_stream_has(estimator, age):
-    state = feed(estimator, windows_of_events(age + 1)).state
-    assert state.age == age
-    primed = Estimator(make_bundle()).primed(state, estimator)
-    assert_same_state(primed, state)
-    following = [*windows_of_events(2, first=age + 1), tick(age + 3)]
-    again = feed(estimator, windows_of_events(age + 1)).state
-    assert_same_estimates(feed(estimator, following, primed).estimates, feed(estimator, following, again).estimates)
+def test_push_is_cut_and_then_follow(estimator):
+    packets = windows_of_events(6)
+    whole, state, estimates = feed(estimator, packets), estimator.initial_state(SENSOR), []
+    for events in packets:
+        pushed = estimator.cut(events, state, int(events.t[0]))
+        answers, state = estimator.follow(pushed.windows, state._replace(windows=pushed.state))
+        estimates += answers
+    assert_same_estimates(estimates, whole.estimates)
+    assert_same_state(state, whole.state)
 
 
-def test_priming_an_old_stream_gives_the_state_of_one_that_saw_its_newest_windows_only(estimator):
-    packets = windows_of_events(SETTLE + 4)
-    primed = estimator.primed(feed(estimator, packets).state, estimator)
-    assert_same_state(primed, feed(estimator, packets[-SETTLE - 1 :]).state)
-    assert primed.age == SETTLE
+def cut_all(estimator, packets):
+    """Every window that packets complete."""
+    state, windows = estimator.initial_state(SENSOR), []
+    for events in packets:
+        pushed = estimator.cut(events, state, int(events.t[0]))
+        state, windows = state._replace(windows=pushed.state), windows + pushed.windows
+    return windows
 
 
-def test_priming_another_model_gives_what_it_would_have_come_to_itself_and_loses_no_event(estimator):
+def test_another_model_that_cuts_alike_follows_the_same_windows_as_if_it_had_cut_them_itself(estimator):
     other = Estimator(make_bundle(seed=7, network=CONFIG.network.model_copy(update={"hidden": 5, "diffusion": False})))
-    packets = windows_of_events(3)
-    half = make_events(80, seed=40, start_us=3 * DURATION_US, duration_us=DURATION_US // 2)
-    rest = [make_events(80, seed=41, start_us=3 * DURATION_US + 6_000, duration_us=4_000), tick(4)]
-    swapped = other.primed(feed(estimator, [*packets, half]).state, estimator)
-    own = feed(other, [*packets, half]).state
-    assert_same_state(swapped, own)
-    assert_same_estimates(feed(other, rest, swapped).estimates, feed(other, rest, own).estimates)
+    packets = windows_of_events(5)
+    assert other.cuts_like(estimator)
+    own = feed(other, packets)
+    estimates, state = other.follow(cut_all(estimator, packets), other.initial_state(SENSOR))
+    assert_same_estimates(estimates, own.estimates)
+    assert_same_state(state, own.state)
+
+
+def test_windows_after_a_hole_are_followed_from_rest(estimator):
+    windows = cut_all(estimator, windows_of_events(8))
+    _, state = estimator.follow([*windows[:2], *windows[4:]], estimator.initial_state(SENSOR))
+    _, fresh = estimator.follow(windows[4:], estimator.initial_state(SENSOR))
+    assert state.age == len(windows[4:])
+    assert_same_state(state, fresh)
 
 
 @pytest.mark.parametrize(
@@ -260,22 +267,8 @@ def test_priming_another_model_gives_what_it_would_have_come_to_itself_and_loses
     ],
     ids=["bins", "duration", "grid", "field_of_view"],
 )
-@pytest.mark.parametrize("camera", [None, LENS], ids=["scaled", "lens"])
-def test_priming_a_model_that_cuts_or_sees_otherwise_starts_the_stream_anew(estimator, change, camera):
-    other = Estimator(make_bundle(seed=3, **change))
-    before = feed(estimator, windows_of_events(6), estimator.initial_state(SENSOR, camera)).state
-    primed = other.primed(before, estimator)
-    assert_same_state(primed, other.initial_state(SENSOR, camera))
-    packets = [*windows_of_events(4, first=6), tick(10)]
-    fresh = feed(other, packets, other.initial_state(SENSOR, camera))
-    assert_same_estimates(feed(other, packets, primed).estimates, fresh.estimates)
-
-
-@pytest.mark.parametrize("settle", [0, 1, SETTLE])
-def test_a_stream_keeps_as_many_windows_to_prime_with_as_its_model_needs_and_no_more(settle):
-    estimator = Estimator(make_bundle(settle_windows=settle))
-    state = feed(estimator, windows_of_events(12)).state
-    assert (len(state.recent), state.age) == (settle, 11)
+def test_models_that_cut_or_see_otherwise_are_told_apart(estimator, change):
+    assert not Estimator(make_bundle(seed=3, **change)).cuts_like(estimator)
 
 
 def test_a_model_that_is_fit_warms_up_and_answers_as_before():

@@ -22,6 +22,7 @@ from neurove_core.training.batches import backwards, doubled, draw, mirrored, no
 from neurove_core.training.config import DataConfig, RecipeConfig, TrainingConfig
 from neurove_core.training.loop import CHECKPOINT, RUN_JSON, golden_windows, learn, learning_rate, train
 from neurove_core.training.run import Run
+from protocol import Events
 from protocol.errors import BadModel, InvalidField
 
 MODEL = ModelConfig(
@@ -61,10 +62,13 @@ def test_a_sequence_has_the_counts_that_the_service_sees_and_the_truth_of_each_b
     lut = lookup_table(MODEL.canonical, simulation.sensor, simulation.lens.info)
     state = estimator.initial_state(simulation.sensor, simulation.lens.info)
     assert (state.lut == lut).all()
-    for chunk in simulation.chunks():
-        state = estimator.push(chunk, state, 0).state
-    state = estimator.push(chunk.span(0, 0), state, 500_000).state
-    np.testing.assert_array_equal(np.stack(state.recent), sequence.counts[-len(state.recent) :])
+    windows = []
+    none = Events.from_columns([], [], [], [])
+    for events, horizon_us in [*((chunk, 0) for chunk in simulation.chunks()), (none, 500_000)]:
+        pushed = estimator.cut(events, state, horizon_us)
+        state = state._replace(windows=pushed.state)
+        windows += pushed.windows
+    np.testing.assert_array_equal(np.stack([window.counts for window in windows]), sequence.counts)
     middle_s = np.array([3 * 0.05 + 2.5 * 0.01])
     twist = simulation.trajectory.twist(middle_s)[0]
     twist[:3] /= simulation.lens.height_m

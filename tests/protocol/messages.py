@@ -138,6 +138,9 @@ EXAMPLES: dict[str, Fields] = {
         "epoch": 2,
         "refused_streams": 0,
         "streams": [STATUS],
+        "ready": True,
+        "change": "spire-7 is active",
+        "rollbacks": 1,
     },
     "ModelsRequest": {"v": 1},
     "ModelsReply": {
@@ -346,6 +349,9 @@ ANY: dict[str, st.SearchStrategy[Fields]] = {
             "epoch": counts,
             "refused_streams": counts,
             "streams": st.lists(statuses.map(lambda status: {"v": 1, **status}), max_size=2),
+            "ready": st.booleans(),
+            "change": sentences,
+            "rollbacks": counts,
         }
     ),
     "ModelsRequest": st.just({}),

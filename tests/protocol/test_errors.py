@@ -15,17 +15,21 @@ from protocol.errors import (
     Conflict,
     Cut,
     Detail,
+    Diverged,
     Downgrade,
     EventOutsideSensor,
     InternalError,
     InvalidField,
     Malformed,
+    NoMemory,
     NoQuota,
     NoSpace,
     NoStore,
     NothingBefore,
+    RolledBack,
     TimeBackwards,
     TooLarge,
+    TooSlow,
     UnknownFormat,
     UnknownModel,
     UnsupportedVersion,
@@ -54,7 +58,12 @@ ERRORS: list[NeuroVEError] = [
     Cut("spire-9.safetensors", 1_000, 3_000_000, "whoever pushed it does not answer"),
     Busy(4),
     Conflict("another model change is under way"),
+    NoMemory("spire-8", 1_000, 2_000),
+    TooSlow("spire-8", 61.23456, 50.0),
+    Diverged("spire-8", "divergence", 2.34567, 1.0),
+    Diverged("spire-8", "fault", "not finite", "none"),
     NothingBefore(),
+    RolledBack("spire-8 was rolled back by itself: stream cam0: divergence 4, the bound is 3"),
 ]
 every_error = pytest.mark.parametrize("error", ERRORS, ids=lambda error: error.code)
 
@@ -70,7 +79,7 @@ def test_the_table_of_this_test_is_complete() -> None:
 
 
 def test_every_error_has_a_code_of_its_own() -> None:
-    codes = [vars(type(error))["code"] for error in ERRORS]
+    codes = [vars(kind)["code"] for kind in {type(error) for error in ERRORS}]
     assert len(set(codes)) == len(codes)
     assert all(code.replace("_", "").isalpha() and code.islower() for code in codes)
 

@@ -96,6 +96,7 @@ OUT_OF_BOUND: dict[str, dict[str, tuple[Any, ...]]] = {
         "node": ("*",),
         "epoch": (-1,),
         "refused_streams": (-1,),
+        "rollbacks": (-1,),
         "model.parameters": (-1,),
         "streams.0.lost.late_events": (-1,),
         "streams.0.stream": ("a/b",),

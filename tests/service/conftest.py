@@ -22,4 +22,6 @@ def models_dir(tmp_path_factory):
 
 @pytest.fixture
 def slot(models_dir):
-    return ModelSlot("one", models_dir)
+    slot = ModelSlot("one", models_dir)
+    yield slot
+    slot.close()

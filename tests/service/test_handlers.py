@@ -96,6 +96,22 @@ def test_a_silent_camera_is_idle_which_is_no_fault_of_the_node(handlers, stream,
     assert (health.ok, health.streams[0].verdict) == (True, "idle")
 
 
+def test_health_tells_how_the_newest_change_of_model_went_and_whether_the_node_is_ready(slot, handlers):
+    assert (ask_health(handlers).change, ask_health(handlers).rollbacks, ask_health(handlers).ready) == ("", 0, True)
+    _, serving = slot.activate("two")
+    assert ask_health(handlers).change == "two is active"
+    slot.fault(serving, "planted")
+    told = ask_health(handlers)
+    assert (told.change, told.rollbacks) == ("two was rolled back by itself: planted", 1)
+    assert (told.model.name, told.epoch) == ("one", 2)
+    with pytest.raises(UnknownModel):
+        slot.activate("three")
+    assert ask_health(handlers).change.startswith("three was refused: ")
+    assert not HealthReply.decode(
+        Handlers("edge", slot, list, lambda: 0, lambda: False).health(HealthRequest().encode())
+    ).ready
+
+
 def test_models_tell_active_previous_and_available(handlers):
     first = ModelsReply.decode(handlers.models(ModelsRequest().encode()))
     assert (first.active.name, first.previous, first.epoch) == ("one", None, 0)
@@ -149,7 +165,7 @@ def storing(models_dir, tmp_path):
         store = ModelStore(tmp_path, models_dir, verify=trusts_a_flag)
         active_file = ActiveFile(None)
         active_file.keep(Active(digest="0" * 64, previous=None, configured="one", highest_release=highest_release))
-        slot = ModelSlot("one", models_dir, pushed=store.bundles)
+        slot = ModelSlot("one", models_dir, pushed=store.files)
         return Handlers("edge", slot, list, lambda: 0, store, active_file)
 
     return make

@@ -4,7 +4,8 @@ import threading
 import pytest
 
 from protocol.errors import BadModel, Conflict, NothingBefore, UnknownModel
-from service.model_slot import ModelSlot
+from service.model_slot import ModelSlot, Rules
+from tests.service.test_swap import wait_until
 
 
 def test_a_model_is_found_by_name_and_by_digest(slot):
@@ -70,7 +71,7 @@ def test_of_changes_at_once_those_that_come_late_are_told_of_a_conflict(slot):
     winner = threading.Thread(target=slot.activate, args=("two",), kwargs={"on_progress": first_step})
     winner.start()
     assert began.wait(30)
-    with pytest.raises(Conflict, match="another model change is under way"):
+    with pytest.raises(Conflict, match="another one is under way"):
         slot.activate("untrained")
     with pytest.raises(Conflict):
         slot.rollback()
@@ -78,14 +79,15 @@ def test_of_changes_at_once_those_that_come_late_are_told_of_a_conflict(slot):
     winner.join()
     slot.activate("one", on_progress=told.append)
     assert (slot.active.epoch, slot.previous.name) == (2, "two")
-    assert [progress.step for progress in told] == ["loaded", "warmed", "active", "done"]
+    steps = [progress.step for progress in told]
+    assert (steps[:3], steps[-2:]) == (["verified", "loaded", "warmed"], ["active", "probation"])
 
 
 def test_a_change_that_expects_another_model_is_a_conflict_and_changes_nothing(slot):
     before = slot.active
     digest = before.estimator.bundle.digest
     for change in (lambda: slot.activate("two", expect="0" * 8), lambda: slot.rollback(expect="0" * 8)):
-        with pytest.raises(Conflict, match=f"expect=00000000, but the active model is {digest[:12]}"):
+        with pytest.raises(Conflict, match=f"00000000 is expected to be active, but .* {digest} is"):
             change()
     assert slot.active is before
     assert slot.activate("two", expect=digest[:8])[1].epoch == 1
@@ -101,10 +103,11 @@ def test_a_rollback_goes_back_once(slot):
         slot.rollback()
 
 
-def test_every_model_that_serves_is_told_with_the_one_before(models_dir):
+def test_every_model_that_may_be_kept_is_told_with_the_one_before(models_dir):
     told = []
-    slot = ModelSlot("one", models_dir, on_changed=lambda model: told.append((model.name, slot.previous)))
+    slot = ModelSlot("one", models_dir, Rules(probation_s=0), lambda model: told.append((model.name, slot.previous)))
     slot.activate("two")
+    wait_until(lambda: told)
     slot.rollback()
     assert [name for name, _ in told] == ["two", "one"]
     assert [previous and previous.name for _, previous in told] == ["one", None]

@@ -11,6 +11,7 @@ from neurove_core.config import NetworkConfig
 from protocol.control import PushRequest
 from protocol.errors import BadModel, Cut, Downgrade, NeuroVEError, NoQuota, NoSpace, NoStore, TooLarge
 from service import model_store
+from service.library import Library
 from service.model_slot import ModelSlot
 from service.model_store import ModelStore
 from service.signatures import Signed
@@ -62,13 +63,19 @@ def files(folder):
     return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
 
 
+def pushed(store):
+    """Names of the sound models among the pushed ones, and what is wrong with the others."""
+    available = Library(pushed=store.files).available()
+    return {one.name for one in available.models} - {"default", "untrained"}, available.unreadable
+
+
 def test_a_pushed_bundle_is_whole_on_the_disk_and_can_be_activated(store, tmp_path, data):
     steps = []
     model, signed, moved = fetch(store, wanted(data), source(data), steps)
     assert (model.name, signed.state, moved) == ("three", "unsigned", len(data))
     assert [step.step for step in steps] == ["fetching", "staged", "verified"]
     assert files(tmp_path) == [f"pushed/{model.digest}/bundle.safetensors"]
-    slot = ModelSlot("untrained", pushed=store.bundles)
+    slot = ModelSlot("untrained", pushed=store.files)
     assert slot.activate("three")[1].estimator.bundle.digest == model.digest
     assert fetch(store, wanted(data), source(b""))[2] == 0  # it is there: not one chunk is asked for
 
@@ -117,7 +124,7 @@ def test_a_bad_bundle_is_refused_with_its_reason_and_leaves_nothing(store, tmp_p
     with pytest.raises(BadModel, match=telling):
         fetch(store, request, source(sent))
     assert files(tmp_path) == []
-    assert store.bundles() == ([], {})
+    assert store.files() == {}
 
 
 def test_what_can_not_be_kept_is_refused_before_the_first_byte(tmp_path, data, monkeypatch):
@@ -163,7 +170,7 @@ def test_left_over_pushes_give_way_to_a_new_one_but_whole_models_do_not(tmp_path
     assert store.partial() == {}
     with pytest.raises(NoQuota):
         fetch(store, wanted(other), source(other))
-    assert {one.name for one in store.bundles()[0]} == {"three", "five"}
+    assert pushed(store) == ({"three", "five"}, {})
 
 
 def test_two_pushes_of_one_bundle_at_once_move_it_once(tmp_path, data):
@@ -236,12 +243,11 @@ def test_a_model_that_rotted_on_the_disk_is_listed_with_its_reason_and_can_be_pu
     file = tmp_path / "pushed" / digest / "bundle.safetensors"
     for rotten in (flipped(data), data[:-1]):
         file.write_bytes(rotten)
-        (unreadable,) = store.bundles()[1].items()
-        assert unreadable[0] == digest
+        assert pushed(store)[1].keys() == {digest}
         with pytest.raises(BadModel):
-            ModelSlot("untrained", pushed=store.bundles).activate(digest)
+            ModelSlot("untrained", pushed=store.files).activate(digest)
         assert fetch(store, wanted(data), source(data))[2] == len(data)
-        assert store.bundles()[1] == {}
+        assert pushed(store)[1] == {}
 
 
 def test_only_folders_named_by_a_digest_are_looked_at(store, tmp_path, data):
@@ -249,7 +255,7 @@ def test_only_folders_named_by_a_digest_are_looked_at(store, tmp_path, data):
     for foreign in ("pushed/readme", "pushed/" + "x" * 64, "staging/.." + "5e" * 31):
         (tmp_path / foreign).mkdir(parents=True)
     (tmp_path / "pushed" / ("5e" * 32)).write_text("a file")
-    assert [one.name for one in store.bundles()[0]] == ["three"]
+    assert pushed(store) == ({"three"}, {})
     assert store.partial() == {}
 
 

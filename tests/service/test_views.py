@@ -63,9 +63,20 @@ def test_health_shows_verdict_reason_and_streams(stream):
         epoch=2,
         refused_streams=0,
         streams=(status,),
+        ready=False,
+        change="two was rolled back by itself: stream cam0: not finite",
+        rollbacks=3,
     )
     text = seen(health_table([reply]))
-    for word in ("n1 not ok", "cam0 is lossy", "untrained", "overload_packets 7"):
+    for word in (
+        "n1 not ok",
+        "cam0 is lossy",
+        "untrained",
+        "overload_packets 7",
+        "not ready",
+        "not finite",
+        "itself: 3",
+    ):
         assert word in text
 
 

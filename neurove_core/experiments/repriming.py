@@ -1,0 +1,212 @@
+"""How settled a model's first estimates are after a change of model: cold, with the old state, primed with N windows.
+
+Not of the paper. What a change costs is measured against a run of the new model that was never swapped, on streets that
+the default model has not seen, in standard deviations of that run's own estimates, per axis. The old model of the
+carried state is the new one with every weight moved by 2 %: about as far as two trainings of one model lie apart at
+their end. The error of the first estimate after N windows from rest is all that N decides (decision 29).
+"""
+
+import json
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from neurove_core import models
+from neurove_core.bundle import Bundle, from_bytes
+from neurove_core.estimator import Estimator, StreamState
+from neurove_core.experiments import save_text
+from neurove_core.figures import blank_figure, save_figure
+from neurove_core.neurons import require
+from neurove_core.sim.simulate import Simulation
+from neurove_core.sim.source import simulation_of
+from neurove_core.windows import Window, WindowsState, push
+from protocol import Sensor
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+PRIMED = (8, 16, 32, 64)
+SETTLED = 0.02  # of the standard deviation of the estimates
+SHIFT = 0.02  # of each weight, between the old model and the new one
+FIRST_SEED = 5000  # the default model has seen no street of these seeds
+AFTER = 48  # windows after the change that are looked at
+CAMERA = "davis346-half"
+SWAPS = 4  # per street
+APART = 12  # windows between them
+
+
+class Report(NamedTuple):
+    """What one run measured: by way of changing, the error of the first windows after it, in standard deviations."""
+
+    model: str
+    digest: str
+    streets: int
+    swaps: int
+    seconds: float
+    errors: dict[str, list[float]]  # RMS over axes, bins and swaps, of each window after the change
+    worst: dict[str, list[float]]  # of the worst axis, RMS over bins and swaps
+    least_primed: int | None  # least N whose first estimate is within SETTLED; None where none is
+
+
+def run(
+    model: str = models.DEFAULT,
+    streets: int = 6,
+    primed: Iterable[int] = PRIMED,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Report:
+    """Change to a model on some streets, in every way, and look at its first estimates.
+
+    Args:
+        model: name of a built-in model, or a bundle's file.
+        streets: held-out ones, of seeds FIRST_SEED and up.
+        primed: numbers of windows to replay.
+        progress: told the name of each street as it is done.
+
+    Raises:
+        InvalidField: no street, or no number of windows. BadModel: the model can not be loaded.
+    """
+    replayed = sorted(set(primed))
+    require(streets >= 1, "reprime", "streets", streets, "must be at least 1")
+    require(bool(replayed) and replayed[0] >= 1, "reprime", "primed", replayed, "must be numbers of windows above 0")
+    bundle = models.find(model)
+    new, old = Estimator(bundle), Estimator(shifted(bundle))
+    swaps_at = [replayed[-1] + 16 + i * APART for i in range(SWAPS)]
+    windows = swaps_at[-1] + AFTER
+    seconds = windows * bundle.config.window.duration_us / 1e6
+    squares: dict[str, list[NDArray[np.float64]]] = {}
+    for street in range(streets):
+        simulation = simulation_of(f"sim://street?seed={FIRST_SEED + street}&camera={CAMERA}&seconds={seconds + 0.1:g}")
+        for way, errors in _ways(new, old, windows_of(simulation, new)[:windows], swaps_at, replayed).items():
+            squares.setdefault(way, []).extend(errors)
+        progress(simulation.name)
+    means = {way: np.mean(errors, axis=0) for way, errors in squares.items()}  # (AFTER, 6)
+    rms = {way: np.sqrt(mean.mean(axis=1)).tolist() for way, mean in means.items()}
+    settled = [n for n in replayed if rms[_name(n)][0] <= SETTLED]
+    return Report(
+        model=bundle.name,
+        digest=bundle.digest,
+        streets=streets,
+        swaps=streets * SWAPS,
+        seconds=seconds,
+        errors=rms,
+        worst={way: np.sqrt(mean.max(axis=1)).tolist() for way, mean in means.items()},
+        least_primed=settled[0] if settled else None,
+    )
+
+
+def shifted(bundle: Bundle, share: float = SHIFT) -> Bundle:
+    """A model beside another: every weight is moved by a normal draw of so much of itself."""
+    draw = torch.Generator().manual_seed(0)
+    moved = from_bytes(bundle.to_bytes(), bundle.name)
+    with torch.no_grad():
+        for parameter in moved.network.parameters():
+            parameter.mul_(1 + share * torch.randn(parameter.shape, generator=draw))
+    return replace(moved, name=f"{bundle.name}-shifted").with_digest()
+
+
+def windows_of(simulation: Simulation, estimator: Estimator) -> list[Window]:
+    """The windows of a simulation as the service cuts them for a model."""
+    state, windows = estimator.initial_state(simulation.sensor, simulation.lens.info), []
+    cut = WindowsState()
+    for step in simulation.steps():
+        config = estimator.config
+        pushed = push(step.events, step.stop_us, cut, state.lut, config.window, config.canonical)
+        cut = pushed.state
+        windows += pushed.windows
+    return windows
+
+
+def _ways(
+    new: Estimator, old: Estimator, windows: list[Window], swaps_at: list[int], primed: list[int]
+) -> dict[str, list[NDArray[np.float64]]]:
+    """By way of changing, for each swap the squared error of the windows after it (AFTER, 6), in variances."""
+    never, _ = _said(new, windows, _rest(new))
+    variance = never.reshape(-1, 6).var(axis=0)
+    carried = _rest(old)
+    found: dict[str, list[NDArray[np.float64]]] = {}
+    done = 0
+    for at in swaps_at:
+        _, carried = _said(old, windows[done:at], carried)
+        done = at
+        starts = {"cold": _rest(new), "carried": carried}
+        starts |= {_name(n): _said(new, windows[at - n : at], _rest(new))[1] for n in primed}
+        truth = never[at : at + AFTER]
+        for way, state in starts.items():
+            said, _ = _said(new, windows[at : at + AFTER], state)
+            found.setdefault(way, []).append(((said - truth) ** 2).mean(axis=1) / variance)
+    return found
+
+
+def _said(estimator: Estimator, windows: list[Window], state: StreamState) -> tuple[NDArray[np.float64], StreamState]:
+    """Answers (W, n, 6) to windows, and the state after them."""
+    estimates, state = estimator.follow(windows, state)
+    return np.array([one.twists for one in estimates]), state
+
+
+def _rest(estimator: Estimator) -> StreamState:
+    grid = estimator.config.canonical
+    return estimator.initial_state(Sensor(grid.width, grid.height))
+
+
+def _name(primed: int) -> str:
+    return f"primed {primed}"
+
+
+def to_json(report: Report) -> str:
+    """The report for machines."""
+    about: dict[str, Any] = report._asdict()
+    for part in ("errors", "worst"):
+        about[part] = {way: [round(one, 5) for one in errors] for way, errors in about[part].items()}
+    return json.dumps(about) + "\n"
+
+
+def to_markdown(report: Report) -> str:
+    """The report as a table: windows after the change in the columns."""
+    shown = [0, 1, 4, 8, 16, 32]
+    lines = [
+        f"Model {report.model} ({report.digest[:12]}), {report.swaps} changes on {report.streets} held-out streets. "
+        "Error of the estimates after a change against a run that was never swapped, RMS in standard deviations.",
+        "",
+        "| way | " + " | ".join("first" if i == 0 else f"{i} windows later" for i in shown) + " | first, worst axis |",
+        "| --- |" + " --- |" * (len(shown) + 1),
+    ]
+    for way, errors in report.errors.items():
+        cells = [f"{errors[i]:.4f}" for i in shown if i < len(errors)]
+        lines.append(f"| {way} | {' | '.join(cells)} | {report.worst[way][0]:.4f} |")
+    least = "no N of these" if report.least_primed is None else f"N = {report.least_primed}"
+    lines += ["", f"Least N whose first estimate is within {100 * SETTLED:g} % of the standard deviation: {least}."]
+    return "\n".join(lines) + "\n"
+
+
+def draw(report: Report) -> "Figure":
+    """The error of the windows after a change, by way of changing.
+
+    Raises:
+        MissingExtra: matplotlib is not installed.
+    """
+    figure = blank_figure(7.0, 4.0)
+    axes = figure.subplots()
+    for way, errors in report.errors.items():
+        axes.semilogy(np.arange(len(errors)), np.maximum(errors, 1e-7), label=way, lw=1.5)
+    axes.axhline(SETTLED, color="black", lw=0.8, ls="--", label=f"{100 * SETTLED:g} %")
+    axes.set_xlabel("windows after the change of model")
+    axes.set_ylabel("error [standard deviations]")
+    axes.legend(ncols=2, fontsize=8)
+    axes.grid(visible=True, alpha=0.3)
+    return figure
+
+
+def save(report: Report, folder: Path) -> list[Path]:
+    """Write repriming.json, repriming.md, repriming.png and repriming.svg.
+
+    Raises:
+        InvalidField: a file cannot be written. MissingExtra: matplotlib is not installed.
+    """
+    files = [save_text(to_json(report), folder / "repriming.json")]
+    files.append(save_text(to_markdown(report), folder / "repriming.md"))
+    return files + save_figure(draw(report), folder / "repriming")

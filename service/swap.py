@@ -1,0 +1,152 @@
+"""The parts of a model change that look at streams: priming them, running beside them, watching a new model."""
+
+import time
+from collections.abc import Callable, Iterable
+from typing import Literal, NamedTuple, Protocol
+
+from protocol.errors import Diverged
+from service.comparison import LEAST_WINDOWS, Finding, Limits, Measured, finding
+from service.lane import Primed, Serving
+from service.lanes import Lanes, Roles
+
+POLL_S = 0.05
+"""How often streams are looked at."""
+
+JUDGED_WINDOWS = 16
+"""On probation the newest so many windows are judged, so that a model that turns bad is seen within a second."""
+
+_MOST_PAUSE_S = 0.02
+_ROUNDS = 3
+_MOST_SETTLING_S = 30.0
+
+Phase = Literal["steady", "shadow", "canary", "probation"]
+
+
+class Subject(Protocol):
+    """A stream, as far as a model change sees it."""
+
+    name: str
+    lanes: Lanes
+
+
+class Plan(NamedTuple):
+    """Which models are at work; streams read it once per packet."""
+
+    active: Serving
+    other: Serving | None = None  # shadow, canary: the candidate; probation: the proven one
+    only: frozenset[str] = frozenset()  # streams that are concerned; empty: all
+    phase: Phase = "steady"
+
+    def concerns(self, stream: str) -> bool:
+        """Whether the other model is at work on this stream."""
+        return self.other is not None and (not self.only or stream in self.only)
+
+    def roles(self, stream: str) -> Roles:
+        """What a stream answers with, and what runs beside."""
+        if self.other is None or not self.concerns(stream):
+            return Roles(self.active)
+        if self.phase == "canary":
+            return Roles(self.other, self.active, probation=True)
+        return Roles(self.active, self.other, probation=self.phase == "probation")
+
+    @property
+    def tried(self) -> Serving | None:
+        """The model that answers and may still be taken back."""
+        return self.active if self.phase == "probation" else self.other if self.phase == "canary" else None
+
+    @property
+    def proven(self) -> Serving | None:
+        """The model that takes over if it is."""
+        return self.other if self.phase == "probation" else self.active if self.phase == "canary" else None
+
+
+def gently(took_s: float) -> None:
+    """Leave the machine to the streams for as long as a window took: half of one core at most is used."""
+    time.sleep(min(took_s, _MOST_PAUSE_S))
+
+
+def prime(serving: Serving, streams: Iterable[Subject]) -> tuple[int, int]:
+    """Bring a model to where it would be had it always served, for each stream that can be replayed.
+
+    Returns:
+        how many streams are primed, and how many are not: they are at rest, or cut otherwise than the model.
+    """
+    done = left = 0
+    for stream in streams:
+        lane: Primed | None = None
+        for _ in range(_ROUNDS):  # while it replayed, windows came: each round leaves fewer of them
+            lane = stream.lanes.prime(serving, gently, lane)
+        stream.lanes.offer(lane)
+        done, left = done + (lane is not None), left + (lane is None)
+    return done, left
+
+
+def settled(serving: Serving, streams: Iterable[Subject]) -> bool:
+    """Whether a model that could not be replayed has run beside every stream for as long as it needs to settle."""
+    wanted = serving.estimator.config.settle_windows + 1
+    besides = [stream.lanes.beside for stream in streams if stream.lanes.front is not None]
+    return all(one is not None and (one.lost or one.lane.state.age >= wanted) for one in besides)
+
+
+def settling_s(serving: Serving) -> float:
+    """How long to wait for `settled` at most: a stream may stand still."""
+    windows = serving.estimator.config.settle_windows + 2
+    return min(_MOST_SETTLING_S, 1.0 + 2 * windows * serving.estimator.config.window.duration_us / 1e6)
+
+
+def measured(serving: Serving, streams: Iterable[Subject], *, front_is_tried: bool) -> dict[str, Measured]:
+    """What the trial of a model has come to, by stream."""
+    found = {}
+    for stream in streams:
+        lanes, comparison = stream.lanes, stream.lanes.comparison
+        lane = lanes.front if front_is_tried else lanes.beside.lane if lanes.beside else None
+        same = lane is not None and lane.estimator is serving.estimator
+        if same and comparison is not None and comparison.front_is_tried == front_is_tried:
+            found[stream.name] = comparison.measured()
+    return found
+
+
+def worst(found: dict[str, Measured], limits: Limits, newest: int) -> tuple[str, Finding] | None:
+    """The first stream on which a model broke a limit, and which."""
+    for name, one in found.items():
+        wrong = finding(one, limits, newest)
+        if wrong is not None:
+            return name, wrong
+    return None
+
+
+def shadow(
+    serving: Serving,
+    streams: Callable[[], list[Subject]],
+    seconds: float,
+    limits: Limits,
+    wait: Callable[[float], bool],
+) -> dict[str, Measured]:
+    """Look at a model that runs beside another for so long.
+
+    Args:
+        serving: the model.
+        streams: those it runs beside.
+        seconds: how long.
+        limits: what it must keep to.
+        wait: sleeps, and says whether to give up.
+
+    Raises:
+        Diverged: it broke a limit, or too few windows came to tell.
+    """
+    name, deadline = serving.estimator.bundle.name, time.monotonic() + seconds
+    while True:
+        found = measured(serving, streams(), front_is_tried=False)
+        for stream, one in found.items():
+            if one.fault:
+                raise Diverged(name, f"fault on stream {stream}", one.fault, "none")
+        if time.monotonic() >= deadline or wait(POLL_S):
+            break
+    compared = sum(len(one.pairs) for one in found.values())
+    if compared < LEAST_WINDOWS:
+        raise Diverged(name, "compared windows", compared, f"at least {LEAST_WINDOWS}")
+    wrong = worst(found, limits, newest=1 << 30)
+    if wrong is not None:
+        stream, broken = wrong
+        raise Diverged(name, f"{broken.field} on stream {stream}", broken.value, broken.bound)
+    return found

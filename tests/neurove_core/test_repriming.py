@@ -1,0 +1,50 @@
+import json
+
+import pytest
+
+from neurove_core import bundle
+from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
+from neurove_core.experiments import repriming
+from protocol.errors import InvalidField
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory):
+    config = ModelConfig(
+        canonical=CanonicalConfig(width=22, height=16, hfov_deg=80),
+        network=NetworkConfig(channels=(4, 8), features=16, hidden=16),
+    )
+    path = tmp_path_factory.mktemp("model") / "small.safetensors"
+    bundle.save(bundle.untrained(3, config, "small"), path)
+    names = []
+    found = repriming.run(str(path), streets=1, primed=(2, 24), progress=names.append)
+    assert len(names) == 1
+    return found
+
+
+def test_a_model_that_replayed_windows_is_more_settled_than_one_from_rest(report):
+    first = {way: errors[0] for way, errors in report.errors.items()}
+    assert list(first) == ["cold", "carried", "primed 2", "primed 24"]
+    assert first["primed 24"] < first["cold"]
+    assert all(len(errors) == repriming.AFTER for errors in report.errors.values())
+    assert all(report.worst[way][0] >= first[way] for way in first)
+
+
+def test_the_least_number_of_windows_is_the_first_within_the_bound(report):
+    within = [n for n in (2, 24) if report.errors[f"primed {n}"][0] <= repriming.SETTLED]
+    assert report.least_primed == (within[0] if within else None)
+
+
+def test_the_report_is_written_as_table_figures_and_picture(report, tmp_path):
+    files = repriming.save(report, tmp_path)
+    assert {file.name for file in files} == {f"repriming.{kind}" for kind in ("json", "md", "png", "svg")}
+    told = json.loads((tmp_path / "repriming.json").read_text())
+    assert told["errors"]["cold"][0] == pytest.approx(report.errors["cold"][0], abs=1e-5)
+    assert "| primed 24 |" in (tmp_path / "repriming.md").read_text()
+
+
+def test_without_streets_or_windows_there_is_nothing_to_measure():
+    with pytest.raises(InvalidField, match="streets=0"):
+        repriming.run(streets=0)
+    with pytest.raises(InvalidField, match="primed=\\[0, 4\\]"):
+        repriming.run(primed=(4, 0))

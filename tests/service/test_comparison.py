@@ -1,0 +1,78 @@
+import numpy as np
+import pytest
+
+from service.comparison import Answered, Comparison, Limits, finding
+
+
+def trial(proven, tried, *, rates=(0.2, 0.2), ms=1.0, front_is_tried=False, windows=20, reach_us=0, late_us=0):
+    """A trial in which both models say the same twist in every window."""
+    comparison = Comparison(front_is_tried=front_is_tried, window_ms=50.0, reach_us=reach_us)
+    front, beside = (tried, proven) if front_is_tried else (proven, tried)
+    front_rate, beside_rate = rates[::-1] if front_is_tried else rates
+    for i in range(windows):
+        comparison.front(Answered(i * 50_000, np.array(front), front_rate), ms)
+        comparison.beside(Answered(i * 50_000 + late_us, np.array(beside), beside_rate), ms)
+    return comparison
+
+
+DRIVING = (0.0, 0.0, 2.0, 0.0, 0.5, 0.0)
+
+
+@pytest.mark.parametrize("front_is_tried", [False, True])
+def test_models_that_agree_are_not_told_apart(front_is_tried):
+    measured = trial(DRIVING, DRIVING, front_is_tried=front_is_tried).measured()
+    assert measured.divergence == 0
+    assert finding(measured, Limits(divergence=0.01)) is None
+
+
+@pytest.mark.parametrize("front_is_tried", [False, True])
+@pytest.mark.parametrize(
+    ("tried", "divergence"),
+    [((0, 0, 3, 0, 0.5, 0), 0.5), ((0, 0, 2, 0, 1.5, 0), 2.0), ((0, 0, 0, 0, 0, 0), 1.0)],
+)
+def test_divergence_is_the_difference_in_units_of_the_proven_models_motion(tried, divergence, front_is_tried):
+    measured = trial(DRIVING, tried, front_is_tried=front_is_tried).measured()
+    assert measured.divergence == pytest.approx(divergence)
+    wrong = finding(measured, Limits(divergence=divergence - 0.1))
+    assert (wrong.field, wrong.value) == ("divergence", pytest.approx(divergence))
+    assert finding(measured, Limits(divergence=divergence + 0.1)) is None
+
+
+def test_at_rest_small_differences_are_small():
+    assert trial((0.0,) * 6, (0.05, 0, 0, 0, 0, 0.02)).measured().divergence < 0.5
+
+
+def test_a_model_that_falls_silent_or_fires_without_end_is_found():
+    for rates in ((0.3, 0.0), (0.05, 0.9)):
+        assert finding(trial(DRIVING, DRIVING, rates=rates).measured(), Limits()).field == "rate_ratio"
+    assert finding(trial(DRIVING, DRIVING, rates=(0.0, 0.0)).measured(), Limits()) is None
+
+
+def test_a_slow_model_is_found_with_its_figure_and_bound():
+    wrong = finding(trial(DRIVING, DRIVING, ms=30.0).measured(), Limits(latency_share=0.5))
+    assert str(wrong) == "latency_ms 30, the bound is 25"
+
+
+def test_too_few_windows_say_nothing():
+    assert finding(trial(DRIVING, (9,) * 6, ms=99, windows=7).measured(), Limits()) is None
+    assert trial(DRIVING, DRIVING, windows=0).measured().divergence == 0
+
+
+def test_only_the_newest_windows_are_judged_where_asked():
+    comparison = trial(DRIVING, DRIVING, windows=100)
+    for i in range(100, 108):
+        comparison.front(Answered(i * 50_000, np.array(DRIVING), 0.2), 1.0)
+        comparison.beside(Answered(i * 50_000, np.array(DRIVING) * 4, 0.2), 1.0)
+    assert finding(comparison.measured(), Limits(divergence=2.0)) is None
+    assert finding(comparison.measured(), Limits(divergence=2.0), newest=8).field == "divergence"
+
+
+def test_windows_that_end_apart_are_compared_within_reach_alone():
+    assert len(trial(DRIVING, DRIVING, reach_us=10_000, late_us=10_000).measured().pairs) == 20
+    assert len(trial(DRIVING, DRIVING, reach_us=10_000, late_us=10_001).measured().pairs) == 0
+
+
+def test_a_fault_goes_before_all_figures():
+    comparison = trial(DRIVING, DRIVING)
+    comparison.fault = "planted"
+    assert str(finding(comparison.measured(), Limits())) == "fault planted, the bound is none"
