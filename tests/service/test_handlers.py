@@ -108,7 +108,7 @@ def test_health_tells_how_the_newest_change_of_model_went_and_whether_the_node_i
         slot.activate("three")
     assert ask_health(handlers).change.startswith("three was refused: ")
     assert not HealthReply.decode(
-        Handlers("edge", slot, list, lambda: 0, lambda: False).health(HealthRequest().encode())
+        Handlers("edge", slot, list, lambda: 0, ready=lambda: False).health(HealthRequest().encode())
     ).ready
 
 
@@ -198,7 +198,7 @@ def test_a_pushed_model_is_staged_until_it_serves(storing, told):
 def test_an_older_release_is_neither_taken_nor_activated_unless_a_trusted_signature_allows_it(storing, told, tmp_path):
     handlers = storing(highest_release=7)
     request, pull = push_of("eight")
-    with pytest.raises(Downgrade, match="release=0: this node has seen release 7"):
+    with pytest.raises(Downgrade, match="release=0: release 7 was here before"):
         handlers.push(request, told, pull, RUNS)
     assert told.steps[-1] == "refused"
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
