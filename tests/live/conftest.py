@@ -87,7 +87,8 @@ def is_alive(transport, config):
 def service(endpoint, *arguments):
     """A serving node and a session with it."""
     config = ClientConfig(connect=(endpoint,))
-    with running("serve", "--listen", endpoint, "--node", "n1", "--log-level", "warning", *arguments) as process:
+    always = ("--listen", endpoint, "--node", "n1", "--log-level", "warning", "--probation-s", "0.5")
+    with running("serve", *always, *arguments) as process:
         wait_until(lambda: _connects(endpoint) or process.child.poll() is not None, START_S)
         with client(endpoint) as transport:
             wait_until(lambda: is_alive(transport, config), START_S)

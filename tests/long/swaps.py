@@ -158,7 +158,7 @@ def run(swaps: int, bad: int, streams: int, quiet_s: float = 5.0, pause_s: float
     with contextlib.ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         kinds = make_models(folder)
-        arguments = ("--models-dir", str(folder), "--model", "one", "--queue-s", "30", "--probation-s", "60")
+        arguments = ("--models-dir", str(folder), "--model", "one", "--queue-s", "30", "--probation-s", "0.5")
         process, transport, config = stack.enter_context(service(endpoint, *arguments))
         heard = Heard(stack.enter_context(client(endpoint)), config)
         cameras = [Camera(endpoint, config, name) for name in names]
@@ -175,13 +175,13 @@ def run(swaps: int, bad: int, streams: int, quiet_s: float = 5.0, pause_s: float
             if number in is_bad:
                 kind = kinds[sorted(is_bad).index(number) % len(kinds)]
                 try:
-                    ask.activate(transport, config, kind)
+                    ask.activate(transport, config, kind, "n1")
                     unrefused.append(kind)
                 except PeerError as error:
                     refused[kind] = f"{error.code}: {error.message}"
             else:
                 active = "two" if active == "one" else "one"
-                ask.activate(transport, config, active)
+                ask.activate(transport, config, active, "n1")
             resident.append(resident_kib(process.child.pid))
             print(f"change {number + 1} of {swaps}: {resident[-1] >> 10} MiB", file=sys.stderr)
             time.sleep(pause_s)

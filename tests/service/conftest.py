@@ -2,7 +2,7 @@ import pytest
 
 from neurove_core import bundle
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
-from service.model_slot import ModelSlot
+from service.model_slot import ModelSlot, Rules
 
 SMALL = ModelConfig(
     canonical=CanonicalConfig(width=24, height=16),
@@ -22,6 +22,6 @@ def models_dir(tmp_path_factory):
 
 @pytest.fixture
 def slot(models_dir):
-    slot = ModelSlot("one", models_dir)
+    slot = ModelSlot("one", models_dir, Rules(probation_s=0.2))
     yield slot
     slot.close()

@@ -21,7 +21,7 @@ from protocol.errors import Downgrade, InvalidField, Malformed, NeuroVEError, No
 from service.active_file import Active, ActiveFile
 from service.handlers import Handlers
 from service.health import stream_status
-from service.model_slot import ModelSlot
+from service.model_slot import ModelSlot, Rules
 from service.model_store import ModelStore
 from service.signatures import Signed
 from service.stream import Arrival, Stream
@@ -165,7 +165,7 @@ def storing(models_dir, tmp_path):
         store = ModelStore(tmp_path, models_dir, verify=trusts_a_flag)
         active_file = ActiveFile(None)
         active_file.keep(Active(digest="0" * 64, previous=None, configured="one", highest_release=highest_release))
-        slot = ModelSlot("one", models_dir, pushed=store.files)
+        slot = ModelSlot("one", models_dir, Rules(probation_s=0.2), pushed=store.files)
         return Handlers("edge", slot, list, lambda: 0, store, active_file)
 
     return make
