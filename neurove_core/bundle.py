@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from neurove_core.config import Config, ModelConfig
 from neurove_core.network import NeuroVE
+from neurove_core.uncertainty import Uncertainty, why_no_correlation
 from protocol.control import ModelInfo
 from protocol.errors import BadModel, shown
 
@@ -34,7 +35,14 @@ METRIC: Final[LinearUnit] = "m/s"
 PER_HEIGHT: Final[LinearUnit] = "1/s per m of height"
 
 _KEY = "neurove"
-_OFFSET, _SCALE = "output.offset", "output.scale"
+_OFFSET, _SCALE, _CORRELATION = "output.offset", "output.scale", "output.correlation"
+
+
+class UncertaintyHeader(Config):
+    """That a bundle has a spread (tensors spread.weight, spread.bias, output.correlation), and how it came to it."""
+
+    uncertain_above: float = Field(gt=0, description="Linear sigma over speed from which an estimate is uncertain.")
+    provenance: str = Field(max_length=1000, description="One line: how it was calibrated.")
 
 
 class Header(Config):
@@ -47,6 +55,9 @@ class Header(Config):
     config: ModelConfig
     linear_unit: LinearUnit = Field(
         METRIC, description="Of the linear part: m/s, or to be multiplied by the camera's height above the ground [m]."
+    )
+    uncertainty: UncertaintyHeader | None = Field(
+        None, description="Left out where the model has no measure of its errors."
     )
 
 
@@ -62,6 +73,7 @@ class Bundle:
     offset: Tensor  # (6): twist = network output * scale + offset, in linear_unit and rad/s
     scale: Tensor  # (6)
     linear_unit: LinearUnit = METRIC
+    uncertainty: Uncertainty | None = None  # where there is one, the network has a spread
     digest: str = ""  # sha256 of the bundle's bytes, hex
 
     @property
@@ -84,9 +96,15 @@ class Bundle:
             provenance=self.provenance,
             config=self.config,
             linear_unit=self.linear_unit,
+            uncertainty=self.uncertainty
+            and UncertaintyHeader(
+                uncertain_above=self.uncertainty.uncertain_above, provenance=self.uncertainty.provenance
+            ),
         )
         tensors = {**_stored(self.network), _OFFSET: self.offset, _SCALE: self.scale}
-        return safetensors.torch.save(tensors, {_KEY: header.model_dump_json()})
+        if self.uncertainty is not None:
+            tensors[_CORRELATION] = self.uncertainty.correlation
+        return safetensors.torch.save(tensors, {_KEY: header.model_dump_json(exclude_none=True)})
 
     def with_digest(self) -> Self:
         """This bundle, its digest computed."""
@@ -135,10 +153,13 @@ def from_bytes(data: bytes, name: str) -> Bundle:
         # the last two: a tensor without elements may claim sides that torch has no integer for
         raise BadModel(name, f"not a whole safetensors file: {error}") from None
     with torch.device("meta"):  # shapes alone: a header of a few bytes may declare terabytes of weights
-        wanted = {**_stored(NeuroVE(header.config)), _OFFSET: torch.zeros(6), _SCALE: torch.ones(6)}
+        wanted = {**_stored(_network(header)), _OFFSET: torch.zeros(6), _SCALE: torch.ones(6)}
+        if header.uncertainty is not None:
+            wanted[_CORRELATION] = torch.eye(6)
     _check_tensors(tensors, wanted, name)
-    network = NeuroVE(header.config)
+    network = _network(header)
     offset, scale = tensors.pop(_OFFSET), tensors.pop(_SCALE)
+    uncertainty = _uncertainty(header.uncertainty, tensors.pop(_CORRELATION, None), name)
     network.load_state_dict(tensors, strict=False)  # names are checked; only the norms' batch counters are not stored
     return Bundle(
         name=header.name,
@@ -149,6 +170,7 @@ def from_bytes(data: bytes, name: str) -> Bundle:
         offset=offset,
         scale=scale,
         linear_unit=header.linear_unit,
+        uncertainty=uncertainty,
         digest=hashlib.sha256(data).hexdigest(),
     )
 
@@ -223,6 +245,22 @@ def _take_statistics(network: NeuroVE, spikes: Tensor) -> None:
         network.train()(spikes, network.initial_state(spikes.shape[1]))
     for norm, momentum in momenta.items():
         norm.momentum = momentum
+
+
+def _network(header: Header) -> NeuroVE:
+    network = NeuroVE(header.config)
+    if header.uncertainty is not None:
+        network.add_spread()
+    return network
+
+
+def _uncertainty(header: UncertaintyHeader | None, correlation: Tensor | None, name: str) -> Uncertainty | None:
+    if header is None or correlation is None:
+        return None
+    why = why_no_correlation(correlation)
+    if why:
+        raise BadModel(name, f"tensor {_CORRELATION!r} {why}")
+    return Uncertainty(correlation, header.uncertain_above, header.provenance)
 
 
 def _stored(network: NeuroVE) -> dict[str, Tensor]:

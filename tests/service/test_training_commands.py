@@ -36,7 +36,8 @@ SOURCE = "sim://street?seed=3&seconds=0.8&camera=pinhole:24x18:75"
 def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("train")
     (folder / "tiny.toml").write_text(CONFIG)
-    assert cli.main(["train", str(folder / "tiny.toml"), "--out", str(folder / "out"), "--json"]) == 0
+    arguments = ["train", str(folder / "tiny.toml"), "--out", str(folder / "out"), "--calibration", "16", "--json"]
+    assert cli.main(arguments) == 0
     return folder
 
 
@@ -62,7 +63,9 @@ def test_training_leaves_a_bundle_a_checkpoint_and_its_account(trained):
 def test_a_finished_run_resumed_gives_the_same_model(trained, run):
     path = trained / "out" / "tiny.safetensors"
     weights = bundle.load(path).network.state_dict()
-    code, out, err = run("train", str(trained / "tiny.toml"), "--out", str(trained / "out"), "--resume")
+    code, out, err = run(
+        "train", str(trained / "tiny.toml"), "--out", str(trained / "out"), "--resume", "--calibration", "16"
+    )
     assert (code, out.startswith("wrote ")) == (0, True)
     assert "simulated" not in err
     again = bundle.load(path).network.state_dict()
