@@ -114,4 +114,6 @@ class TwistEstimate(Message):
     @property
     def sigma(self) -> Twist | None:
         """Standard deviation of each axis; none where there is no covariance."""
-        return self.covariance and Twist(*(math.sqrt(self.covariance[i * _AXES + i]) for i in range(_AXES)))
+        if self.covariance is None:
+            return None
+        return Twist(*(math.sqrt(self.covariance[i * _AXES + i]) for i in range(_AXES)))

@@ -12,7 +12,6 @@ from service.arguments import command, sensor_size
 
 if TYPE_CHECKING:
     from neurove_core.bundle import Bundle
-    from neurove_core.training.config import TrainingConfig
 
 _CALIBRATION_SEQUENCES = 96
 
@@ -70,7 +69,7 @@ def calibrate(args: argparse.Namespace) -> int:
     return 0
 
 
-def _calibrate(model: "Bundle", config: "TrainingConfig", folder: Path, count: int, workers: int, out: Path) -> Any:
+def _calibrate(model: "Bundle", config: Any, folder: Path, count: int, workers: int, out: Path) -> Any:
     """Calibrate a model and write it; returns the report."""
     from neurove_core import bundle
     from neurove_core.training import calibration
