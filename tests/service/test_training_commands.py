@@ -125,3 +125,38 @@ def test_a_wrong_configuration_ends_in_one_line(run, tmp_path):
     code, _, err = run("train", str(tmp_path / "bad.toml"))
     assert (code, err.count("\n")) == (2, 1)
     assert "recipe.steps" in err
+
+
+def test_training_ends_with_a_calibrated_model_and_calibrating_again_tells_how_well_it_holds(trained, run):
+    path = trained / "out" / "tiny.safetensors"
+    assert bundle.load(path).uncertainty.provenance.startswith("neurove calibrate: 16 simulated sequences")
+    arguments = (
+        "calibrate",
+        str(path),
+        "--config",
+        str(trained / "tiny.toml"),
+        "--data",
+        str(trained / "out" / "data"),
+    )
+    out = trained / "again.safetensors"
+    code, text, err = run(*arguments, "--sequences", "16", "--out", str(out))
+    assert (code, "simulated" in err) == (0, False)
+    assert text.startswith(f"wrote {out}\nshare of the truth in the 90% interval")
+    assert bundle.load(out).digest == bundle.load(path).digest
+    code, text, _ = run(*arguments, "--sequences", "16", "--out", str(out), "--json")
+    assert json.loads(text)["groups"]["as it is"]["vz"]["0.9"] > 0.8
+
+
+def test_a_calibrated_model_is_evaluated_by_its_coverage_and_the_reliability_is_drawn(trained, run, tmp_path):
+    path = trained / "out" / "tiny.safetensors"
+    code, text, _ = run("evaluate", str(path), SOURCE, "--plot", str(tmp_path), "--json")
+    told = json.loads(text)["uncertainty"]
+    assert code == 0
+    assert set(told["coverage"]) == {"vx", "vy", "vz", "wx", "wy", "wz"}
+    assert told["coverage"]["wy"]["0.5"] <= told["coverage"]["wy"]["0.99"] <= 1
+    assert told["per_axis"]["vz"]["median_sigma_m_s"] > 0
+    assert (tmp_path / "reliability.png").stat().st_size > 1000
+    _, text, _ = run("evaluate", str(path), SOURCE)
+    assert "share of the truth in its interval" in text
+    _, text, _ = run("evaluate", "untrained", SOURCE)
+    assert "neurove calibrate gives it one" in text
