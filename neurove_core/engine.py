@@ -71,7 +71,7 @@ class Engine:
         x, membranes = self._features(spikes, state)
         rows = x.permute(0, 2, 3, 1).reshape(steps * batch, -1)  # as it lies in memory
         answers, cells, y = (self._plain_cells if is_plain() else self._fused_cells)(rows, steps, state)
-        twists = answers[..., : 6 * self._bins].unflatten(-1, (self._bins, 6))
+        twists = answers[..., : 6 * self._bins].reshape(steps, batch, self._bins, 6)
         return twists, NetworkState(membranes, cells, y)
 
     @torch.inference_mode()

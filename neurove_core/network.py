@@ -157,5 +157,5 @@ class NeuroVE(nn.Module):
         for z in x:
             y = readout_step(z, y, weight, bias, kappa)
             answers.append(y)
-        twists = torch.stack(answers)[..., : 6 * self.bins].unflatten(-1, (self.bins, 6))
+        twists = torch.stack(answers)[..., : 6 * self.bins].reshape(steps, batch, self.bins, 6)
         return twists, NetworkState(tuple(membranes), tuple(cells), y)

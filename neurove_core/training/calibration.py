@@ -227,7 +227,8 @@ def laplace_scale(inputs: Array, size: Array, penalty: float) -> Array:
         w = w - share * step
         if gradient @ step < 1e-8:
             break
-    return w / np.append(np.full(x.shape[1] - 1, unit), 1.0)
+    weights: Array = w / np.append(np.full(x.shape[1] - 1, unit), 1.0)
+    return weights
 
 
 def _fit(watched: list[Watched]) -> Array:
