@@ -89,7 +89,7 @@ def test_evaluate_tells_people_a_table_and_draws(trained, run, tmp_path):
     assert {"tiny", "zero velocity", "mean of the truth", "wy"} <= {line[:24].strip() for line in out.splitlines()} | {
         line.split()[0] for line in out.splitlines() if line
     }
-    assert err.count("wrote ") == 2
+    assert err.count("wrote ") == 4  # the drive and the reliability, each as PNG and SVG
     assert {file.suffix for file in (tmp_path / "plots").iterdir()} == {".png", ".svg"}
 
 
