@@ -48,7 +48,7 @@ class Engine:
             self._lif: LIFParams = blocks[0].lif
             self._convolutions = [_convolution(block, *size) for block, size in zip(blocks, sizes, strict=False)]
             self._project = _projection(network, net.channels[-1], *sizes[-1])
-            self._readout = Folded(network.readout.weight.detach().clone(), network.readout.bias.detach().clone())
+            self._readout = Folded(*(tensor.detach().clone() for tensor in network.outputs()))
             self._kappa = float(torch.sigmoid(network.kappa_logit))
             cells = [cell for cell in network.cells if isinstance(cell, ASLSTM)]
             self._params = [_copied(cell.params()) for cell in cells]
@@ -70,8 +70,9 @@ class Engine:
         steps, batch = spikes.shape[:2]
         x, membranes = self._features(spikes, state)
         rows = x.permute(0, 2, 3, 1).reshape(steps * batch, -1)  # as it lies in memory
-        twists, cells, y = (self._plain_cells if is_plain() else self._fused_cells)(rows, steps, state)
-        return twists.view(steps, batch, self._bins, 6), NetworkState(membranes, cells, y)
+        answers, cells, y = (self._plain_cells if is_plain() else self._fused_cells)(rows, steps, state)
+        twists = answers[..., : 6 * self._bins].reshape(steps, batch, self._bins, 6)
+        return twists, NetworkState(membranes, cells, y)
 
     @torch.inference_mode()
     def features(self, spikes: Tensor, state: NetworkState) -> tuple[Tensor, tuple[LIFState, ...]]:
@@ -258,9 +259,9 @@ def _layer(x, weights, at, c, v, s, alpha, v_th):  # type: ignore[no-untyped-def
 
 @fused
 def _cells(rows, weights, features, constants, carried, y, answers):  # type: ignore[no-untyped-def]  # compiled for its arguments
-    """From the last map's spikes (T * B, cells of it) to answers (T, B, 6n).
+    """From the last map's spikes (T * B, cells of it) to answers (T, B, R).
 
-    The carried c, v, s of each layer (3 L, B, N) and the potentials y (B, 6n) of the readout move on in place.
+    The carried c, v, s of each layer (3 L, B, N) and the potentials y (B, R) of the readout move on in place.
     """
     steps, batch, outputs = answers.shape
     layers, _, hidden = carried.shape

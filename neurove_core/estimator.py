@@ -40,6 +40,8 @@ class WindowEstimate(NamedTuple):
     settled: bool
     low_activity: bool
     saturated: bool
+    covariance: NDArray[np.float64] | None = None  # (6, 6) of each of these twists, by the bundle's calibration
+    uncertain: bool = False  # the linear part's sigma is a larger share of its speed than the bundle's bound
 
 
 class Answer(NamedTuple):
@@ -98,7 +100,7 @@ class Estimator:
             if end_us is not None and window.start_us != end_us:
                 network, age, recent = self.network.initial_state(), 0, ()
             twists, network = self._step(window.counts, network)
-            estimates.append(self._estimate(window, twists * self._metres(state.camera), age))
+            estimates.append(self._estimate(window, twists, network, self._metres(state.camera), age))
             age += 1
             recent = (*recent, window.counts)[max(0, len(recent) + 1 - self.config.settle_windows) :]
             end_us = window.start_us + self.config.window.duration_us
@@ -152,7 +154,23 @@ class Estimator:
         twists, state = self._engine(spikes, state)
         return twists[0, 0].double().numpy() * self._scale + self._offset, state
 
-    def _estimate(self, window: Window, twists: NDArray[np.float64], age: int) -> WindowEstimate:
+    def _covariance(self, network: NetworkState, metres: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Of the twists of the window that led to this state; as them scaled by the camera's height."""
+        log_sigma = self.network.log_sigma(network)
+        if self.bundle.uncertainty is None or log_sigma is None:
+            return None
+        return self.bundle.uncertainty.covariance(log_sigma[0].double().numpy(), self._scale * metres)
+
+    def _estimate(
+        self,
+        window: Window,
+        twists: NDArray[np.float64],
+        network: NetworkState,
+        metres: NDArray[np.float64],
+        age: int,
+    ) -> WindowEstimate:
+        twists, covariance = twists * metres, self._covariance(network, metres)
+        unsure = self.bundle.uncertainty
         return WindowEstimate(
             start_us=window.start_us,
             end_us=window.start_us + self.config.window.duration_us,
@@ -162,4 +180,6 @@ class Estimator:
             settled=age >= self.config.settle_windows,
             low_activity=window.events - window.outside < self.config.low_activity_events,
             saturated=bool(window.counts.max() == 255),
+            covariance=covariance,
+            uncertain=covariance is not None and unsure is not None and unsure.is_uncertain(twists, covariance),
         )

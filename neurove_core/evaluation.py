@@ -13,7 +13,9 @@ from neurove_core.io.packets import slices
 from neurove_core.io.recording import Recording
 from neurove_core.metrics import ANGULAR_FLOOR_RAD_S, LINEAR_FLOOR_M_S, SKIP_S, figures
 from neurove_core.network import NetworkState
+from neurove_core.uncertainty import LEVEL, LEVELS, coverage
 from protocol.errors import NeuroVEError
+from protocol.velocity import AXES
 
 _SAMPLES = 4  # of the truth in each bin, whose mean is the bin's
 _STREAM = "evaluate"
@@ -37,6 +39,8 @@ class Answers:
     latency_ms: NDArray[np.float64]  # (W,) of the push that completed each
     firing_rate: dict[str, float]  # share of neurons that fire per step, by layer; and of all of them
     scaled: bool  # the linear part is in m/s; else as if the camera were 1 m above the ground
+    sigma: NDArray[np.float64] | None = None  # (W, 6) of each window's twists; None where the model has no uncertainty
+    uncertain: NDArray[np.bool_] | None = None  # (W,) which windows are flagged so
 
 
 @dataclass(frozen=True)
@@ -47,6 +51,8 @@ class Judged:
     end_us: NDArray[np.int64]  # (N,) of the bins
     truth: NDArray[np.float64]  # (N, 6)
     answer: NDArray[np.float64]  # (N, 6)
+    sigma: NDArray[np.float64] | None = None  # (N, 6), or None
+    uncertain: NDArray[np.bool_] | None = None  # (N,), or None
 
 
 def answer(estimator: Estimator, recording: Recording) -> Answers:
@@ -79,7 +85,14 @@ def answer(estimator: Estimator, recording: Recording) -> Answers:
         latency_ms=np.array(latencies_ms),
         firing_rate=fired.rates(),
         scaled=camera is not None and camera.height_m is not None,
+        sigma=_sigmas(found),
+        uncertain=None if _sigmas(found) is None else np.array([one.uncertain for one in found], np.bool_),
     )
+
+
+def _sigmas(found: list[WindowEstimate]) -> NDArray[np.float64] | None:
+    covariances = [one.covariance for one in found if one.covariance is not None]
+    return np.sqrt(np.stack([np.diagonal(one) for one in covariances])) if covariances else None
 
 
 class _Fired:
@@ -122,7 +135,9 @@ def judge(answers: Answers, truth: Twists) -> Judged:
         why = f"of its {windows} windows none lies after the first {SKIP_S:g} s and within the truth"
         raise NoTruth(f"{answers.name}: {why}", windows=windows)
     ends = (answers.start_us[:, None] + answers.bin_us * (np.arange(bins) + 1))[kept].ravel()
-    return Judged(answers, ends, true[kept].reshape(-1, 6), answers.twists[kept].reshape(-1, 6))
+    sigma = None if answers.sigma is None else np.repeat(answers.sigma[kept], bins, axis=0)
+    uncertain = None if answers.uncertain is None else np.repeat(answers.uncertain[kept], bins)
+    return Judged(answers, ends, true[kept].reshape(-1, 6), answers.twists[kept].reshape(-1, 6), sigma, uncertain)
 
 
 def report(judged: list[Judged]) -> dict[str, Any]:
@@ -144,5 +159,37 @@ def report(judged: list[Judged]) -> dict[str, Any]:
         "scaled": all(one.answers.scaled for one in judged),
         "zero": figures(truth, np.zeros_like(truth), bins),
         "mean": figures(truth, np.broadcast_to(truth.mean(0), truth.shape), bins),
-        "recordings": [{"name": one.answers.name} | figures(one.truth, one.answer, bins) for one in judged],
+        "uncertainty": reliability(judged),
+        "recordings": [
+            {"name": one.answers.name} | figures(one.truth, one.answer, bins) | {"uncertainty": reliability([one])}
+            for one in judged
+        ],
+    }
+
+
+def reliability(judged: list[Judged]) -> dict[str, Any] | None:
+    """How often the truth lies within the intervals that the estimates claim; None where some claim nothing.
+
+    `coverage` has, by axis, the measured share for each nominal one; `per_axis` the measured share for LEVEL alone, the
+    median sigma, and the root mean square of error over sigma: 1 for errors that are normal and of the claimed size.
+    """
+    claimed = [one.sigma for one in judged if one.sigma is not None]
+    flagged = [one.uncertain for one in judged if one.uncertain is not None]
+    if len(claimed) < len(judged):
+        return None
+    sigma, error = np.concatenate(claimed), np.concatenate([one.answer - one.truth for one in judged])
+    measured = {level: coverage(error, sigma, level) for level in LEVELS}
+    middle, ratio = np.median(sigma, axis=0), np.sqrt(((error / sigma) ** 2).mean(0))
+    return {
+        "level": LEVEL,
+        "uncertain_share": float(np.concatenate(flagged).mean()),
+        "coverage": {axis: {str(n): float(one[i]) for n, one in measured.items()} for i, axis in enumerate(AXES)},
+        "per_axis": {
+            axis: {
+                "coverage": float(measured[LEVEL][i]),
+                "median_sigma_rad_s" if i >= 3 else "median_sigma_m_s": float(middle[i]),
+                "error_over_sigma_rms": float(ratio[i]),
+            }
+            for i, axis in enumerate(AXES)
+        },
     }

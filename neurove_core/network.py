@@ -16,7 +16,7 @@ class NetworkState(NamedTuple):
 
     membranes: tuple[LIFState, ...]  # one per block of the feature extractor, (B, C, H, W)
     cells: tuple[ASLSTMState, ...]  # one per ASLSTM layer, (B, N)
-    readout: Tensor  # potential of the output neurons (B, 6n)
+    readout: Tensor  # potential of the output neurons (B, 6n), and of those of the spread after them, where it has any
 
     def finite(self) -> bool:
         """Whether no number of it is nan or infinite."""
@@ -82,7 +82,30 @@ class NeuroVE(nn.Module):
         else:
             self.register_buffer("d_space", d_space, persistent=False)
         self.readout = nn.Linear(net.hidden, 6 * self.bins)
+        self.spread: nn.Linear | None = None  # more output neurons: how far off each axis may be, see add_spread
         self.kappa_logit = nn.Parameter(torch.tensor(-1.386))  # sigmoid gives 0.2
+
+    def add_spread(self, rows: int = 6) -> nn.Linear:
+        """Give the network output neurons for the spread of its errors, at 0; returns them.
+
+        They leak as those of the velocity and see what those see, and no answer depends on them. Their potentials, one
+        row for each axis, are log sigma of the newest window in units of the bundle's scale: see `log_sigma`.
+        """
+        self.spread = nn.Linear(self.readout.in_features, rows)
+        nn.init.zeros_(self.spread.weight)
+        nn.init.zeros_(self.spread.bias)
+        return self.spread
+
+    def log_sigma(self, state: NetworkState) -> Tensor | None:
+        """Potentials (B, rows) of the spread after the window that led to this state; None without a spread."""
+        return None if self.spread is None else state.readout[:, 6 * self.bins :]
+
+    def outputs(self) -> tuple[Tensor, Tensor]:
+        """Weight (R, N) and bias (R) of all output neurons, R = 6n and the rows of the spread."""
+        if self.spread is None:
+            return self.readout.weight, self.readout.bias
+        both = self.readout, self.spread
+        return torch.cat([layer.weight for layer in both]), torch.cat([layer.bias for layer in both])
 
     def map_sizes(self) -> list[tuple[int, int]]:
         """Rows and columns of every block's output."""
@@ -101,7 +124,7 @@ class NeuroVE(nn.Module):
             for channels, (rows, columns) in zip(self.config.network.channels, self.map_sizes(), strict=True)
         )
         cells = tuple(cell.initial_state(batch) for cell in self._layers())
-        return NetworkState(membranes, cells, zeros(batch, 6 * self.bins))
+        return NetworkState(membranes, cells, zeros(batch, len(self.outputs()[1])))
 
     def _layers(self) -> list[ASLSTM]:
         return [cell for cell in self.cells if isinstance(cell, ASLSTM)]
@@ -130,8 +153,9 @@ class NeuroVE(nn.Module):
             x = diffuse(scanned.s, scanned.v, self.d_space[index])
             cells.append(last)
         y, kappa, answers = state.readout, torch.sigmoid(self.kappa_logit), []
+        weight, bias = self.outputs()
         for z in x:
-            y = readout_step(z, y, self.readout.weight, self.readout.bias, kappa)
+            y = readout_step(z, y, weight, bias, kappa)
             answers.append(y)
-        twists = torch.stack(answers).view(steps, batch, self.bins, 6)
+        twists = torch.stack(answers)[..., : 6 * self.bins].reshape(steps, batch, self.bins, 6)
         return twists, NetworkState(tuple(membranes), tuple(cells), y)
