@@ -13,6 +13,7 @@ from neurove_core.io.packets import slices
 from neurove_core.io.recording import Recording
 from neurove_core.metrics import ANGULAR_FLOOR_RAD_S, LINEAR_FLOOR_M_S, SKIP_S, figures
 from neurove_core.network import NetworkState
+from protocol.camera import CameraInfo
 from protocol.errors import NeuroVEError
 
 _SAMPLES = 4  # of the truth in each bin, whose mean is the bin's
@@ -34,6 +35,7 @@ class Answers:
     bin_us: int
     twists: NDArray[np.float64]  # (W, n, 6) [m/s, rad/s]
     events: NDArray[np.int64]  # (W,)
+    low_activity: NDArray[np.bool_]  # (W,) as the service flags it
     latency_ms: NDArray[np.float64]  # (W,) of the push that completed each
     firing_rate: dict[str, float]  # share of neurons that fire per step, by layer; and of all of them
     scaled: bool  # the linear part is in m/s; else as if the camera were 1 m above the ground
@@ -49,13 +51,18 @@ class Judged:
     answer: NDArray[np.float64]  # (N, 6)
 
 
-def answer(estimator: Estimator, recording: Recording) -> Answers:
+def answer(estimator: Estimator, recording: Recording, camera: CameraInfo | None = None) -> Answers:
     """Run a model over a recording, packet by packet as a driver sends it.
 
+    Args:
+        estimator: the model.
+        recording: what it sees.
+        camera: its lens, by default what the recording tells of it.
+
     Raises:
-        BrokenRecording: it can not be read to its end.
+        BrokenRecording: it can not be read to its end. InvalidField: the lens is of another sensor.
     """
-    camera = recording.camera(_STREAM)
+    camera = camera or recording.camera(_STREAM)
     state = estimator.initial_state(recording.sensor, camera)
     found: list[WindowEstimate] = []
     latencies_ms: list[float] = []
@@ -76,6 +83,7 @@ def answer(estimator: Estimator, recording: Recording) -> Answers:
         bin_us=estimator.config.window.bin_us,
         twists=np.stack([one.twists for one in found]) if found else np.zeros((0, bins, 6)),
         events=np.array([one.events for one in found], np.int64),
+        low_activity=np.array([one.low_activity for one in found], np.bool_),
         latency_ms=np.array(latencies_ms),
         firing_rate=fired.rates(),
         scaled=camera is not None and camera.height_m is not None,

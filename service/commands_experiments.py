@@ -84,6 +84,28 @@ def reproduce_sine(args: argparse.Namespace) -> int:
     return 0
 
 
+def reproduce_real(args: argparse.Namespace) -> int:
+    """What a model makes of real events that nobody tuned it on."""
+    import torch
+
+    from neurove_core import models
+    from neurove_core.estimator import Estimator
+    from neurove_core.experiments import real
+
+    torch.set_num_threads(1)
+    estimator = Estimator(models.find(args.model))
+    rows = []
+    for row in real.run(estimator, args.recordings):
+        rows.append(row)
+        print(f"{row['recording']}: {row['what']}", file=sys.stderr)
+    typed = shlex.join(["neurove", *sys.argv[1:]])
+    about = {"model": estimator.bundle.info.model_dump(), "command": typed, "commit": commit()}
+    print(json.dumps(about | {"checks": rows}) if args.json else real.markdown(rows, real.title(about)), end="")
+    for file in real.save(rows, about, args.out) if args.out else []:
+        print(f"wrote {file}", file=sys.stderr)
+    return 0
+
+
 def _assignment(text: str) -> tuple[str, str]:
     field, separator, value = text.partition("=")
     if not separator:
@@ -120,3 +142,7 @@ def _add_reproduce(commands: Any) -> None:
     )
     sine.add_argument("--quick", action="store_true", help="a few updates, to see that it runs: figures mean nothing")
     sine.add_argument("--out", type=Path, metavar="DIR", help="write figures, tables, pictures and networks there")
+    real = command(parser, "real", reproduce_real)
+    real.add_argument("model", nargs="?", default="default", metavar="BUNDLE", help="a bundle's file; `default`")
+    real.add_argument("--recordings", type=Path, required=True, metavar="DIR", help="where the recordings lie")
+    real.add_argument("--out", type=Path, metavar="DIR", help="write real.json and real.md there")
