@@ -18,8 +18,9 @@ from pydantic import Field, ValidationError
 from safetensors import SafetensorError
 from torch import Tensor, nn
 
+from neurove_core import networks
 from neurove_core.config import Config, ModelConfig
-from neurove_core.network import NeuroVE
+from neurove_core.networks import Network
 from protocol.control import ModelInfo
 from protocol.errors import BadModel, shown
 
@@ -58,7 +59,7 @@ class Bundle:
     trained: bool
     provenance: str
     config: ModelConfig
-    network: NeuroVE
+    network: Network
     offset: Tensor  # (6): twist = network output * scale + offset, in linear_unit and rad/s
     scale: Tensor  # (6)
     linear_unit: LinearUnit = METRIC
@@ -135,9 +136,9 @@ def from_bytes(data: bytes, name: str) -> Bundle:
         # the last two: a tensor without elements may claim sides that torch has no integer for
         raise BadModel(name, f"not a whole safetensors file: {error}") from None
     with torch.device("meta"):  # shapes alone: a header of a few bytes may declare terabytes of weights
-        wanted = {**_stored(NeuroVE(header.config)), _OFFSET: torch.zeros(6), _SCALE: torch.ones(6)}
+        wanted = {**_stored(networks.make(header.config)), _OFFSET: torch.zeros(6), _SCALE: torch.ones(6)}
     _check_tensors(tensors, wanted, name)
-    network = NeuroVE(header.config)
+    network = networks.make(header.config)
     offset, scale = tensors.pop(_OFFSET), tensors.pop(_SCALE)
     network.load_state_dict(tensors, strict=False)  # names are checked; only the norms' batch counters are not stored
     return Bundle(
@@ -199,7 +200,7 @@ def untrained(seed: int = 0, config: ModelConfig | None = None, name: str = "unt
     config = config or ModelConfig()
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        network = NeuroVE(config)
+        network = networks.make(config)
         shape = (8, 4, 2 * config.window.bins, config.canonical.height, config.canonical.width)
         _take_statistics(network, torch.poisson(torch.full(shape, 0.3)).log1p())
     return Bundle(
@@ -213,7 +214,7 @@ def untrained(seed: int = 0, config: ModelConfig | None = None, name: str = "unt
     ).with_digest()
 
 
-def _take_statistics(network: NeuroVE, spikes: Tensor) -> None:
+def _take_statistics(network: Network, spikes: Tensor) -> None:
     momenta = {
         layer: layer.momentum for layer in network.modules() if isinstance(layer, nn.BatchNorm1d | nn.BatchNorm2d)
     }
@@ -225,7 +226,7 @@ def _take_statistics(network: NeuroVE, spikes: Tensor) -> None:
         norm.momentum = momentum
 
 
-def _stored(network: NeuroVE) -> dict[str, Tensor]:
+def _stored(network: Network) -> dict[str, Tensor]:
     return {
         name: tensor.contiguous()
         for name, tensor in network.state_dict().items()

@@ -12,7 +12,7 @@ from neurove_core.geometry import Twists
 from neurove_core.io.packets import slices
 from neurove_core.io.recording import Recording
 from neurove_core.metrics import ANGULAR_FLOOR_RAD_S, LINEAR_FLOOR_M_S, SKIP_S, figures
-from neurove_core.network import NetworkState
+from neurove_core.networks import State, fired
 from protocol.camera import CameraInfo
 from protocol.errors import NeuroVEError
 
@@ -37,7 +37,7 @@ class Answers:
     events: NDArray[np.int64]  # (W,)
     low_activity: NDArray[np.bool_]  # (W,) as the service flags it
     latency_ms: NDArray[np.float64]  # (W,) of the push that completed each
-    firing_rate: dict[str, float]  # share of neurons that fire per step, by layer; and of all of them
+    firing_rate: dict[str, float]  # share of neurons that fire per step, by layer and of all; or empty
     scaled: bool  # the linear part is in m/s; else as if the camera were 1 m above the ground
 
 
@@ -66,7 +66,7 @@ def answer(estimator: Estimator, recording: Recording, camera: CameraInfo | None
     state = estimator.initial_state(recording.sensor, camera)
     found: list[WindowEstimate] = []
     latencies_ms: list[float] = []
-    fired = _Fired(estimator)
+    fired = _Fired()
     for piece in slices(recording.chunks()):
         began = time.perf_counter()
         pushed = estimator.push(piece.events, state, piece.t0_us)
@@ -91,25 +91,21 @@ def answer(estimator: Estimator, recording: Recording, camera: CameraInfo | None
 
 
 class _Fired:
-    """How often neurons fire, as their state tells it: a membrane that has just fired is exactly 0."""
+    """How often neurons fire, as their state tells it."""
 
-    def __init__(self, estimator: Estimator) -> None:
-        net = estimator.config.network
-        self._layers = [f"block {i + 1}" for i in range(len(net.channels))]
-        self._layers += [f"cell {i + 1}" for i in range(net.cells)]
-        self._spikes, self._neurons, self._steps = np.zeros(len(self._layers)), np.zeros(len(self._layers)), 0
+    def __init__(self) -> None:
+        self._spikes, self._neurons = dict[str, int](), dict[str, int]()
 
-    def add(self, state: NetworkState) -> None:
-        layers = [one.v == 0 for one in state.membranes] + [one.s > 0 for one in state.cells]
-        self._spikes += [float(fired.sum()) for fired in layers]
-        self._neurons = np.array([float(fired.numel()) for fired in layers])
-        self._steps += 1
+    def add(self, state: State) -> None:
+        for layer, spikes in fired(state).items():
+            self._spikes[layer] = self._spikes.get(layer, 0) + int(spikes.sum())
+            self._neurons[layer] = self._neurons.get(layer, 0) + spikes.numel()
 
     def rates(self) -> dict[str, float]:
-        if not self._steps:
+        if not self._spikes:
             return {}
-        rates = dict(zip(self._layers, (self._spikes / self._neurons / self._steps).tolist(), strict=True))
-        return rates | {"all": float(self._spikes.sum() / self._neurons.sum() / self._steps)}
+        rates = {layer: spikes / self._neurons[layer] for layer, spikes in self._spikes.items()}
+        return rates | {"all": sum(self._spikes.values()) / sum(self._neurons.values())}
 
 
 def judge(answers: Answers, truth: Twists) -> Judged:
@@ -144,7 +140,7 @@ def report(judged: list[Judged]) -> dict[str, Any]:
     rates = [one.answers.firing_rate for one in judged]
     every = {layer: float(np.mean([rate[layer] for rate in rates])) for layer in rates[0]}
     return figures(truth, said, bins) | {
-        "firing_rate": every.pop("all"),
+        "firing_rate": every.pop("all", None),
         "firing_rate_by_layer": every,
         "latency_ms": {f"p{q}": float(np.percentile(latency_ms, q)) for q in (50, 99)},
         "re_floors": {"v_l_m_s": LINEAR_FLOOR_M_S, "v_a_rad_s": ANGULAR_FLOOR_RAD_S},

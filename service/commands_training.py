@@ -89,7 +89,9 @@ def _table(told: dict[str, Any]) -> Iterator[str]:
         numbers = [_number(row[f"{name}_{unit}"], 8) for name in ("rmse", "median_error", "bias", "spread")]
         yield f"{axis:6} {' '.join(numbers)} {_number(row['correlation'], 11)}  {unit.replace('_s', '/s')}"
     latency = told["latency_ms"]
-    yield f"firing rate {told['firing_rate']:.3f}; a window takes {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"
+    rate = told["firing_rate"]
+    fires = "no spikes" if rate is None else f"firing rate {rate:.3f}"
+    yield f"{fires}; a window takes {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"
     if not told["scaled"]:
         yield "linear part: for a camera 1 m above the ground, because the recording does not say how high it is"
 

@@ -75,7 +75,7 @@ def run(estimator: Estimator, folder: Path) -> Iterator[dict[str, Any]]:
     """
     for check in CHECKS:
         row: dict[str, Any] = {"recording": check.recording, "what": check.what, "asked": check.asked}
-        empty = {"value": None, "met": None, "made_of": {}}
+        empty: dict[str, Any] = {"value": None, "met": None, "made_of": {}}
         if not (folder / check.recording).exists():
             yield row | empty | {"skipped": "the recording is not there"}
             continue

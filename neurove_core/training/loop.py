@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 
 from neurove_core import bundle
+from neurove_core.carried import detached
 from neurove_core.encoding import to_spikes
 from neurove_core.loss import group_loss, scaled_sum
-from neurove_core.network import NetworkState
 from neurove_core.training.batches import Segment, draw
 from neurove_core.training.config import RecipeConfig, TrainingConfig
 from neurove_core.training.data import Cache
@@ -128,13 +128,6 @@ def errors(run: Run, answers: Tensor, segment: Segment, chunk: slice) -> tuple[T
     """
     error = answers * run.scale + run.offset - segment.twists[chunk]
     return group_loss(error[..., :3] * segment.height_m[:, None, None]), group_loss(error[..., 3:])
-
-
-def detached(state: NetworkState) -> NetworkState:
-    """The state without its past: gradients do not flow into the chunk before."""
-    membranes = tuple(type(one)(*(tensor.detach() for tensor in one)) for one in state.membranes)
-    cells = tuple(type(one)(*(tensor.detach() for tensor in one)) for one in state.cells)
-    return NetworkState(membranes, cells, state.readout.detach())
 
 
 def provenance(run: Run) -> str:

@@ -16,9 +16,10 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
+from neurove_core import networks
 from neurove_core.bundle import PER_HEIGHT, Bundle
 from neurove_core.loss import Balance
-from neurove_core.network import NeuroVE
+from neurove_core.networks import Network
 from neurove_core.training.config import TrainingConfig
 from neurove_core.training.data import Sequences
 from protocol.errors import BadModel
@@ -32,7 +33,7 @@ class Run:
     """All that a run carries from one segment to the next."""
 
     config: TrainingConfig
-    network: NeuroVE
+    network: Network
     optimiser: torch.optim.Adam
     offset: Tensor  # (6): twist = network output * scale + offset
     scale: Tensor  # (6)
@@ -50,7 +51,7 @@ class Run:
 
     def bundle(self, provenance: str) -> Bundle:
         """The model as it is now."""
-        network = NeuroVE(self.config.model)
+        network = networks.make(self.config.model)
         network.load_state_dict(self.network.state_dict())
         return Bundle(
             name=self.config.name,
@@ -123,10 +124,10 @@ def write_whole(path: Path, data: bytes) -> None:
         part.unlink(missing_ok=True)
 
 
-def _network(config: TrainingConfig) -> tuple[NeuroVE, torch.optim.Adam]:
+def _network(config: TrainingConfig) -> tuple[Network, torch.optim.Adam]:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.recipe.seed)
-        network = NeuroVE(config.model)
+        network = networks.make(config.model)
     for norm in network.modules():
         if isinstance(norm, nn.BatchNorm1d | nn.BatchNorm2d):
             norm.momentum = config.recipe.norm_momentum
