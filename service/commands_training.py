@@ -1,14 +1,14 @@
 """The commands that make models and judge them: train, evaluate."""
 
 import argparse
-import contextlib
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from service.arguments import command, sensor_size
+from service.progress import progress
 
 
 def train(args: argparse.Namespace) -> int:
@@ -22,7 +22,7 @@ def train(args: argparse.Namespace) -> int:
     config = configs.load(args.config)
     out: Path = args.out or Path("runs") / config.name
     folder: Path = args.data or out / "data"
-    with _progress() as show:
+    with progress() as show:
         cache = data.Cache(folder, config)
         wanted = config.data.sequences
         for done, name in enumerate(cache.fill(args.workers), wanted - len(cache.missing()) + 1):
@@ -98,32 +98,6 @@ def _table(told: dict[str, Any]) -> Iterator[str]:
 
 def _number(value: float | None, width: int) -> str:
     return f"{'-' if value is None else format(value, '.3f'):>{width}}"
-
-
-@contextlib.contextmanager
-def _progress() -> Iterator[Callable[[str, int, int, str], None]]:
-    """Shows how far each task is: bars on a terminal, else a line now and then."""
-    if not sys.stderr.isatty():
-        yield _say
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn(), TextColumn("{task.fields[about]}"))
-    with Progress(*columns, console=Console(stderr=True)) as bars:
-        tasks: dict[str, Any] = {}
-
-        def show(what: str, done: int, of: int, about: str) -> None:
-            if what not in tasks:
-                tasks[what] = bars.add_task(what, total=of, about="")
-            bars.update(tasks[what], completed=done, about=about)
-
-        yield show
-
-
-def _say(what: str, done: int, of: int, about: str) -> None:
-    if what != "learned" or done % 100 < 4 or done == of:
-        print(f"{what} {done}/{of}: {about}", file=sys.stderr, flush=True)
 
 
 def add(commands: Any) -> None:

@@ -4,7 +4,7 @@ import json
 import math
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -17,7 +17,7 @@ from neurove_core.encoding import to_spikes
 from neurove_core.loss import group_loss, scaled_sum
 from neurove_core.training.batches import Segment, draw
 from neurove_core.training.config import RecipeConfig, TrainingConfig
-from neurove_core.training.data import Cache
+from neurove_core.training.data import Cache, Sequences
 from neurove_core.training.run import Run, write_whole
 
 CHECKPOINT: Final = "checkpoint.safetensors"
@@ -58,6 +58,7 @@ def train(
     out: Path,
     data: Path,
     *,
+    more: Sequence[Path] = (),
     resume: bool = False,
     on_progress: Callable[[Progress], None] = lambda _: None,
 ) -> Path:
@@ -67,6 +68,7 @@ def train(
         config: of the run.
         out: folder for the checkpoint, run.json and the bundle.
         data: folder of the sequences, filled by `Cache.fill`.
+        more: files of further sequences, as `data.save` writes them.
         resume: go on from the checkpoint in `out`, where there is one.
         on_progress: told after each segment.
 
@@ -78,7 +80,8 @@ def train(
     """
     out.mkdir(parents=True, exist_ok=True)
     checkpoint = out / CHECKPOINT
-    sequences = Cache(data, config).open()
+    cache = Cache(data, config)
+    sequences = Sequences([*(cache.path(index) for index in range(config.data.sequences)), *more])
     run = Run.restore(checkpoint, config) if resume and checkpoint.exists() else Run.begin(config, sequences)
     saved_s, began_s, recent = time.monotonic(), time.process_time() - run.cpu_s, list[_Losses]()
     while run.step < config.recipe.steps:
@@ -94,7 +97,7 @@ def train(
                 _write_run(run, out)
                 saved_s = time.monotonic()
     path = out / f"{config.name}{bundle.SUFFIX}"
-    bundle.save(run.bundle(provenance(run)), path)
+    bundle.save(run.bundle(provenance(run, len(more))), path)
     return path
 
 
@@ -130,12 +133,13 @@ def errors(run: Run, answers: Tensor, segment: Segment, chunk: slice) -> tuple[T
     return group_loss(error[..., :3] * segment.height_m[:, None, None]), group_loss(error[..., 3:])
 
 
-def provenance(run: Run) -> str:
-    """One line: how this model was made."""
+def provenance(run: Run, more: int = 0) -> str:
+    """One line: how this model was made; `more` sequences were learned from beside the configuration's."""
     recipe, data = run.config.recipe, run.config.data
     text = (
         f"neurove train {run.config.name}: {run.step} updates of {recipe.batch} x {recipe.chunk_windows} windows, "
-        f"seed {recipe.seed}, {data.sequences} simulated sequences of {data.seconds:g} s from seed {data.seed}, "
+        f"seed {recipe.seed}, {data.sequences} simulated sequences of {data.seconds:g} s from seed {data.seed}"
+        f"{f' and {more} more' if more else ''}, "
         f"{run.cpu_s:.0f} CPU s, commit {commit() or 'unknown'}, torch {torch.__version__}"
     )
     return text[:_PROVENANCE_CHARS]
