@@ -122,7 +122,7 @@ def drives(recordings: Path | None, seconds: float, motion_px: float, *, quick: 
         return []
     count = 2 if quick else _TRAIN_DRIVES
     on_day1 = max(1, round(count * DAY1_TRAINED_S / (DAY1_TRAINED_S + _DAY2_S)))
-    found = []
+    found: list[Item] = []
     for day, number, until_s in ((DAY1, on_day1, DAY1_TRAINED_S), (DAY2, count - on_day1, _DAY2_S)):
         for start in np.linspace(0, until_s - seconds - 1, number).round(2).tolist():
             way = _part(recordings / day, start, seconds)
@@ -203,7 +203,8 @@ class Kept:
 def _turning(simulation: Simulation) -> Iterator[dict[str, Any]]:
     """What contrast maximisation says at some instants: `truth` and `answer` [rad/s], mean over a window."""
     last_s = simulation.duration_s - _WINDOW_US / 1e6
-    for start_s in np.linspace(min(0.5, last_s / 2), last_s - 0.02, _CM_INSTANTS).round(2).tolist():
+    count = _CM_INSTANTS if simulation.duration_s > _QUICK_S else 1
+    for start_s in np.linspace(0.5, last_s - 0.02, count).round(2).tolist():
         start_us = round(start_s * 1e6)
         events = Events.empty()
         for step in simulation.steps(start_s):

@@ -79,11 +79,9 @@ def follow(model: Bundle, path: Path, item: Item) -> tuple[Track, tuple[int, int
     bins, window_s = twists.shape[1], model.config.window.duration_us / 1e6
     kept = slice(round(SKIP_S / window_s), None)
     t_s = (np.arange(twists.shape[0] * bins).reshape(-1, bins) + 0.5) * window_s / bins
-    both = (
-        values[kept].reshape(-1, 6)
-        for values in (twists * metres, answer * (metres if model.linear_unit == PER_HEIGHT else 1.0))
-    )
-    return Track(item.group, item.name, t_s[kept].ravel(), *both, bins), (int(counted[0]), int(counted[1]))
+    truth = (twists * metres)[kept].reshape(-1, 6)
+    said = (answer * (metres if model.linear_unit == PER_HEIGHT else 1.0))[kept].reshape(-1, 6)
+    return Track(item.group, item.name, t_s[kept].ravel(), truth, said, bins), (int(counted[0]), int(counted[1]))
 
 
 def summaries(tracks: list[Track]) -> dict[str, dict[str, Any]]:

@@ -180,8 +180,8 @@ def turning(plan: Plan, folder: Path) -> dict[str, dict[str, Any]]:
         if item.group in CM_GROUPS:
             told = json.loads(kept.turning_path(item).read_text())
             t_s = np.array([one["t_s"] for one in told])
-            both = (np.array([[0.0, 0.0, 0.0, *one[name]] for one in told]) for name in ("truth", "answer"))
-            found.setdefault(item.group, []).append(Track(item.group, item.name, t_s, *both, 1))
+            truth, said = (np.array([[0.0, 0.0, 0.0, *one[name]] for one in told]) for name in ("truth", "answer"))
+            found.setdefault(item.group, []).append(Track(item.group, item.name, t_s, truth, said, 1))
     linear = ("re_v_l", "re_v_l_unfloored", "rmse_v_l_m_s", "r2_v_l", "median_direction_error_v_l_deg")
     return {group: summary(tracks) | dict.fromkeys(linear) for group, tracks in found.items()}
 
