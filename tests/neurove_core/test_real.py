@@ -13,9 +13,10 @@ from neurove_core.estimator import Estimator
 from neurove_core.evaluation import answer
 from neurove_core.experiments import real
 from neurove_core.io import open_source
-from protocol import Events
+from protocol import Events, Sensor
 from service import cli
-from tests.recordings import SHARED, ecd_text, shared
+from tests.builders import make_events
+from tests.recordings import SHARED, aedat4, ecd_text, shared
 
 RESULTS = Path(real.__file__).parent / "results"
 CALIB = "199.1 198.8 132.2 110.7 -0.368 0.151 -0.0003 -0.0008 0.0\n"
@@ -74,6 +75,25 @@ def test_what_lacks_its_truth_or_a_whole_window_is_skipped_with_the_reason(estim
     rows = by_name(real.run(estimator, tmp_path))
     assert "groundtruth.txt" in rows["slider_depth", "direction of motion"]["skipped"]
     assert "no whole window of 50 ms" in rows["ecd", "rate of turning"]["skipped"]
+
+
+def test_profiles_and_cameras_at_rest_are_judged_over_their_windows(estimator, tmp_path):
+    (tmp_path / "ecd").mkdir()
+    (tmp_path / "ecd" / "shapes_rotation_1.43s.txt").write_bytes(ecd_text(turning(0.75)))
+    (tmp_path / "aedat4").mkdir()
+    noise = make_events(3000, duration_us=600_000, sensor=Sensor(346, 260))
+    (tmp_path / "aedat4" / "davis346.aedat4").write_bytes(aedat4([noise], Sensor(346, 260)).data)
+    rows = by_name(real.run(estimator, tmp_path))
+    assert rows["ecd", "yaw"]["made_of"]["windows"] == 3  # whole ones, 0.5 s after the first of them
+    assert -1 <= rows["ecd", "yaw"]["value"] <= 1
+    assert (
+        rows["ecd", "turning at rest [rad/s]"]["value"] >= rows["ecd", "turning at rest [rad/s]"]["made_of"]["median"]
+    )
+    rest = {row["what"]: row for row in real.run(estimator, tmp_path) if row["recording"].endswith("davis346.aedat4")}
+    flagged = rest["share of windows flagged low activity"]
+    assert flagged["made_of"]["events in a window"] == pytest.approx(250, abs=40)
+    assert 0 <= flagged["value"] <= 1
+    assert rest["speed at rest at 1 m [m/s]"]["value"] >= 0
 
 
 def test_all_of_them_are_judged_where_they_are_there(tmp_path):
