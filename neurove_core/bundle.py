@@ -13,16 +13,17 @@ from typing import Any, Final, Literal, Self
 
 import safetensors.torch
 import torch
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, ValidationInfo, field_validator
 from safetensors import SafetensorError
 from torch import Tensor, nn
 
-from neurove_core import golden
+from neurove_core import golden, networks
 from neurove_core.about import About, Limits
 from neurove_core.config import Config, ModelConfig
 from neurove_core.files import write_whole
 from neurove_core.golden import Golden
 from neurove_core.network import NeuroVE
+from neurove_core.networks import Network
 from neurove_core.uncertainty import Uncertainty, why_no_correlation
 from protocol.control import ModelInfo
 from protocol.errors import BadModel, shown
@@ -62,6 +63,14 @@ class Header(About):
     golden_tolerance: float | None = Field(None, gt=0, le=1, description="Of the golden test, where there is one.")
     uncertainty: UncertaintyHeader | None = Field(None, description="How far off its answers may be, where it knows.")
 
+    @field_validator("uncertainty")
+    @classmethod
+    def _of_a_neurove(cls, value: UncertaintyHeader | None, info: ValidationInfo) -> UncertaintyHeader | None:
+        config = info.data.get("config")
+        if value is not None and config is not None and config.kind != "neurove":
+            raise ValueError(f"a network of kind={config.kind!r} has none")
+        return value
+
 
 @dataclass(frozen=True)
 class Bundle:
@@ -71,7 +80,7 @@ class Bundle:
     trained: bool
     provenance: str
     config: ModelConfig
-    network: NeuroVE
+    network: Network
     offset: Tensor  # (6): twist = network output * scale + offset, in linear_unit and rad/s
     scale: Tensor  # (6)
     linear_unit: LinearUnit = METRIC
@@ -244,7 +253,7 @@ def untrained(seed: int = 0, config: ModelConfig | None = None, name: str = "unt
     config = config or ModelConfig()
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        network = NeuroVE(config)
+        network = networks.make(config)
         shape = (8, 4, 2 * config.window.bins, config.canonical.height, config.canonical.width)
         _take_statistics(network, torch.poisson(torch.full(shape, 0.3)).log1p())
     return Bundle(
@@ -258,7 +267,7 @@ def untrained(seed: int = 0, config: ModelConfig | None = None, name: str = "unt
     ).with_digest()
 
 
-def _take_statistics(network: NeuroVE, spikes: Tensor) -> None:
+def _take_statistics(network: Network, spikes: Tensor) -> None:
     momenta = {
         layer: layer.momentum for layer in network.modules() if isinstance(layer, nn.BatchNorm1d | nn.BatchNorm2d)
     }
@@ -271,8 +280,8 @@ def _take_statistics(network: NeuroVE, spikes: Tensor) -> None:
 
 
 def _network(header: Header) -> NeuroVE:
-    network = NeuroVE(header.config)
-    if header.uncertainty is not None:
+    network = networks.make(header.config)
+    if header.uncertainty is not None and isinstance(network, NeuroVE):
         network.add_spread()
     return network
 
@@ -286,7 +295,7 @@ def _uncertainty(header: UncertaintyHeader | None, correlation: Tensor | None, n
     return Uncertainty(correlation, header.uncertain_above, header.provenance)
 
 
-def _stored(network: NeuroVE) -> dict[str, Tensor]:
+def _stored(network: Network) -> dict[str, Tensor]:
     return {
         name: tensor.contiguous()
         for name, tensor in network.state_dict().items()

@@ -76,6 +76,9 @@ class NetworkConfig(Config):
 class ModelConfig(Config):
     """Everything that shapes a model and its input."""
 
+    kind: Literal["neurove", "ann", "snn-ang"] = Field(
+        "neurove", description="Which network: NeuroVE, the equal-size one without spikes, or SNN-ANG; see networks."
+    )
     window: WindowConfig = WindowConfig()
     canonical: CanonicalConfig = CanonicalConfig()
     network: NetworkConfig = NetworkConfig()

@@ -1,17 +1,20 @@
 """Estimator.push: the one entry for inference; the same windows and encoding as training."""
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from neurove_core import windows
 from neurove_core.bundle import PER_HEIGHT, Bundle
 from neurove_core.encoding import to_spikes
 from neurove_core.engine import Engine
 from neurove_core.geometry import lookup_table
-from neurove_core.network import NetworkState
+from neurove_core.network import NetworkState, NeuroVE
+from neurove_core.networks import State
 from neurove_core.windows import Window, WindowsState
 from protocol import CameraInfo, Events, Sensor
 from protocol.errors import BadModel
@@ -24,7 +27,7 @@ class StreamState(NamedTuple):
     camera: CameraInfo | None
     lut: NDArray[np.int32]  # sensor pixel -> canonical cell
     windows: WindowsState
-    network: NetworkState
+    network: State
     age: int  # windows since the network state began
     recent: tuple[NDArray[np.uint8], ...]  # counts of the newest windows, to prime another model with
 
@@ -65,7 +68,9 @@ class Estimator:
         self.bundle = bundle
         self.config = bundle.config
         self.network = bundle.network.eval().requires_grad_(requires_grad=False)
-        self._engine = Engine(self.network)
+        # a baseline runs as it was trained: NeuroVE alone has a fast path
+        fast = Engine(self.network) if isinstance(self.network, NeuroVE) else self.network
+        self._engine: Callable[[Tensor, Any], tuple[Tensor, Any]] = fast
         self._offset, self._scale = bundle.offset.double().numpy(), bundle.scale.double().numpy()
 
     def initial_state(self, sensor: Sensor, camera: CameraInfo | None = None) -> StreamState:
@@ -149,14 +154,16 @@ class Estimator:
         return np.array([height_m or 1.0] * 3 + [1.0] * 3)
 
     @torch.inference_mode()
-    def _step(self, counts: NDArray[np.uint8], state: NetworkState) -> tuple[NDArray[np.float64], NetworkState]:
+    def _step(self, counts: NDArray[np.uint8], state: State) -> tuple[NDArray[np.float64], State]:
         spikes = to_spikes(torch.from_numpy(counts)[None, None], self.config.network.encoding)
         twists, state = self._engine(spikes, state)
         return twists[0, 0].double().numpy() * self._scale + self._offset, state
 
-    def _covariance(self, network: NetworkState, metres: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    def _covariance(self, state: State, metres: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Of the twists of the window that led to this state; as them scaled by the camera's height."""
-        log_sigma = self.network.log_sigma(network)
+        if not isinstance(self.network, NeuroVE) or not isinstance(state, NetworkState):
+            return None
+        log_sigma = self.network.log_sigma(state)
         if self.bundle.uncertainty is None or log_sigma is None:
             return None
         return self.bundle.uncertainty.covariance(log_sigma[0].double().numpy(), self._scale * metres)
@@ -165,7 +172,7 @@ class Estimator:
         self,
         window: Window,
         twists: NDArray[np.float64],
-        network: NetworkState,
+        network: State,
         metres: NDArray[np.float64],
         age: int,
     ) -> WindowEstimate:

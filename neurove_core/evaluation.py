@@ -12,8 +12,9 @@ from neurove_core.geometry import Twists
 from neurove_core.io.packets import slices
 from neurove_core.io.recording import Recording
 from neurove_core.metrics import ANGULAR_FLOOR_RAD_S, LINEAR_FLOOR_M_S, SKIP_S, figures
-from neurove_core.network import NetworkState
+from neurove_core.networks import State, fired
 from neurove_core.uncertainty import LEVEL, LEVELS, coverage
+from protocol.camera import CameraInfo
 from protocol.errors import NeuroVEError
 from protocol.velocity import AXES
 
@@ -36,8 +37,9 @@ class Answers:
     bin_us: int
     twists: NDArray[np.float64]  # (W, n, 6) [m/s, rad/s]
     events: NDArray[np.int64]  # (W,)
+    low_activity: NDArray[np.bool_]  # (W,) as the service flags it
     latency_ms: NDArray[np.float64]  # (W,) of the push that completed each
-    firing_rate: dict[str, float]  # share of neurons that fire per step, by layer; and of all of them
+    firing_rate: dict[str, float]  # share of neurons that fire per step, by layer and of all; or empty
     scaled: bool  # the linear part is in m/s; else as if the camera were 1 m above the ground
     sigma: NDArray[np.float64] | None = None  # (W, 6) of each window's twists; None where the model has no uncertainty
     uncertain: NDArray[np.bool_] | None = None  # (W,) which windows are flagged so
@@ -55,17 +57,22 @@ class Judged:
     uncertain: NDArray[np.bool_] | None = None  # (N,), or None
 
 
-def answer(estimator: Estimator, recording: Recording) -> Answers:
+def answer(estimator: Estimator, recording: Recording, camera: CameraInfo | None = None) -> Answers:
     """Run a model over a recording, packet by packet as a driver sends it.
 
+    Args:
+        estimator: the model.
+        recording: what it sees.
+        camera: its lens, by default what the recording tells of it.
+
     Raises:
-        BrokenRecording: it can not be read to its end.
+        BrokenRecording: it can not be read to its end. InvalidField: the lens is of another sensor.
     """
-    camera = recording.camera(_STREAM)
+    camera = camera or recording.camera(_STREAM)
     state = estimator.initial_state(recording.sensor, camera)
     found: list[WindowEstimate] = []
     latencies_ms: list[float] = []
-    fired = _Fired(estimator)
+    fired = _Fired()
     for piece in slices(recording.chunks()):
         began = time.perf_counter()
         pushed = estimator.push(piece.events, state, piece.t0_us)
@@ -82,6 +89,7 @@ def answer(estimator: Estimator, recording: Recording) -> Answers:
         bin_us=estimator.config.window.bin_us,
         twists=np.stack([one.twists for one in found]) if found else np.zeros((0, bins, 6)),
         events=np.array([one.events for one in found], np.int64),
+        low_activity=np.array([one.low_activity for one in found], np.bool_),
         latency_ms=np.array(latencies_ms),
         firing_rate=fired.rates(),
         scaled=camera is not None and camera.height_m is not None,
@@ -96,25 +104,21 @@ def _sigmas(found: list[WindowEstimate]) -> NDArray[np.float64] | None:
 
 
 class _Fired:
-    """How often neurons fire, as their state tells it: a membrane that has just fired is exactly 0."""
+    """How often neurons fire, as their state tells it."""
 
-    def __init__(self, estimator: Estimator) -> None:
-        net = estimator.config.network
-        self._layers = [f"block {i + 1}" for i in range(len(net.channels))]
-        self._layers += [f"cell {i + 1}" for i in range(net.cells)]
-        self._spikes, self._neurons, self._steps = np.zeros(len(self._layers)), np.zeros(len(self._layers)), 0
+    def __init__(self) -> None:
+        self._spikes, self._neurons = dict[str, int](), dict[str, int]()
 
-    def add(self, state: NetworkState) -> None:
-        layers = [one.v == 0 for one in state.membranes] + [one.s > 0 for one in state.cells]
-        self._spikes += [float(fired.sum()) for fired in layers]
-        self._neurons = np.array([float(fired.numel()) for fired in layers])
-        self._steps += 1
+    def add(self, state: State) -> None:
+        for layer, spikes in fired(state).items():
+            self._spikes[layer] = self._spikes.get(layer, 0) + int(spikes.sum())
+            self._neurons[layer] = self._neurons.get(layer, 0) + spikes.numel()
 
     def rates(self) -> dict[str, float]:
-        if not self._steps:
+        if not self._spikes:
             return {}
-        rates = dict(zip(self._layers, (self._spikes / self._neurons / self._steps).tolist(), strict=True))
-        return rates | {"all": float(self._spikes.sum() / self._neurons.sum() / self._steps)}
+        rates = {layer: spikes / self._neurons[layer] for layer, spikes in self._spikes.items()}
+        return rates | {"all": sum(self._spikes.values()) / sum(self._neurons.values())}
 
 
 def judge(answers: Answers, truth: Twists) -> Judged:
@@ -151,7 +155,7 @@ def report(judged: list[Judged]) -> dict[str, Any]:
     rates = [one.answers.firing_rate for one in judged]
     every = {layer: float(np.mean([rate[layer] for rate in rates])) for layer in rates[0]}
     return figures(truth, said, bins) | {
-        "firing_rate": every.pop("all"),
+        "firing_rate": every.pop("all", None),
         "firing_rate_by_layer": every,
         "latency_ms": {f"p{q}": float(np.percentile(latency_ms, q)) for q in (50, 99)},
         "re_floors": {"v_l_m_s": LINEAR_FLOOR_M_S, "v_a_rad_s": ANGULAR_FLOOR_RAD_S},

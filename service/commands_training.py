@@ -1,14 +1,14 @@
 """The commands that make models and judge them: train, evaluate."""
 
 import argparse
-import contextlib
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from service.arguments import command, sensor_size
+from service.bars import progress
 
 if TYPE_CHECKING:
     from neurove_core.bundle import Bundle
@@ -29,7 +29,7 @@ def train(args: argparse.Namespace) -> int:
     ranks.device_of(args.device, devices=args.devices)  # told before anything is simulated
     out: Path = args.out or Path("runs") / config.name
     folder: Path = args.data or out / "data"
-    with _progress() as show:
+    with progress() as show:
         cache = data.Cache(folder, config)
         wanted = config.data.sequences
         for done, name in enumerate(cache.fill(args.workers), wanted - len(cache.missing()) + 1):
@@ -45,7 +45,7 @@ def train(args: argparse.Namespace) -> int:
 
         how: dict[str, Any] = {"resume": args.resume, "devices": args.devices, "device": args.device}
         path = loop.train(config, out, folder, **how, on_progress=learned)
-    if args.calibration:
+    if args.calibration and config.model.kind == "neurove":  # a baseline has no spread to fit
         _calibrate(bundle.load(path), config, folder, args.calibration, args.workers, path)
     told = {"bundle": str(path), "bytes": path.stat().st_size, "run": str(out / loop.RUN_JSON)}
     print(json.dumps(told) if args.json else f"wrote {path}, {told['bytes']:,} bytes")
@@ -80,7 +80,7 @@ def _calibrate(model: "Bundle", config: Any, folder: Path, count: int, workers: 
     from neurove_core import bundle
     from neurove_core.training import calibration
 
-    with _progress() as show:
+    with progress() as show:
         for done, name in enumerate(calibration.fill(config, folder, count, workers), 1):
             show("simulated to calibrate", done, count, name)
     made = calibration.calibrate(model, config, folder, count)
@@ -142,7 +142,9 @@ def _table(told: dict[str, Any]) -> Iterator[str]:
         yield f"{axis:6} {' '.join(numbers)} {_number(row['correlation'], 11)}  {unit.replace('_s', '/s')}"
     yield from _uncertainty_table(told["uncertainty"])
     latency = told["latency_ms"]
-    yield f"firing rate {told['firing_rate']:.3f}; a window takes {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"
+    rate = told["firing_rate"]
+    fires = "no spikes" if rate is None else f"firing rate {rate:.3f}"
+    yield f"{fires}; a window takes {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"
     if not told["scaled"]:
         yield "linear part: for a camera 1 m above the ground, because the recording does not say how high it is"
 
@@ -162,32 +164,6 @@ def _uncertainty_table(told: dict[str, Any] | None) -> Iterator[str]:
 
 def _number(value: float | None, width: int) -> str:
     return f"{'-' if value is None else format(value, '.3f'):>{width}}"
-
-
-@contextlib.contextmanager
-def _progress() -> Iterator[Callable[[str, int, int, str], None]]:
-    """Shows how far each task is: bars on a terminal, else a line now and then."""
-    if not sys.stderr.isatty():
-        yield _say
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn(), TextColumn("{task.fields[about]}"))
-    with Progress(*columns, console=Console(stderr=True)) as bars:
-        tasks: dict[str, Any] = {}
-
-        def show(what: str, done: int, of: int, about: str) -> None:
-            if what not in tasks:
-                tasks[what] = bars.add_task(what, total=of, about="")
-            bars.update(tasks[what], completed=done, about=about)
-
-        yield show
-
-
-def _say(what: str, done: int, of: int, about: str) -> None:
-    if what != "learned" or done % 100 < 4 or done == of:
-        print(f"{what} {done}/{of}: {about}", file=sys.stderr, flush=True)
 
 
 def add(commands: Any) -> None:
@@ -210,7 +186,7 @@ def add(commands: Any) -> None:
         type=int,
         default=_CALIBRATION_SEQUENCES,
         metavar="N",
-        help="sequences that the uncertainty is fitted on at the end; 0: leave it without; default %(default)s",
+        help="sequences that a NeuroVE's uncertainty is fitted on at the end; 0: none; default %(default)s",
     )
     parser = command(commands, "calibrate", calibrate)
     parser.add_argument("model", metavar="BUNDLE", help="a bundle's file, or `default`")

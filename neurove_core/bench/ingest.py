@@ -3,7 +3,7 @@
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -75,7 +75,7 @@ def end_to_end(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: 
     tonic = peers.load("tonic.functional", missing) if with_peers else None
     for name, config in shapes.items():
         estimator = Estimator(bundle.untrained(0, config))
-        network = estimator.network
+        network = cast("NeuroVE", estimator.network)
         others = peers.networks(network, missing) if with_peers else {}
         runs: dict[str, Callable[[], Any]] = {"ours": _estimated(estimator, events)}
         for peer, theirs in {"PyTorch, plain": network, **others}.items():

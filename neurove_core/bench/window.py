@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Callable
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -110,7 +111,7 @@ def draw(config: ModelConfig, steps: int, batch: int = 1, seed: int = 1) -> Tens
 
 
 def _network(config: ModelConfig) -> NeuroVE:
-    return bundle.untrained(0, config).network.eval().requires_grad_(requires_grad=False)
+    return cast("NeuroVE", bundle.untrained(0, config).network.eval().requires_grad_(requires_grad=False))
 
 
 def _plainly(network: NeuroVE, spikes: Tensor, state: NetworkState) -> Callable[[], object]:

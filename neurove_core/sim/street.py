@@ -82,7 +82,8 @@ class Street:
         middle = np.round(position[[0, 2]] / repeat) * repeat
         right, ahead = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
         size = (2 * ENDLESS, 2 * ENDLESS)
-        parts = [panel(np.array([middle[0], 0, middle[1]]), right, ahead, size, "asphalt", repeat_m=repeat)]
+        ground = panel(np.array([middle[0], 0, middle[1]]), right, ahead, size, "asphalt", repeat_m=repeat)
+        parts = [ground] if self._style.ground else [NOTHING]
         if self._style.ceiling:
             above = np.array([middle[0], -self._style.ceiling, middle[1]])
             parts.append(panel(above, right, ahead, size, "plaster", repeat_m=repeat))

@@ -26,6 +26,7 @@ from neurove_core.bundle import PER_HEIGHT, Bundle
 from neurove_core.encoding import to_spikes
 from neurove_core.engine import Engine
 from neurove_core.estimator import Estimator
+from neurove_core.network import NeuroVE
 from neurove_core.training.batches import mirrored, noisy, regained
 from neurove_core.training.config import DataConfig, TrainingConfig
 from neurove_core.training.data import Cache, Sequences
@@ -114,7 +115,7 @@ def calibrate(bundle: Bundle, config: TrainingConfig, folder: Path, sequences: i
         sequences: how many.
 
     Raises:
-        BadModel: the configuration is of another model, or its linear part is not per metre of height.
+        BadModel: it is no NeuroVE or not of this configuration, or its linear part is not per metre of height.
         BrokenRecording: a sequence is missing or broken.
     """
     if (bundle.config.window, bundle.config.canonical) != (config.model.window, config.model.canonical):
@@ -140,7 +141,7 @@ def fitted(bundle: Bundle, watched: list[Watched], about: str) -> Calibrated:
     ratio = np.concatenate([np.abs(one.error) / sigma[:, None] for one, sigma in usual]).reshape(-1, 6)
     factor = np.quantile(ratio, LEVEL, axis=0) / half_width(LEVEL)
     weights = _fit(watched)
-    network = copy.deepcopy(bundle.network)
+    network = _copy(bundle)
     spread = network.add_spread()
     leak = 1 - float(torch.sigmoid(network.kappa_logit.detach()))
     with torch.no_grad():
@@ -155,7 +156,7 @@ def fitted(bundle: Bundle, watched: list[Watched], about: str) -> Calibrated:
 
 def watch(bundle: Bundle, parts: list[tuple[Sequences, bool]]) -> Iterator[Watched]:
     """Follow the model through all sequences, each seen in every way of SEEN; the bool says which are hard."""
-    probe = copy.deepcopy(bundle.network)
+    probe = _copy(bundle)
     width = probe.readout.in_features
     layer: nn.Linear = probe.add_spread(width + 1)
     with torch.no_grad():
@@ -236,6 +237,12 @@ def laplace_scale(inputs: Array, size: Array, penalty: float) -> Array:
             break
     weights: Array = w / np.append(np.full(x.shape[1] - 1, unit), 1.0)
     return weights
+
+
+def _copy(bundle: Bundle) -> NeuroVE:
+    if not isinstance(bundle.network, NeuroVE):
+        raise BadModel(bundle.name, f"kind={bundle.config.kind!r}: only a network of kind 'neurove' has an uncertainty")
+    return copy.deepcopy(bundle.network)
 
 
 def _fit(watched: list[Watched]) -> Array:
