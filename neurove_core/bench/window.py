@@ -44,7 +44,7 @@ def window(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool
             with plain():
                 for peer, theirs in others.items():
                     fires_alike = bool(torch.equal(peers.features(theirs, spikes), fired))
-                    equal[peer] = None if peer == "snnTorch" else fires_alike
+                    equal[peer] = None if peer in peers.ELSEWISE else fires_alike
             times = interleaved({**runs, "peak": machine.peak()}, rounds)
         limit_ms = times["peak"] * steps * machine.flops(config) / machine.PEAK_FLOPS
         found += rows(f"window {name}", times, equal, limit_ms)
@@ -71,7 +71,7 @@ def train(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool)
             runs[peer] = _inside_plain(step)
         loss = ours.loss()
         equal: dict[str, bool | None] = {
-            peer: None if peer == "snnTorch" else abs(value - loss) < 1e-4 * abs(loss) for peer, value in losses.items()
+            peer: None if peer in peers.ELSEWISE else abs(value - loss) < 1e-4 * abs(loss) for peer, value in losses.items()
         }
         found += rows(f"training step {name}, batch 4", interleaved(runs, rounds, warm_up=1), equal)
     return found
