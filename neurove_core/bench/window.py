@@ -71,7 +71,8 @@ def train(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool)
             runs[peer] = _inside_plain(step)
         loss = ours.loss()
         equal: dict[str, bool | None] = {
-            peer: None if peer in peers.ELSEWISE else abs(value - loss) < 1e-4 * abs(loss) for peer, value in losses.items()
+            peer: None if peer in peers.ELSEWISE else abs(value - loss) < 1e-4 * abs(loss)
+            for peer, value in losses.items()
         }
         found += rows(f"training step {name}, batch 4", interleaved(runs, rounds, warm_up=1), equal)
     return found
