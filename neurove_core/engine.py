@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
-from neurove_core import scan
+from neurove_core import int8, scan
 from neurove_core.activations import fused, sigmoid, tanh
 from neurove_core.cells import ASLSTM, ASLSTMParams, ASLSTMState, aslstm_step, readout_step
 from neurove_core.convolution import Convolution, convolution
@@ -46,7 +46,13 @@ class Engine:
         sizes = [(grid.height, grid.width), *network.map_sizes()]
         with torch.no_grad():
             self._lif: LIFParams = blocks[0].lif
-            self._convolutions = [_convolution(block, *size) for block, size in zip(blocks, sizes, strict=False)]
+            self._extractor, self._convolutions = None, []
+            if net.precision == "int8":
+                self._extractor = int8.Extractor(
+                    [_int8_layer(block, at=i) for i, block in enumerate(blocks)], sizes, self._lif
+                )
+            else:
+                self._convolutions = [_convolution(block, *size) for block, size in zip(blocks, sizes, strict=False)]
             self._project = _projection(network, net.channels[-1], *sizes[-1])
             self._readout = Folded(network.readout.weight.detach().clone(), network.readout.bias.detach().clone())
             self._kappa = float(torch.sigmoid(network.kappa_logit))
@@ -61,7 +67,8 @@ class Engine:
         """Velocities of T consecutive windows, and the state after them.
 
         Args:
-            spikes: (T, B, 2n, H, W), any layout; channels last is read as it lies.
+            spikes: (T, B, 2n, H, W), any layout; channels last is read as it lies. An int8 network takes
+                `encoding.to_codes` too.
             state: of these B streams, the network's or the engine's.
 
         Returns:
@@ -79,6 +86,8 @@ class Engine:
         return self._features(spikes, state)
 
     def _features(self, spikes: Tensor, state: NetworkState) -> tuple[Tensor, tuple[LIFState, ...]]:
+        if self._extractor is not None:
+            return self._extractor(spikes.flatten(0, 1), state.membranes)
         x = spikes.flatten(0, 1).contiguous(memory_format=torch.channels_last)
         fire = self._plain_fire if is_plain() else self._fused_fire
         membranes = []
@@ -136,6 +145,14 @@ def folded(weight: Tensor, norm: nn.BatchNorm1d | nn.BatchNorm2d) -> Folded:
 
 def _convolution(block: SpikingBlock, rows: int, columns: int) -> Convolution:
     return convolution(*folded(block.conv.weight, block.norm), rows, columns)
+
+
+def _int8_layer(block: SpikingBlock, at: int) -> int8.Layer:
+    """A block in whole numbers: the norm's factor takes the step of the weights, and that of the input, with it."""
+    weights = int8.quantised(block.conv.weight)
+    steps = weights.step.double() / (int8.LEVELS if at == 0 else 1)
+    factor, offset = folded(steps.view(-1, 1), block.norm)
+    return int8.Layer(weights, factor.view(-1).float(), offset.float())
 
 
 def _projection(network: NeuroVE, channels: int, rows: int, columns: int) -> Folded:

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from neurove_core import windows
 from neurove_core.bundle import PER_HEIGHT, Bundle
-from neurove_core.encoding import to_spikes
+from neurove_core.encoding import to_codes, to_spikes
 from neurove_core.engine import Engine
 from neurove_core.geometry import lookup_table
 from neurove_core.network import NetworkState
@@ -148,7 +148,8 @@ class Estimator:
 
     @torch.inference_mode()
     def _step(self, counts: NDArray[np.uint8], state: NetworkState) -> tuple[NDArray[np.float64], NetworkState]:
-        spikes = to_spikes(torch.from_numpy(counts)[None, None], self.config.network.encoding)
+        encode = to_codes if self.config.network.precision == "int8" else to_spikes
+        spikes = encode(torch.from_numpy(counts)[None, None], self.config.network.encoding)
         twists, state = self._engine(spikes, state)
         return twists[0, 0].double().numpy() * self._scale + self._offset, state
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from neurove_core import bundle
+from neurove_core import bundle, int8
 from neurove_core.bench import Row, interleaved, machine, peers, rows
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
 from neurove_core.engine import Engine
@@ -31,24 +31,45 @@ def window(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool
     shapes = {"tiny, T=3": (TINY, 3)} if quick else {"reference, T=8": (REFERENCE, 8), "shipped, T=1": (SHIPPED, 1)}
     found: list[Row] = []
     for name, (config, steps) in shapes.items():
-        network = _network(config)
-        spikes, rest = draw(config, steps), network.initial_state(1)
-        engine = Engine(network)
-        others = peers.networks(network, missing) if with_peers else {}
-        runs: dict[str, Callable[[], object]] = {"ours": lambda e=engine, s=spikes, r=rest: e(s, r)}  # type: ignore[misc]
-        for peer, theirs in {"PyTorch, plain": network, **others}.items():
-            runs[peer] = _plainly(theirs, spikes, rest)
-        with torch.inference_mode():
-            fired = engine.features(spikes, rest)[0]
-            equal: dict[str, bool | None] = {"PyTorch, plain": _agree(engine, network, spikes, rest)}
-            with plain():
-                for peer, theirs in others.items():
-                    fires_alike = bool(torch.equal(peers.features(theirs, spikes), fired))
-                    equal[peer] = None if peer in peers.ELSEWISE else fires_alike
-            times = interleaved({**runs, "peak": machine.peak()}, rounds)
-        limit_ms = times["peak"] * steps * machine.flops(config) / machine.PEAK_FLOPS
-        found += rows(f"window {name}", times, equal, limit_ms)
+        found += _windows(name, config, steps, rounds, missing, with_peers=with_peers)
+        found += _windows(
+            f"{name}, int8", with_precision(config, "int8"), steps, rounds, missing, with_peers=with_peers
+        )
     return found
+
+
+def with_precision(config: ModelConfig, precision: str) -> ModelConfig:
+    """The same network with its convolutions in float32 or int8."""
+    return config.model_copy(update={"network": config.network.model_copy(update={"precision": precision})})
+
+
+def _windows(
+    name: str, config: ModelConfig, steps: int, rounds: int, missing: peers.Missing, *, with_peers: bool
+) -> list[Row]:
+    """Where ours runs in int8 the peers run in float32, as their users do, and ours is compared to itself alone."""
+    network = _network(config)
+    quantised = config.network.precision == "int8"
+    in_float32 = _network(with_precision(config, "float32")) if quantised else network
+    spikes, rest = draw(config, steps), network.initial_state(1)
+    given = int8.codes(spikes) if quantised else spikes
+    engine = Engine(network)
+    others = peers.networks(in_float32, missing) if with_peers else {}
+    runs: dict[str, Callable[[], object]] = {"ours": lambda: engine(given, rest)}
+    for peer, theirs in {"PyTorch, plain": network, **others}.items():
+        runs[peer] = _plainly(theirs, spikes, rest)
+    with torch.inference_mode():
+        fired = engine.features(spikes, rest)[0]
+        equal: dict[str, bool | None] = {"PyTorch, plain": _agree(engine, network, spikes, rest)}
+        with plain():
+            for peer, theirs in others.items():
+                fires_alike = bool(torch.equal(peers.features(theirs, spikes), fired))
+                equal[peer] = None if quantised or peer in peers.ELSEWISE else fires_alike
+        if quantised:
+            wide = Engine(in_float32)
+            runs["ours, float32"], equal["ours, float32"] = lambda: wide(spikes, rest), None
+        times = interleaved({**runs, "peak": machine.peak()}, rounds)
+    limit_ms = None if quantised else times["peak"] * steps * machine.flops(config) / machine.PEAK_FLOPS
+    return rows(f"window {name}", times, equal, limit_ms)
 
 
 def train(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool) -> list[Row]:

@@ -33,6 +33,7 @@ WRONG = [
     (CanonicalConfig, "hfov_deg", 170.0, "less than 170"),
     (CanonicalConfig, "hfov_deg", float("nan"), "finite number"),
     (NetworkConfig, "encoding", "rate", "'binary' or 'log1p'"),
+    (NetworkConfig, "precision", "int4", "'float32' or 'int8'"),
     (NetworkConfig, "channels", (), "at least 1 item"),
     (NetworkConfig, "channels", (1,) * 9, "at most 8 items"),
     (NetworkConfig, "channels", (16, 0), "each must be 1 to 1024"),
