@@ -100,13 +100,12 @@ def train(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool)
 
 
 def streams(rounds: int, *, quick: bool) -> list[Row]:
-    """Eight streams on one core: one after the other, and their windows in one batch; milliseconds per window."""
+    """Streams on one core, milliseconds per window: eight in turn beside one alone, and several at once beside in turn."""
     config = TINY if quick else SHIPPED
     network = _network(config)
     engine = Engine(network)
     inputs = [draw(config, 1, seed=seed) for seed in range(8)]
     states = [network.initial_state(1) for _ in inputs]
-    together, joint = torch.cat(inputs, dim=1), network.initial_state(8)
 
     def in_turn() -> None:
         for index, spikes in enumerate(inputs):
@@ -116,12 +115,25 @@ def streams(rounds: int, *, quick: bool) -> list[Row]:
         for _ in inputs:
             states[0] = engine(inputs[0], states[0])[1]
 
-    times = interleaved({"ours": in_turn, "one stream": alone, "batch of 8": lambda: engine(together, joint)}, rounds)
-    batch, _ = engine(together, joint)
-    each = torch.cat([engine(spikes, network.initial_state(1))[0] for spikes in inputs], dim=1)
-    equal = bool(torch.allclose(batch, each, rtol=1e-3, atol=1e-4))
-    per_window = {name: value / len(inputs) for name, value in times.items()}
-    return rows("8 streams in turn, shipped, per window", per_window, {"one stream": True, "batch of 8": equal})
+    def at_once(count: int) -> Callable[[], object]:
+        joint, rest = torch.cat(inputs[:count], dim=1), [network.initial_state(1)] * count
+        return lambda: engine.together(joint, rest)
+
+    batches = {count: at_once(count) for count in (2, 4, 8)}
+    runs = {f"{count} at once": run for count, run in batches.items()}
+    times = interleaved({"in turn": in_turn, "one stream": alone, **runs}, rounds)
+    per_window = {name: value / int(name[0]) for name, value in times.items() if "at once" in name}
+    turn, one = (times[name] / len(inputs) for name in ("in turn", "one stream"))
+    each = [engine(spikes, network.initial_state(1))[0] for spikes in inputs]
+    joined = [twists for twists, _ in engine.together(torch.cat(inputs, dim=1), [network.initial_state(1)] * 8)]
+    equal = all(torch.allclose(a, b, rtol=1e-3, atol=1e-4) for a, b in zip(joined, each, strict=True))
+    return [
+        Row("8 streams in turn, shipped, per window", turn, "one stream", one, one / turn, None, True),
+        *(
+            Row(f"{name}, shipped, per window", ours, "streams in turn", turn, turn / ours, None, equal)
+            for name, ours in per_window.items()
+        ),
+    ]
 
 
 def draw(config: ModelConfig, steps: int, batch: int = 1, seed: int = 1) -> Tensor:

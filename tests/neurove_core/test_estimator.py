@@ -16,7 +16,7 @@ import neurove_core
 from neurove_core import bundle
 from neurove_core.bundle import Bundle
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from neurove_core.estimator import Answer, Estimator, StreamState, WindowEstimate
+from neurove_core.estimator import Answer, Estimator, Push, StreamState, WindowEstimate
 from protocol import CameraInfo, Events, Sensor
 from protocol.errors import BadModel, InvalidField
 from tests.builders import SENSOR, make_events
@@ -151,6 +151,33 @@ def test_streams_of_several_threads_share_an_estimator_and_are_answered_as_each_
         together = list(threads.map(lambda packets: feed(estimator, packets).estimates, streams))
     for one, other in zip(together, alone, strict=True):
         assert_same_estimates(one, other)
+
+
+@pytest.mark.parametrize("precision", ["float32", "int8"])
+def test_streams_pushed_at_once_are_answered_as_each_alone(precision):
+    """Streams of different ages, one with a hole and one without a window; in int8 equal bit for bit."""
+    estimator = Estimator(make_bundle(network=CONFIG.network.model_copy(update={"precision": precision})))
+    hole = [*windows_of_events(3), *windows_of_events(3, first=20)]
+    packets = [windows_of_events(6, seed=50), hole, [make_events(9, seed=1)] * 6, [Events.join(hole), *[tick(30)] * 5]]
+    alone = [feed(estimator, one) for one in packets]
+    states = [estimator.initial_state(SENSOR) for _ in packets]
+    together: list[list[Answer]] = []
+    for turn in zip(*packets, strict=True):
+        pushes = [Push(events, state, int(events.t[0])) for events, state in zip(turn, states, strict=True)]
+        answers = estimator.push_many(pushes)
+        states = [answer.state for answer in answers]
+        together.append(answers)
+    for stream, want in enumerate(alone):
+        got = [answers[stream] for answers in together]
+        estimates = list(chain.from_iterable(one.estimates for one in got))
+        assert [one[:2] for one in estimates] == [one[:2] for one in want.estimates]
+        assert [sum(one[2:][k] for one in got) for k in range(3)] == list(want[2:])
+        if precision == "int8":
+            assert_same_estimates(estimates, want.estimates)
+            assert_same_state(states[stream], want.state)
+        for one, other in zip(estimates, want.estimates, strict=True):
+            np.testing.assert_allclose(one.twists, other.twists, rtol=1e-3, atol=1e-4)
+    assert estimator.push_many([]) == []
 
 
 @pytest.mark.parametrize("as_one_packet", [True, False])
