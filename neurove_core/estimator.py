@@ -1,4 +1,4 @@
-"""Estimator.push, the one entry for inference, with the windows and encoding of training; push_many, of many streams."""
+"""Estimator.push, the one entry for inference: the windows and encoding of training; push_many, many streams at once."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field

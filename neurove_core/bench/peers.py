@@ -132,15 +132,17 @@ def _norse(missing: Missing) -> Neurons | None:
     def neurons(block: SpikingBlock) -> tuple[Callable[[Tensor], Tensor], Callable[[], None]]:
         share = 1 - block.lif.decay
         with torch.no_grad():  # v + share (i - v): the norm before it makes up for the share of the current
-            block.norm.weight /= share
-            block.norm.bias /= share
+            block.norm.weight.div_(share)
+            block.norm.bias.div_(share)
         params = module.LIFBoxParameters(tau_mem_inv=torch.tensor(share), v_th=torch.tensor(block.lif.v_th))
-        cell, state = module.LIFBoxCell(params, dt=1.0), []
+        cell = module.LIFBoxCell(params, dt=1.0)
+        state: list[Any] = []
 
         def fire(current: Tensor) -> Tensor:
+            spikes: Tensor
             spikes, after = cell(current, *state)
             state[:] = [after]
-            return spikes  # type: ignore[no-any-return]  # norse is untyped
+            return spikes
 
         return fire, state.clear
 

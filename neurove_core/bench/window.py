@@ -100,7 +100,7 @@ def train(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool)
 
 
 def streams(rounds: int, *, quick: bool) -> list[Row]:
-    """Streams on one core, milliseconds per window: eight in turn beside one alone, and several at once beside in turn."""
+    """Streams on one core, milliseconds per window: eight in turn beside one alone, several at once beside in turn."""
     config = TINY if quick else SHIPPED
     network = _network(config)
     engine = Engine(network)

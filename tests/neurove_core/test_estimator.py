@@ -305,6 +305,37 @@ def test_a_stream_keeps_as_many_windows_to_prime_with_as_its_model_needs_and_no_
     assert (len(state.recent), state.age) == (settle, 11)
 
 
+def arrays_of(value) -> list[np.ndarray]:
+    """All arrays of nested tuples, with the tensors among them as arrays."""
+    if isinstance(value, torch.Tensor):
+        return [value.numpy()]
+    if isinstance(value, np.ndarray):
+        return [value]
+    return [one for part in value for one in arrays_of(part)] if isinstance(value, tuple) else []
+
+
+@pytest.mark.parametrize(
+    ("sensor", "grid", "most_mib"),
+    [
+        (Sensor(346, 260), CanonicalConfig(), 8),
+        (Sensor(346, 260), CanonicalConfig(width=173, height=130), 8),
+        (Sensor(1280, 720), CanonicalConfig(), 40),
+        (Sensor(1280, 720), CanonicalConfig(width=320, height=180), 40),
+    ],
+    ids=str,
+)
+def test_a_stream_that_has_run_for_long_holds_a_bounded_state(sensor, grid, most_mib):
+    estimator = Estimator(bundle.untrained(0, ModelConfig(canonical=grid)))
+    state, sizes = estimator.initial_state(sensor), []
+    for k in range(20):  # more than the 16 windows that prime another model
+        events = make_events(50, seed=k, sensor=sensor, start_us=k * 50_000, duration_us=50_000)
+        state = estimator.push(events, state, k * 50_000).state
+        whole = {id(array.base if array.base is not None else array): array for array in arrays_of(state)}
+        sizes.append(sum((array.base if array.base is not None else array).nbytes for array in whole.values()))
+    assert sizes[-1] == sizes[-2]
+    assert sizes[-1] < most_mib << 20
+
+
 def test_a_model_that_is_fit_warms_up_and_answers_as_before():
     cold, warm = Estimator(make_bundle()), Estimator(make_bundle())
     warm.warm_up()
