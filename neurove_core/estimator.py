@@ -1,4 +1,4 @@
-"""Estimator.push, the one entry for inference: the windows and encoding of training; push_many, many streams at once."""
+"""Estimator.push: the one entry for inference; windows and encoding as in training. push_many: many streams at once."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
