@@ -279,7 +279,7 @@ def _take_statistics(network: Network, spikes: Tensor) -> None:
         norm.momentum = momentum
 
 
-def _network(header: Header) -> NeuroVE:
+def _network(header: Header) -> Network:
     network = networks.make(header.config)
     if header.uncertainty is not None and isinstance(network, NeuroVE):
         network.add_spread()

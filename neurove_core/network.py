@@ -5,9 +5,11 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import conv2d
 
 from neurove_core.cells import ASLSTM, ASLSTMState, readout_step
 from neurove_core.config import ModelConfig
+from neurove_core.int8 import rounded, rounded_input
 from neurove_core.neurons import LIFParams, LIFState, diffuse, lif_scan
 
 
@@ -28,20 +30,25 @@ class SpikingBlock(nn.Module):
     """Convolution of stride 2, threshold-dependent batch norm (tdBN, Zheng 2021), LIF.
 
     Differs: tdBN's factor v_th is the initial value of the norm's learnable weight, which spans the same functions.
+    With `int8` the convolution's weights are rounded to 8 bits, in training too (decision 38).
     """
 
-    def __init__(self, inputs: int, outputs: int, lif: LIFParams) -> None:
+    def __init__(self, inputs: int, outputs: int, lif: LIFParams, *, int8: bool = False) -> None:
         super().__init__()
         self.conv = nn.Conv2d(inputs, outputs, 3, stride=2, padding=1, bias=False)
         self.norm = nn.BatchNorm2d(outputs)
         nn.init.constant_(self.norm.weight, lif.v_th)
         self.lif = lif
+        self._int8 = int8
 
     def forward(self, spikes: Tensor, state: LIFState) -> tuple[Tensor, LIFState]:
         """(T, B, C, H, W) to (T, B, C', H', W'); the norm's statistics run over time and batch together."""
         steps, batch = spikes.shape[:2]
         frames = spikes.flatten(0, 1).contiguous(memory_format=torch.channels_last)  # a convolution's own order on CPUs
-        current = self.norm(self.conv(frames))
+        if self._int8:
+            current = self.norm(conv2d(frames, rounded(self.conv.weight), stride=2, padding=1))
+        else:
+            current = self.norm(self.conv(frames))
         return lif_scan(current.unflatten(0, (steps, batch)), state, self.lif)
 
 
@@ -58,7 +65,8 @@ class NeuroVE(nn.Module):
         self.bins = config.window.bins
         lif = LIFParams(net.decay, net.v_th, net.surrogate, net.surrogate_width * net.v_th)
         widths = (2 * self.bins, *net.channels)
-        self.blocks = nn.ModuleList(SpikingBlock(a, b, lif) for a, b in itertools.pairwise(widths))
+        self._int8 = net.precision == "int8"
+        self.blocks = nn.ModuleList(SpikingBlock(a, b, lif, int8=self._int8) for a, b in itertools.pairwise(widths))
         rows, columns = self.map_sizes()[-1]
         self.project = nn.Linear(net.channels[-1] * rows * columns, net.features, bias=False)
         self.project_norm = nn.BatchNorm1d(net.features)
@@ -142,6 +150,8 @@ class NeuroVE(nn.Module):
             twists (T, B, n, 6) in scaled units: vx vy vz wx wy wz, one per bin; and the next state.
         """
         steps, batch = spikes.shape[:2]
+        if self._int8:
+            spikes = rounded_input(spikes)
         membranes = []
         for block, membrane in zip(self.blocks, state.membranes, strict=True):
             spikes, membrane = block(spikes, membrane)

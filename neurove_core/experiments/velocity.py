@@ -23,8 +23,8 @@ from protocol.errors import InvalidField
 METHODS: Final[dict[str, dict[str, Any]]] = {
     "nve": {},
     "nve-wo": {"network": {"diffusion": False}},
-    "ann": {"kind": "ann"},
-    "snn-ang": {"kind": "snn-ang", "network": {"channels": CHANNELS}},
+    "ann": {"kind": "ann", "network": {"precision": "float32"}},
+    "snn-ang": {"kind": "snn-ang", "network": {"channels": CHANNELS, "precision": "float32"}},
 }
 """What of the model's configuration each method changes; nothing else differs between them."""
 

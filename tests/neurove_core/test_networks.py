@@ -11,7 +11,7 @@ from torch import nn
 from neurove_core import bundle, carried, golden, networks
 from neurove_core.bundle import PER_HEIGHT
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
-from neurove_core.estimator import Estimator
+from neurove_core.estimator import Estimator, Push
 from neurove_core.evaluation import answer, judge, report
 from neurove_core.io import open_source
 from neurove_core.snn_ang import CHANNELS, OUTPUT_TAU_STEPS
@@ -20,7 +20,9 @@ from neurove_core.training.config import DataConfig, RecipeConfig, TrainingConfi
 from neurove_core.training.loop import train
 from neurove_core.training.ranks import ALONE, share_norms
 from neurove_core.uncertainty import Uncertainty
+from protocol import Sensor
 from protocol.errors import BadModel
+from tests.builders import make_events
 
 SOURCE = "sim://street?seed=4&seconds=1.2&camera=pinhole:24x18:75&height=2"
 each_kind = pytest.mark.parametrize("kind", list(networks.KINDS))
@@ -142,6 +144,22 @@ def test_snn_ang_halves_its_image_four_times_and_no_more():
     network = networks.make(config_of("snn-ang", channels=CHANNELS))
     sizes = [tuple(one.v.shape[1:]) for one in network.initial_state(1).membranes]
     assert sizes == [(16, 8, 11), (32, 4, 6), (64, 2, 3), (128, 1, 2), (256, 1, 2)]
+
+
+@each_kind
+def test_streams_answered_together_are_those_answered_alone(kind):
+    estimator, sensor = Estimator(bundle.untrained(2, config_of(kind))), Sensor(22, 16)
+    seen = [make_events(2_000, sensor=sensor, duration_us=120_000, seed=seed) for seed in range(3)]
+    pushes = [Push(events, estimator.initial_state(sensor), 120_000) for events in seen]
+    for push, together in zip(pushes, estimator.push_many(pushes), strict=True):
+        for one, other in zip(estimator.push(*push).estimates, together.estimates, strict=True):
+            np.testing.assert_allclose(other.twists, one.twists, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["ann", "snn-ang"])
+def test_a_baseline_in_int8_is_refused(kind):
+    with pytest.raises(ValueError, match=f"network.precision='int8': kind='{kind}' has float32 alone"):
+        ModelConfig(kind=kind, network=NetworkConfig(precision="int8"))
 
 
 @each_kind

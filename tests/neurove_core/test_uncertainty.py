@@ -10,7 +10,7 @@ import torch
 from neurove_core import bundle, golden
 from neurove_core.bundle import PER_HEIGHT
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from neurove_core.estimator import Estimator
+from neurove_core.estimator import Estimator, Push
 from neurove_core.training import calibration
 from neurove_core.training.calibration import Watched, fitted, laplace_scale, seen_in_all_ways
 from neurove_core.training.config import TrainingConfig
@@ -124,6 +124,22 @@ def test_a_covariance_is_symmetric_positive_definite_and_grows_with_the_square_o
         assert (one.covariance == one.covariance.T).all()
         assert np.linalg.eigvalsh(one.covariance)[0] > 0
         np.testing.assert_allclose(other.covariance, one.covariance * np.outer(metres, metres))
+
+
+@pytest.mark.parametrize("precision", ["float32", "int8"])
+def test_streams_that_are_answered_together_have_the_covariances_of_each_alone(precision):
+    config = SMALL.model_copy(update={"network": SMALL.network.model_copy(update={"precision": precision})})
+    model = replace(bundle.untrained(1, config), linear_unit=PER_HEIGHT)
+    estimator = Estimator(fitted(model, list(wild(np.random.default_rng(0), 16)), "a test").bundle)
+    estimator.warm_up()
+    seen = [make_events(3_000, sensor=SENSOR, duration_us=60_000, seed=seed) for seed in range(3)]
+    pushes = [Push(events, estimator.initial_state(SENSOR, TWO_METRES), 60_000) for events in seen]
+    for push, together in zip(pushes, estimator.push_many(pushes), strict=True):
+        alone = estimator.push(*push)
+        assert len(alone.estimates) == len(together.estimates) > 0
+        for one, other in zip(alone.estimates, together.estimates, strict=True):
+            np.testing.assert_allclose(other.twists, one.twists, rtol=1e-4, atol=1e-5)
+            np.testing.assert_allclose(other.covariance, one.covariance, rtol=1e-4)
 
 
 def test_an_estimate_is_uncertain_where_its_sigma_is_too_large_for_its_speed():
