@@ -13,16 +13,18 @@ from typing import Any, Final, Literal, Self
 
 import safetensors.torch
 import torch
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, ValidationInfo, field_validator
 from safetensors import SafetensorError
 from torch import Tensor, nn
 
-from neurove_core import golden
+from neurove_core import golden, networks
 from neurove_core.about import About, Limits
-from neurove_core.config import ModelConfig
+from neurove_core.config import Config, ModelConfig
 from neurove_core.files import write_whole
 from neurove_core.golden import Golden
 from neurove_core.network import NeuroVE
+from neurove_core.networks import Network
+from neurove_core.uncertainty import Uncertainty, why_no_correlation
 from protocol.control import ModelInfo
 from protocol.errors import BadModel, shown
 
@@ -37,7 +39,14 @@ METRIC: Final[LinearUnit] = "m/s"
 PER_HEIGHT: Final[LinearUnit] = "1/s per m of height"
 
 _KEY = "neurove"
-_OFFSET, _SCALE = "output.offset", "output.scale"
+_OFFSET, _SCALE, _CORRELATION = "output.offset", "output.scale", "output.correlation"
+
+
+class UncertaintyHeader(Config):
+    """That a bundle has a spread (tensors spread.weight, spread.bias, output.correlation), and how it came to it."""
+
+    uncertain_above: float = Field(gt=0, description="Linear sigma over speed from which an estimate is uncertain.")
+    provenance: str = Field(max_length=1000, description="One line: how it was calibrated.")
 
 
 class Header(About):
@@ -52,6 +61,15 @@ class Header(About):
         METRIC, description="Of the linear part: m/s, or to be multiplied by the camera's height above the ground [m]."
     )
     golden_tolerance: float | None = Field(None, gt=0, le=1, description="Of the golden test, where there is one.")
+    uncertainty: UncertaintyHeader | None = Field(None, description="How far off its answers may be, where it knows.")
+
+    @field_validator("uncertainty")
+    @classmethod
+    def _of_a_neurove(cls, value: UncertaintyHeader | None, info: ValidationInfo) -> UncertaintyHeader | None:
+        config = info.data.get("config")
+        if value is not None and config is not None and config.kind != "neurove":
+            raise ValueError(f"a network of kind={config.kind!r} has none")
+        return value
 
 
 @dataclass(frozen=True)
@@ -62,12 +80,13 @@ class Bundle:
     trained: bool
     provenance: str
     config: ModelConfig
-    network: NeuroVE
+    network: Network
     offset: Tensor  # (6): twist = network output * scale + offset, in linear_unit and rad/s
     scale: Tensor  # (6)
     linear_unit: LinearUnit = METRIC
     about: About = field(default_factory=About)
     golden: Golden | None = None  # none: the model can not be tested on another machine, and passes unseen
+    uncertainty: Uncertainty | None = None  # where there is one, the network has a spread
     digest: str = ""  # sha256 of the bundle's bytes, hex
 
     @property
@@ -109,12 +128,21 @@ class Bundle:
             config=self.config,
             linear_unit=self.linear_unit,
             golden_tolerance=self.golden.tolerance if self.golden else None,
+            uncertainty=self.uncertainty
+            and UncertaintyHeader(
+                uncertain_above=self.uncertainty.uncertain_above, provenance=self.uncertainty.provenance
+            ),
             **dict(self.about),
         )
-        untold = About.model_fields.keys() - self.about.told() | (set() if self.golden else {"golden_tolerance"})
+        without = {"golden_tolerance": self.golden is None, "uncertainty": self.uncertainty is None}
+        untold = About.model_fields.keys() - self.about.told() | {
+            name for name, left_out in without.items() if left_out
+        }
         tensors = {**_stored(self.network), _OFFSET: self.offset, _SCALE: self.scale}
         if self.golden:
             tensors |= golden.packed(self.golden)
+        if self.uncertainty is not None:
+            tensors[_CORRELATION] = self.uncertainty.correlation
         return safetensors.torch.save(tensors, {_KEY: header.model_dump_json(exclude=untold)})
 
     def with_digest(self) -> Self:
@@ -157,10 +185,13 @@ def from_bytes(data: bytes, name: str) -> Bundle:
         raise BadModel(name, f"not a whole safetensors file: {error}") from None
     test = golden.unpacked(tensors, header.config, header.golden_tolerance, name)
     with torch.device("meta"):  # shapes alone: a header of a few bytes may declare terabytes of weights
-        wanted = {**_stored(NeuroVE(header.config)), _OFFSET: torch.zeros(6), _SCALE: torch.ones(6)}
+        wanted = {**_stored(_network(header)), _OFFSET: torch.zeros(6), _SCALE: torch.ones(6)}
+        if header.uncertainty is not None:
+            wanted[_CORRELATION] = torch.eye(6)
     _check_tensors(tensors, wanted, name)
-    network = NeuroVE(header.config)
+    network = _network(header)
     offset, scale = tensors.pop(_OFFSET), tensors.pop(_SCALE)
+    uncertainty = _uncertainty(header.uncertainty, tensors.pop(_CORRELATION, None), name)
     network.load_state_dict(tensors, strict=False)  # names are checked; only the norms' batch counters are not stored
     return Bundle(
         name=header.name,
@@ -173,6 +204,7 @@ def from_bytes(data: bytes, name: str) -> Bundle:
         linear_unit=header.linear_unit,
         about=About(**{told: getattr(header, told) for told in About.model_fields}),
         golden=test,
+        uncertainty=uncertainty,
         digest=hashlib.sha256(data).hexdigest(),
     )
 
@@ -223,7 +255,7 @@ def untrained(seed: int = 0, config: ModelConfig | None = None, name: str = "unt
     config = config or ModelConfig()
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        network = NeuroVE(config)
+        network = networks.make(config)
         shape = (8, 4, 2 * config.window.bins, config.canonical.height, config.canonical.width)
         _take_statistics(network, torch.poisson(torch.full(shape, 0.3)).log1p())
     return Bundle(
@@ -237,7 +269,7 @@ def untrained(seed: int = 0, config: ModelConfig | None = None, name: str = "unt
     ).with_digest()
 
 
-def _take_statistics(network: NeuroVE, spikes: Tensor) -> None:
+def _take_statistics(network: Network, spikes: Tensor) -> None:
     momenta = {
         layer: layer.momentum for layer in network.modules() if isinstance(layer, nn.BatchNorm1d | nn.BatchNorm2d)
     }
@@ -249,7 +281,23 @@ def _take_statistics(network: NeuroVE, spikes: Tensor) -> None:
         norm.momentum = momentum
 
 
-def _stored(network: NeuroVE) -> dict[str, Tensor]:
+def _network(header: Header) -> Network:
+    network = networks.make(header.config)
+    if header.uncertainty is not None and isinstance(network, NeuroVE):
+        network.add_spread()
+    return network
+
+
+def _uncertainty(header: UncertaintyHeader | None, correlation: Tensor | None, name: str) -> Uncertainty | None:
+    if header is None or correlation is None:
+        return None
+    why = why_no_correlation(correlation)
+    if why:
+        raise BadModel(name, f"tensor {_CORRELATION!r} {why}")
+    return Uncertainty(correlation, header.uncertain_above, header.provenance)
+
+
+def _stored(network: Network) -> dict[str, Tensor]:
     return {
         name: tensor.contiguous()
         for name, tensor in network.state_dict().items()

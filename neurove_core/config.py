@@ -55,6 +55,9 @@ class NetworkConfig(Config):
     """The network of paper section III: spiking feature extractor and velocity estimator."""
 
     encoding: Literal["binary", "log1p"] = Field("log1p", description="Counts to input: 0/1, or log(1 + count).")
+    precision: Literal["float32", "int8"] = Field(
+        "float32", description="Of the convolutions; int8 rounds their weights to 8 bits and the input to 1/32."
+    )
     channels: Annotated[tuple[int, ...], Field(min_length=1, max_length=8)] = (16, 32, 64, 64)
     features: int = Field(128, ge=1, le=4096, description="Width of the layer between extractor and estimator.")
     hidden: int = Field(128, ge=1, le=4096, description="Units of each ASLSTM cell.")
@@ -76,8 +79,17 @@ class NetworkConfig(Config):
 class ModelConfig(Config):
     """Everything that shapes a model and its input."""
 
+    kind: Literal["neurove", "ann", "snn-ang"] = Field(
+        "neurove", description="Which network: NeuroVE, the equal-size one without spikes, or SNN-ANG; see networks."
+    )
     window: WindowConfig = WindowConfig()
     canonical: CanonicalConfig = CanonicalConfig()
     network: NetworkConfig = NetworkConfig()
     settle_windows: int = Field(16, ge=0, le=256, description="Windows until a fresh state is settled.")
     low_activity_events: int = Field(200, ge=0, description="A window with fewer events is flagged low_activity.")
+
+    @model_validator(mode="after")
+    def _int8_is_neuroves(self) -> Self:
+        if self.kind != "neurove" and self.network.precision != "float32":
+            raise ValueError(f"network.precision={self.network.precision!r}: kind={self.kind!r} has float32 alone")
+        return self

@@ -31,10 +31,10 @@ def convolution(weight: Tensor, bias: Tensor, rows: int, columns: int) -> Convol
         packed = _packed(weight, bias, rows, columns)
         agrees = _agrees(tuple(weight.shape), rows, columns)
     except (AttributeError, RuntimeError, NotImplementedError, TypeError) as error:
-        _say_once(str(error).partition("\n")[0])
+        say_once("packed convolutions", str(error).partition("\n")[0])
         return plain_convolution(weight, bias)
     if not agrees:
-        _say_once("it computes something else")
+        say_once("packed convolutions", "they compute something else")
         return plain_convolution(weight, bias)
     return packed
 
@@ -78,10 +78,11 @@ def _agrees(shape: tuple[int, ...], rows: int, columns: int) -> bool:
 
 
 @functools.cache
-def _say_once(reason: str) -> None:
-    log.warning("packed convolutions are off, plain ones serve: reason=%s", reason)
+def say_once(what: str, reason: str) -> None:
+    """Log that a fast form is off, once for each reason."""
+    log.warning("%s are off, plain ones serve: reason=%s", what, reason)
 
 
 def forget_warnings() -> None:
     """Say it again at the next load."""
-    _say_once.cache_clear()
+    say_once.cache_clear()

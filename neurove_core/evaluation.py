@@ -12,8 +12,11 @@ from neurove_core.geometry import Twists
 from neurove_core.io.packets import slices
 from neurove_core.io.recording import Recording
 from neurove_core.metrics import ANGULAR_FLOOR_RAD_S, LINEAR_FLOOR_M_S, SKIP_S, figures
-from neurove_core.network import NetworkState
+from neurove_core.networks import State, fired
+from neurove_core.uncertainty import LEVEL, LEVELS, coverage
+from protocol.camera import CameraInfo
 from protocol.errors import NeuroVEError
+from protocol.velocity import AXES
 
 _SAMPLES = 4  # of the truth in each bin, whose mean is the bin's
 _STREAM = "evaluate"
@@ -34,9 +37,12 @@ class Answers:
     bin_us: int
     twists: NDArray[np.float64]  # (W, n, 6) [m/s, rad/s]
     events: NDArray[np.int64]  # (W,)
+    low_activity: NDArray[np.bool_]  # (W,) as the service flags it
     latency_ms: NDArray[np.float64]  # (W,) of the push that completed each
-    firing_rate: dict[str, float]  # share of neurons that fire per step, by layer; and of all of them
+    firing_rate: dict[str, float]  # share of neurons that fire per step, by layer and of all; or empty
     scaled: bool  # the linear part is in m/s; else as if the camera were 1 m above the ground
+    sigma: NDArray[np.float64] | None = None  # (W, 6) of each window's twists; None where the model has no uncertainty
+    uncertain: NDArray[np.bool_] | None = None  # (W,) which windows are flagged so
 
 
 @dataclass(frozen=True)
@@ -47,19 +53,26 @@ class Judged:
     end_us: NDArray[np.int64]  # (N,) of the bins
     truth: NDArray[np.float64]  # (N, 6)
     answer: NDArray[np.float64]  # (N, 6)
+    sigma: NDArray[np.float64] | None = None  # (N, 6), or None
+    uncertain: NDArray[np.bool_] | None = None  # (N,), or None
 
 
-def answer(estimator: Estimator, recording: Recording) -> Answers:
+def answer(estimator: Estimator, recording: Recording, camera: CameraInfo | None = None) -> Answers:
     """Run a model over a recording, packet by packet as a driver sends it.
 
+    Args:
+        estimator: the model.
+        recording: what it sees.
+        camera: its lens, by default what the recording tells of it.
+
     Raises:
-        BrokenRecording: it can not be read to its end.
+        BrokenRecording: it can not be read to its end. InvalidField: the lens is of another sensor.
     """
-    camera = recording.camera(_STREAM)
+    camera = camera or recording.camera(_STREAM)
     state = estimator.initial_state(recording.sensor, camera)
     found: list[WindowEstimate] = []
     latencies_ms: list[float] = []
-    fired = _Fired(estimator)
+    fired = _Fired()
     for piece in slices(recording.chunks()):
         began = time.perf_counter()
         pushed = estimator.push(piece.events, state, piece.t0_us)
@@ -76,32 +89,36 @@ def answer(estimator: Estimator, recording: Recording) -> Answers:
         bin_us=estimator.config.window.bin_us,
         twists=np.stack([one.twists for one in found]) if found else np.zeros((0, bins, 6)),
         events=np.array([one.events for one in found], np.int64),
+        low_activity=np.array([one.low_activity for one in found], np.bool_),
         latency_ms=np.array(latencies_ms),
         firing_rate=fired.rates(),
         scaled=camera is not None and camera.height_m is not None,
+        sigma=_sigmas(found),
+        uncertain=None if _sigmas(found) is None else np.array([one.uncertain for one in found], np.bool_),
     )
 
 
+def _sigmas(found: list[WindowEstimate]) -> NDArray[np.float64] | None:
+    covariances = [one.covariance for one in found if one.covariance is not None]
+    return np.sqrt(np.stack([np.diagonal(one) for one in covariances])) if covariances else None
+
+
 class _Fired:
-    """How often neurons fire, as their state tells it: a membrane that has just fired is exactly 0."""
+    """How often neurons fire, as their state tells it."""
 
-    def __init__(self, estimator: Estimator) -> None:
-        net = estimator.config.network
-        self._layers = [f"block {i + 1}" for i in range(len(net.channels))]
-        self._layers += [f"cell {i + 1}" for i in range(net.cells)]
-        self._spikes, self._neurons, self._steps = np.zeros(len(self._layers)), np.zeros(len(self._layers)), 0
+    def __init__(self) -> None:
+        self._spikes, self._neurons = dict[str, int](), dict[str, int]()
 
-    def add(self, state: NetworkState) -> None:
-        layers = [one.v == 0 for one in state.membranes] + [one.s > 0 for one in state.cells]
-        self._spikes += [float(fired.sum()) for fired in layers]
-        self._neurons = np.array([float(fired.numel()) for fired in layers])
-        self._steps += 1
+    def add(self, state: State) -> None:
+        for layer, spikes in fired(state).items():
+            self._spikes[layer] = self._spikes.get(layer, 0) + int(spikes.sum())
+            self._neurons[layer] = self._neurons.get(layer, 0) + spikes.numel()
 
     def rates(self) -> dict[str, float]:
-        if not self._steps:
+        if not self._spikes:
             return {}
-        rates = dict(zip(self._layers, (self._spikes / self._neurons / self._steps).tolist(), strict=True))
-        return rates | {"all": float(self._spikes.sum() / self._neurons.sum() / self._steps)}
+        rates = {layer: spikes / self._neurons[layer] for layer, spikes in self._spikes.items()}
+        return rates | {"all": sum(self._spikes.values()) / sum(self._neurons.values())}
 
 
 def judge(answers: Answers, truth: Twists) -> Judged:
@@ -122,7 +139,9 @@ def judge(answers: Answers, truth: Twists) -> Judged:
         why = f"of its {windows} windows none lies after the first {SKIP_S:g} s and within the truth"
         raise NoTruth(f"{answers.name}: {why}", windows=windows)
     ends = (answers.start_us[:, None] + answers.bin_us * (np.arange(bins) + 1))[kept].ravel()
-    return Judged(answers, ends, true[kept].reshape(-1, 6), answers.twists[kept].reshape(-1, 6))
+    sigma = None if answers.sigma is None else np.repeat(answers.sigma[kept], bins, axis=0)
+    uncertain = None if answers.uncertain is None else np.repeat(answers.uncertain[kept], bins)
+    return Judged(answers, ends, true[kept].reshape(-1, 6), answers.twists[kept].reshape(-1, 6), sigma, uncertain)
 
 
 def report(judged: list[Judged]) -> dict[str, Any]:
@@ -136,7 +155,7 @@ def report(judged: list[Judged]) -> dict[str, Any]:
     rates = [one.answers.firing_rate for one in judged]
     every = {layer: float(np.mean([rate[layer] for rate in rates])) for layer in rates[0]}
     return figures(truth, said, bins) | {
-        "firing_rate": every.pop("all"),
+        "firing_rate": every.pop("all", None),
         "firing_rate_by_layer": every,
         "latency_ms": {f"p{q}": float(np.percentile(latency_ms, q)) for q in (50, 99)},
         "re_floors": {"v_l_m_s": LINEAR_FLOOR_M_S, "v_a_rad_s": ANGULAR_FLOOR_RAD_S},
@@ -144,5 +163,37 @@ def report(judged: list[Judged]) -> dict[str, Any]:
         "scaled": all(one.answers.scaled for one in judged),
         "zero": figures(truth, np.zeros_like(truth), bins),
         "mean": figures(truth, np.broadcast_to(truth.mean(0), truth.shape), bins),
-        "recordings": [{"name": one.answers.name} | figures(one.truth, one.answer, bins) for one in judged],
+        "uncertainty": reliability(judged),
+        "recordings": [
+            {"name": one.answers.name} | figures(one.truth, one.answer, bins) | {"uncertainty": reliability([one])}
+            for one in judged
+        ],
+    }
+
+
+def reliability(judged: list[Judged]) -> dict[str, Any] | None:
+    """How often the truth lies within the intervals that the estimates claim; None where some claim nothing.
+
+    `coverage` has, by axis, the measured share for each nominal one; `per_axis` the measured share for LEVEL alone, the
+    median sigma, and the root mean square of error over sigma: 1 for errors that are normal and of the claimed size.
+    """
+    claimed = [one.sigma for one in judged if one.sigma is not None]
+    flagged = [one.uncertain for one in judged if one.uncertain is not None]
+    if len(claimed) < len(judged):
+        return None
+    sigma, error = np.concatenate(claimed), np.concatenate([one.answer - one.truth for one in judged])
+    measured = {level: coverage(error, sigma, level) for level in LEVELS}
+    middle, ratio = np.median(sigma, axis=0), np.sqrt(((error / sigma) ** 2).mean(0))
+    return {
+        "level": LEVEL,
+        "uncertain_share": float(np.concatenate(flagged).mean()),
+        "coverage": {axis: {str(n): float(one[i]) for n, one in measured.items()} for i, axis in enumerate(AXES)},
+        "per_axis": {
+            axis: {
+                "coverage": float(measured[LEVEL][i]),
+                "median_sigma_rad_s" if i >= 3 else "median_sigma_m_s": float(middle[i]),
+                "error_over_sigma_rms": float(ratio[i]),
+            }
+            for i, axis in enumerate(AXES)
+        },
     }

@@ -1,11 +1,13 @@
-"""Truth and estimate over time, axis by axis, with the error below."""
+"""Truth and estimate over time, axis by axis, with the error beside; how reliable the claimed uncertainty is."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from neurove_core.evaluation import Judged
 from neurove_core.figures import blank_figure, save_figure
+from neurove_core.uncertainty import LEVEL, half_width
 from protocol.velocity import AXES
 
 _GAP_S = 0.2  # lines are broken where windows are missing for so long
@@ -30,6 +32,11 @@ def plot(judged: Judged, folder: Path) -> list[Path]:
         ):
             panel.plot(np.insert(t_s, holes, np.nan), np.insert(values, holes, np.nan), label=label, linewidth=0.9)
             panel.grid(visible=True, alpha=0.3)
+        if judged.sigma is not None:
+            wide = half_width(LEVEL) * judged.sigma[:, i]
+            low, high = judged.answer[:, i] - wide, judged.answer[:, i] + wide
+            gone = (np.insert(t_s, holes, np.nan), np.insert(low, holes, np.nan), np.insert(high, holes, np.nan))
+            beside.fill_between(*gone, alpha=0.2, color="C1", linewidth=0, label=f"{LEVEL:.0%} interval")
         beside.set_ylabel(f"{axis} [{unit}]")
         error.axhline(0, color="black", linewidth=0.5)
     panels[0, 0].legend(loc="upper right")
@@ -40,3 +47,26 @@ def plot(judged: Judged, folder: Path) -> list[Path]:
     folder.mkdir(parents=True, exist_ok=True)
     stem = "".join(c if c.isalnum() or c in "-_." else "_" for c in judged.answers.name)
     return save_figure(figure, folder / stem)
+
+
+def plot_reliability(told: dict[str, Any], folder: Path) -> list[Path]:
+    """Write `reliability.png` and `.svg`: nominal against measured coverage of each axis; returns the files.
+
+    Args:
+        told: what `evaluation.reliability` says of all recordings together.
+        folder: where to.
+
+    Raises:
+        MissingExtra: matplotlib is not installed. InvalidField: a file can not be written.
+    """
+    figure = blank_figure(6, 6)
+    panel = figure.subplots()
+    panel.plot([0, 1], [0, 1], color="black", linewidth=0.8, label="as claimed")
+    for axis, measured in told["coverage"].items():
+        nominal = [float(level) for level in measured]
+        panel.plot(nominal, list(measured.values()), marker="o", markersize=4, linewidth=1, label=axis)
+    panel.set(xlim=(0.4, 1.01), ylim=(0.4, 1.01), xlabel="nominal coverage", ylabel="measured coverage", aspect="equal")
+    panel.grid(visible=True, alpha=0.3)
+    panel.legend(loc="lower right")
+    folder.mkdir(parents=True, exist_ok=True)
+    return save_figure(figure, folder / "reliability")

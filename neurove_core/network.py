@@ -5,9 +5,11 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import conv2d
 
 from neurove_core.cells import ASLSTM, ASLSTMState, readout_step
 from neurove_core.config import ModelConfig
+from neurove_core.int8 import rounded, rounded_input
 from neurove_core.neurons import LIFParams, LIFState, diffuse, lif_scan
 
 
@@ -16,7 +18,7 @@ class NetworkState(NamedTuple):
 
     membranes: tuple[LIFState, ...]  # one per block of the feature extractor, (B, C, H, W)
     cells: tuple[ASLSTMState, ...]  # one per ASLSTM layer, (B, N)
-    readout: Tensor  # potential of the output neurons (B, 6n)
+    readout: Tensor  # potential of the output neurons (B, 6n), and of those of the spread after them, where it has any
 
     def finite(self) -> bool:
         """Whether no number of it is nan or infinite."""
@@ -28,20 +30,25 @@ class SpikingBlock(nn.Module):
     """Convolution of stride 2, threshold-dependent batch norm (tdBN, Zheng 2021), LIF.
 
     Differs: tdBN's factor v_th is the initial value of the norm's learnable weight, which spans the same functions.
+    With `int8` the convolution's weights are rounded to 8 bits, in training too (decision 38).
     """
 
-    def __init__(self, inputs: int, outputs: int, lif: LIFParams) -> None:
+    def __init__(self, inputs: int, outputs: int, lif: LIFParams, *, int8: bool = False) -> None:
         super().__init__()
         self.conv = nn.Conv2d(inputs, outputs, 3, stride=2, padding=1, bias=False)
         self.norm = nn.BatchNorm2d(outputs)
         nn.init.constant_(self.norm.weight, lif.v_th)
         self.lif = lif
+        self._int8 = int8
 
     def forward(self, spikes: Tensor, state: LIFState) -> tuple[Tensor, LIFState]:
         """(T, B, C, H, W) to (T, B, C', H', W'); the norm's statistics run over time and batch together."""
         steps, batch = spikes.shape[:2]
         frames = spikes.flatten(0, 1).contiguous(memory_format=torch.channels_last)  # a convolution's own order on CPUs
-        current = self.norm(self.conv(frames))
+        if self._int8:
+            current = self.norm(conv2d(frames, rounded(self.conv.weight), stride=2, padding=1))
+        else:
+            current = self.norm(self.conv(frames))
         return lif_scan(current.unflatten(0, (steps, batch)), state, self.lif)
 
 
@@ -58,7 +65,8 @@ class NeuroVE(nn.Module):
         self.bins = config.window.bins
         lif = LIFParams(net.decay, net.v_th, net.surrogate, net.surrogate_width * net.v_th)
         widths = (2 * self.bins, *net.channels)
-        self.blocks = nn.ModuleList(SpikingBlock(a, b, lif) for a, b in itertools.pairwise(widths))
+        self._int8 = net.precision == "int8"
+        self.blocks = nn.ModuleList(SpikingBlock(a, b, lif, int8=self._int8) for a, b in itertools.pairwise(widths))
         rows, columns = self.map_sizes()[-1]
         self.project = nn.Linear(net.channels[-1] * rows * columns, net.features, bias=False)
         self.project_norm = nn.BatchNorm1d(net.features)
@@ -82,7 +90,30 @@ class NeuroVE(nn.Module):
         else:
             self.register_buffer("d_space", d_space, persistent=False)
         self.readout = nn.Linear(net.hidden, 6 * self.bins)
+        self.spread: nn.Linear | None = None  # more output neurons: how far off each axis may be, see add_spread
         self.kappa_logit = nn.Parameter(torch.tensor(-1.386))  # sigmoid gives 0.2
+
+    def add_spread(self, rows: int = 6) -> nn.Linear:
+        """Give the network output neurons for the spread of its errors, at 0; returns them.
+
+        They leak as those of the velocity and see what those see, and no answer depends on them. Their potentials, one
+        row for each axis, are log sigma of the newest window in units of the bundle's scale: see `log_sigma`.
+        """
+        self.spread = nn.Linear(self.readout.in_features, rows)
+        nn.init.zeros_(self.spread.weight)
+        nn.init.zeros_(self.spread.bias)
+        return self.spread
+
+    def log_sigma(self, state: NetworkState) -> Tensor | None:
+        """Potentials (B, rows) of the spread after the window that led to this state; None without a spread."""
+        return None if self.spread is None else state.readout[:, 6 * self.bins :]
+
+    def outputs(self) -> tuple[Tensor, Tensor]:
+        """Weight (R, N) and bias (R) of all output neurons, R = 6n and the rows of the spread."""
+        if self.spread is None:
+            return self.readout.weight, self.readout.bias
+        both = self.readout, self.spread
+        return torch.cat([layer.weight for layer in both]), torch.cat([layer.bias for layer in both])
 
     def map_sizes(self) -> list[tuple[int, int]]:
         """Rows and columns of every block's output."""
@@ -101,7 +132,7 @@ class NeuroVE(nn.Module):
             for channels, (rows, columns) in zip(self.config.network.channels, self.map_sizes(), strict=True)
         )
         cells = tuple(cell.initial_state(batch) for cell in self._layers())
-        return NetworkState(membranes, cells, zeros(batch, 6 * self.bins))
+        return NetworkState(membranes, cells, zeros(batch, len(self.outputs()[1])))
 
     def _layers(self) -> list[ASLSTM]:
         return [cell for cell in self.cells if isinstance(cell, ASLSTM)]
@@ -119,6 +150,8 @@ class NeuroVE(nn.Module):
             twists (T, B, n, 6) in scaled units: vx vy vz wx wy wz, one per bin; and the next state.
         """
         steps, batch = spikes.shape[:2]
+        if self._int8:
+            spikes = rounded_input(spikes)
         membranes = []
         for block, membrane in zip(self.blocks, state.membranes, strict=True):
             spikes, membrane = block(spikes, membrane)
@@ -130,8 +163,9 @@ class NeuroVE(nn.Module):
             x = diffuse(scanned.s, scanned.v, self.d_space[index])
             cells.append(last)
         y, kappa, answers = state.readout, torch.sigmoid(self.kappa_logit), []
+        weight, bias = self.outputs()
         for z in x:
-            y = readout_step(z, y, self.readout.weight, self.readout.bias, kappa)
+            y = readout_step(z, y, weight, bias, kappa)
             answers.append(y)
-        twists = torch.stack(answers).view(steps, batch, self.bins, 6)
+        twists = torch.stack(answers)[..., : 6 * self.bins].reshape(steps, batch, self.bins, 6)
         return twists, NetworkState(tuple(membranes), tuple(cells), y)

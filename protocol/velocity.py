@@ -1,9 +1,11 @@
 """Twist, TwistEstimate and its quality flags: what the service says about a stream, once per window."""
 
+import math
 from enum import StrEnum
 from typing import Annotated, ClassVar, NamedTuple, Self
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
+from pydantic_core import PydanticCustomError
 
 from protocol.codec import Count, Int64, Message, Name, Part
 from protocol.errors import InvalidField
@@ -28,6 +30,7 @@ class Flag(StrEnum):
     OVERLOAD = "overload"  # and they were dropped here, because this node could not keep up
     LOW_ACTIVITY = "low_activity"  # fewer events than the model needs to see motion
     SATURATED = "saturated"  # some cell counted more events than it can hold
+    UNCERTAIN = "uncertain"  # the linear velocity's standard deviation is a larger share of it than the model's bound
 
 
 class Twist(NamedTuple):
@@ -39,6 +42,26 @@ class Twist(NamedTuple):
     wx: float  # [rad/s]
     wy: float
     wz: float
+
+
+def _fits_a_covariance(values: tuple[float, ...]) -> tuple[float, ...]:
+    """A 6x6 matrix, row by row, that is symmetric and whose variances are not negative."""
+    for i in range(_AXES):
+        if values[i * _AXES + i] < 0:
+            raise PydanticCustomError("covariance", "the variance of an axis must not be negative")
+        for j in range(i):
+            if values[i * _AXES + j] != values[j * _AXES + i]:
+                raise PydanticCustomError("covariance", "a covariance must be symmetric")
+    return values
+
+
+_AXES = len(AXES)
+Covariance = Annotated[
+    tuple[float, ...],
+    Field(strict=False, min_length=_AXES * _AXES, max_length=_AXES * _AXES),
+    AfterValidator(_fits_a_covariance),
+]
+"""Of the six numbers of a twist, 6x6 row by row: as geometry_msgs/TwistWithCovariance has it, in the same order."""
 
 
 class Trace(Part):
@@ -72,6 +95,7 @@ class TwistEstimate(Message):
     epoch: Count  # counts model changes of the node
     events: Count  # events of this window, all of the sensor
     flags: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    covariance: Covariance | None = None  # of each of these twists; none where the model has no measure of its errors
     trace: Trace
 
     @model_validator(mode="after")
@@ -86,3 +110,10 @@ class TwistEstimate(Message):
     def twist(self) -> Twist:
         """The newest twist: that of the last bin."""
         return self.twists[-1]
+
+    @property
+    def sigma(self) -> Twist | None:
+        """Standard deviation of each axis; none where there is no covariance."""
+        if self.covariance is None:
+            return None
+        return Twist(*(math.sqrt(self.covariance[i * _AXES + i]) for i in range(_AXES)))

@@ -2,17 +2,36 @@
 
 import argparse
 import json
+import os
+import platform
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from protocol.errors import NeuroVEError
 from service.arguments import BAD_NEWS, command, commit
 
 if TYPE_CHECKING:
     from neurove_core.bench import Row
 
-ALL = ("ingest", "window", "end-to-end", "train", "streams", "decode", "simulate", "sine")
+ALL = (
+    "ingest",
+    "window",
+    "end-to-end",
+    "train",
+    "streams",
+    "decode",
+    "simulate",
+    "sine",
+    "wire",
+    "processes",
+    "narrow",
+)
+
+NARROW = {"ONEDNN_MAX_CPU_ISA": "AVX2", "ATEN_CPU_CAPABILITY": "avx2", "NUMBA_CPU_NAME": "haswell"}
+"""What makes an x86-64 machine compute as one without AVX-512 and AMX; read when the libraries are loaded."""
 
 
 def bench(args: argparse.Namespace) -> int:
@@ -42,7 +61,8 @@ def bench(args: argparse.Namespace) -> int:
 
 
 def _rows(name: str, args: argparse.Namespace, missing: list[str]) -> Iterator["Row"]:
-    from neurove_core.bench import ingest, simulate, sine, window
+    from neurove_core.bench import ingest, processes, simulate, sine, window
+    from service import bench_wire
 
     options = {"quick": args.quick, "with_peers": args.peers}
     run: dict[str, Callable[[], list[Row]]] = {
@@ -54,8 +74,32 @@ def _rows(name: str, args: argparse.Namespace, missing: list[str]) -> Iterator["
         "decode": lambda: ingest.decode(_rounds(args, 9), missing, **options),
         "simulate": lambda: simulate.rows(_rounds(args, 5), quick=args.quick),
         "sine": lambda: sine.compare(_rounds(args, 9)),
+        "wire": lambda: bench_wire.wire(_rounds(args, 15), quick=args.quick),
+        "processes": lambda: processes.processes(_rounds(args, 7), quick=args.quick),
+        "narrow": lambda: _narrow(args, missing),
     }
     yield from run[name]()
+
+
+def _narrow(args: argparse.Namespace, missing: list[str]) -> "list[Row]":
+    """The benchmark `window` in a process that sees no wider instruction sets than AVX2.
+
+    Raises:
+        NeuroVEError: it could not be run; its own reason has gone to stderr.
+    """
+    from neurove_core.bench import Row
+
+    if platform.machine().lower() not in ("x86_64", "amd64"):
+        missing.append(f"narrow (this machine is {platform.machine()}, AVX2 is x86-64's)")
+        return []
+    flags = [flag for flag, given in (("--peers", args.peers), ("--quick", args.quick)) if given]
+    command = [sys.executable, "-m", "service.cli", "bench", "window", "--json", *flags]
+    run = subprocess.run(command, env={**os.environ, **NARROW}, stdout=subprocess.PIPE, check=False)
+    try:
+        found = [Row(**row) for row in json.loads(run.stdout)]
+    except (ValueError, TypeError):
+        raise NeuroVEError(f"bench narrow: its process ended with {run.returncode}") from None
+    return [row._replace(name=f"{row.name}, AVX2 at most") for row in found]
 
 
 def _rounds(args: argparse.Namespace, usual: int) -> int:

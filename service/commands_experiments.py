@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from service.arguments import command, commit
+from service.bars import progress
 
 
 def reproduce_firing(args: argparse.Namespace) -> int:
@@ -72,6 +73,67 @@ def reproduce_sine(args: argparse.Namespace) -> int:
     return 0
 
 
+def reproduce_real(args: argparse.Namespace) -> int:
+    """What a model makes of real events that nobody tuned it on."""
+    from neurove_core.experiments import real
+
+    rows, about = _real_rows(args.model, args.recordings, args.out)
+    print(json.dumps(about | {"checks": rows}) if args.json else real.markdown(rows, real.title(about)), end="")
+    return 0
+
+
+def _real_rows(model: str, recordings: Path, out: Path | None) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """All checks of a model, told one by one as they are made, and how they were made; written into `out`."""
+    import torch
+
+    from neurove_core import models
+    from neurove_core.estimator import Estimator
+    from neurove_core.experiments import real
+
+    torch.set_num_threads(1)
+    estimator = Estimator(models.find(model))
+    rows = []
+    for row in real.run(estimator, recordings):
+        rows.append(row)
+        print(f"{row['recording']}: {row['what']}", file=sys.stderr)
+    about = {"model": estimator.bundle.info.model_dump()} | _made_by()
+    for file in real.save(rows, about, out) if out else []:
+        print(f"wrote {file}", file=sys.stderr)
+    return rows, about
+
+
+def reproduce_velocity(args: argparse.Namespace) -> int:
+    """Tables III and IV: velocity by NeuroVE, NeuroVE w/o, its equal in ANN, SNN-ANG, and what learns nothing."""
+    import torch
+
+    from neurove_core.experiments import velocity, velocity_figures, velocity_report
+
+    torch.set_num_threads(args.threads)
+    config = velocity.base_config(args.config, args.steps, quick=args.quick)
+    seeds = range(args.seed, args.seed + args.seeds)
+    plan = velocity.Plan(config, tuple(args.methods.split(",")), seeds, args.recordings, args.quick)
+    out: Path = args.out or Path("runs") / config.name
+    folder: Path = args.data or out / "data"
+    found = []
+    with progress() as show:
+        for one in velocity.reproduce(plan, folder, out, show, args.workers):
+            found.append(one)
+            show("judged", len(found), len(plan.methods) * len(seeds), f"{one.row['method']} seed {one.row['seed']}")
+    told = _made_by() | velocity.results(plan, folder, found)
+    print(json.dumps(told) if args.json else velocity_report.markdown(told), end="")
+    tracks = {one.row["method"]: one.tracks for one in reversed(found)}
+    for file in [*velocity_report.save(told, out), *velocity_figures.save(told, tracks, out)]:
+        print(f"wrote {file}", file=sys.stderr)
+    if args.recordings:
+        _real_rows("default", args.recordings, out)
+    return 0
+
+
+def _made_by() -> dict[str, str]:
+    """The command as it was typed, and the code's commit."""
+    return {"command": shlex.join(["neurove", *sys.argv[1:]]), "commit": commit()}
+
+
 def _assignment(text: str) -> tuple[str, str]:
     field, separator, value = text.partition("=")
     if not separator:
@@ -98,3 +160,25 @@ def add(commands: Any) -> None:
     )
     sine.add_argument("--quick", action="store_true", help="a few updates, to see that it runs: figures mean nothing")
     sine.add_argument("--out", type=Path, metavar="DIR", help="write figures, tables, pictures and networks there")
+    real = command(parser, "real", reproduce_real)
+    real.add_argument("model", nargs="?", default="default", metavar="BUNDLE", help="a bundle's file; `default`")
+    real.add_argument("--recordings", type=Path, required=True, metavar="DIR", help="where the recordings lie")
+    real.add_argument("--out", type=Path, metavar="DIR", help="write real.json and real.md there")
+    _add_velocity(parser)
+
+
+def _add_velocity(parser: Any) -> None:
+    velocity = command(parser, "velocity", reproduce_velocity)
+    velocity.add_argument("--methods", default="nve,nve-wo,ann,snn-ang", help="which to train, joined by commas")
+    velocity.add_argument("--seed", type=int, default=0, help="the first seed; default 0")
+    velocity.add_argument("--seeds", type=int, default=1, metavar="N", help="so many, one after the other; default 1")
+    velocity.add_argument("--config", metavar="CONFIG", help="another recipe, a TOML file or a name")
+    velocity.add_argument("--steps", type=int, metavar="N", help="so many updates, not those of the configuration")
+    velocity.add_argument(
+        "--data", type=Path, metavar="DIR", help="simulated sequences are kept there; default OUT/data"
+    )
+    velocity.add_argument("--recordings", type=Path, metavar="DIR", help="where MVSEC's poses lie, for Table III")
+    velocity.add_argument("--out", type=Path, metavar="DIR", help="methods, tables, figures; default runs/velocity")
+    velocity.add_argument("--workers", type=int, default=1, metavar="N", help="processes that simulate; default 1")
+    velocity.add_argument("--threads", type=int, default=1, metavar="N", help="threads that learn; default 1")
+    velocity.add_argument("--quick", action="store_true", help="tiny networks and sequences, to see that it runs")

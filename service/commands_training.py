@@ -1,20 +1,26 @@
 """The commands that make models and judge them: train, evaluate."""
 
 import argparse
-import contextlib
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from service.arguments import command, sensor_size
+from service.bars import progress
+
+if TYPE_CHECKING:
+    from neurove_core.bundle import Bundle
+
+_CALIBRATION_SEQUENCES = 96
 
 
 def train(args: argparse.Namespace) -> int:
     """Train a model on simulated sequences and recordings, from a configuration and its seed."""
     import torch
 
+    from neurove_core import bundle
     from neurove_core.training import config as configs
     from neurove_core.training import data, loop, ranks, recorded
 
@@ -23,7 +29,7 @@ def train(args: argparse.Namespace) -> int:
     ranks.device_of(args.device, devices=args.devices)  # told before anything is simulated
     out: Path = args.out or Path("runs") / config.name
     folder: Path = args.data or out / "data"
-    with _progress() as show:
+    with progress() as show:
         cache = data.Cache(folder, config)
         wanted = config.data.sequences
         for done, name in enumerate(cache.fill(args.workers), wanted - len(cache.missing()) + 1):
@@ -39,9 +45,47 @@ def train(args: argparse.Namespace) -> int:
 
         how: dict[str, Any] = {"resume": args.resume, "devices": args.devices, "device": args.device}
         path = loop.train(config, out, folder, **how, on_progress=learned)
+    if args.calibration and config.model.kind == "neurove":  # a baseline has no spread to fit
+        _calibrate(bundle.load(path), config, folder, args.calibration, args.workers, path)
     told = {"bundle": str(path), "bytes": path.stat().st_size, "run": str(out / loop.RUN_JSON)}
     print(json.dumps(told) if args.json else f"wrote {path}, {told['bytes']:,} bytes")
     return 0
+
+
+def calibrate(args: argparse.Namespace) -> int:
+    """Give a trained model its uncertainty, fitted on simulated sequences that it never saw; its answers stay."""
+    import torch
+
+    from neurove_core import bundle, models
+    from neurove_core.training import config as configs
+
+    torch.set_num_threads(1)
+    config, model = configs.load(args.config), models.find(args.model)
+    out: Path = args.out or Path(f"{model.name}{bundle.SUFFIX}")
+    report = _calibrate(
+        model, config, args.data or Path("runs") / config.name / "data", args.sequences, args.workers, out
+    )
+    if args.json:
+        print(json.dumps({"bundle": str(out), **report}))
+        return 0
+    print(f"wrote {out}")
+    print(f"share of the truth in the {report['level']:.0%} interval, of sequences that were not used to fit it:")
+    for name, axes in report["groups"].items():
+        print(f"{name:26}", *(f"{axis} {row[str(report['level'])]:.2f}" for axis, row in axes.items()))
+    return 0
+
+
+def _calibrate(model: "Bundle", config: Any, folder: Path, count: int, workers: int, out: Path) -> Any:
+    """Calibrate a model and write it; returns the report."""
+    from neurove_core import bundle
+    from neurove_core.training import calibration
+
+    with progress() as show:
+        for done, name in enumerate(calibration.fill(config, folder, count, workers), 1):
+            show("simulated to calibrate", done, count, name)
+    made = calibration.calibrate(model, config, folder, count)
+    bundle.save(made.bundle, out)
+    return made.report
 
 
 def evaluate(args: argparse.Namespace) -> int:
@@ -67,11 +111,13 @@ def evaluate(args: argparse.Namespace) -> int:
     told = {"model": estimator.bundle.info.model_dump(), **evaluation.report(judged)}
     print(json.dumps(told) if args.json else "\n".join(_table(told)))
     if args.plot:
-        from neurove_core.evaluation_plots import plot
+        from neurove_core.evaluation_plots import plot, plot_reliability
 
-        for one in judged:
-            for file in plot(one, args.plot):
-                print(f"wrote {file}", file=sys.stderr)
+        files = [file for one in judged for file in plot(one, args.plot)]
+        if told["uncertainty"]:
+            files += plot_reliability(told["uncertainty"], args.plot)
+        for file in files:
+            print(f"wrote {file}", file=sys.stderr)
     return 0
 
 
@@ -94,40 +140,30 @@ def _table(told: dict[str, Any]) -> Iterator[str]:
         unit = "deg_s" if axis[0] == "w" else "m_s"
         numbers = [_number(row[f"{name}_{unit}"], 8) for name in ("rmse", "median_error", "bias", "spread")]
         yield f"{axis:6} {' '.join(numbers)} {_number(row['correlation'], 11)}  {unit.replace('_s', '/s')}"
+    yield from _uncertainty_table(told["uncertainty"])
     latency = told["latency_ms"]
-    yield f"firing rate {told['firing_rate']:.3f}; a window takes {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"
+    rate = told["firing_rate"]
+    fires = "no spikes" if rate is None else f"firing rate {rate:.3f}"
+    yield f"{fires}; a window takes {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"
     if not told["scaled"]:
         yield "linear part: for a camera 1 m above the ground, because the recording does not say how high it is"
 
 
+def _uncertainty_table(told: dict[str, Any] | None) -> Iterator[str]:
+    if told is None:
+        yield "the model has no measure of its errors: neurove calibrate gives it one"
+        return
+    yield ""
+    inside = f"in {told['level']:.0%}"
+    yield f"{'axis':6} {'sigma':>8} {inside:>8}  median sigma; share of the truth in its interval"
+    for axis, row in told["per_axis"].items():
+        name, unit = ("median_sigma_rad_s", "rad/s") if axis[0] == "w" else ("median_sigma_m_s", "m/s")
+        yield f"{axis:6} {row[name]:8.3f} {row['coverage']:8.1%}   {unit}"
+    yield f"{told['uncertain_share']:.1%} of the estimates are flagged uncertain"
+
+
 def _number(value: float | None, width: int) -> str:
     return f"{'-' if value is None else format(value, '.3f'):>{width}}"
-
-
-@contextlib.contextmanager
-def _progress() -> Iterator[Callable[[str, int, int, str], None]]:
-    """Shows how far each task is: bars on a terminal, else a line now and then."""
-    if not sys.stderr.isatty():
-        yield _say
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn(), TextColumn("{task.fields[about]}"))
-    with Progress(*columns, console=Console(stderr=True)) as bars:
-        tasks: dict[str, Any] = {}
-
-        def show(what: str, done: int, of: int, about: str) -> None:
-            if what not in tasks:
-                tasks[what] = bars.add_task(what, total=of, about="")
-            bars.update(tasks[what], completed=done, about=about)
-
-        yield show
-
-
-def _say(what: str, done: int, of: int, about: str) -> None:
-    if what != "learned" or done % 100 < 4 or done == of:
-        print(f"{what} {done}/{of}: {about}", file=sys.stderr, flush=True)
 
 
 def add(commands: Any) -> None:
@@ -145,6 +181,28 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--threads", type=int, default=1, metavar="N", help="threads of each device's process; default 1"
     )
+    parser.add_argument(
+        "--calibration",
+        type=int,
+        default=_CALIBRATION_SEQUENCES,
+        metavar="N",
+        help="sequences that a NeuroVE's uncertainty is fitted on at the end; 0: none; default %(default)s",
+    )
+    parser = command(commands, "calibrate", calibrate)
+    parser.add_argument("model", metavar="BUNDLE", help="a bundle's file, or `default`")
+    parser.add_argument(
+        "--config", default="default", metavar="CONFIG", help="that it was trained by; default `default`"
+    )
+    parser.add_argument("--data", type=Path, metavar="DIR", help="sequences are kept there; default runs/CONFIG/data")
+    parser.add_argument(
+        "--sequences",
+        type=int,
+        default=_CALIBRATION_SEQUENCES,
+        metavar="N",
+        help="how many are simulated; default %(default)s",
+    )
+    parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes that simulate; default 1")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="default NAME.safetensors")
     parser = command(commands, "evaluate", evaluate)
     parser.add_argument("model", metavar="BUNDLE", help="a bundle's file, `default` or `untrained`")
     parser.add_argument("recordings", nargs="+", metavar="RECORDING", help="with truth, such as sim://street?seconds=8")

@@ -287,6 +287,7 @@ class Stream:
             epoch=serving.epoch,
             events=window.events,
             flags=self._flags(window, serving),
+            covariance=None if window.covariance is None else tuple(window.covariance.ravel().tolist()),
             trace=Trace(
                 received_ns=arrival.received_ns, queued_ns=arrival.queued_ns, computed_ns=now_ns, published_ns=now_ns
             ),
@@ -305,6 +306,7 @@ class Stream:
             Flag.SETTLING: not window.settled,
             Flag.LOW_ACTIVITY: window.low_activity,
             Flag.SATURATED: window.saturated,
+            Flag.UNCERTAIN: window.uncertain,
         }
         flags = {flag for flag, holds in conditions.items() if holds} | self._pending
         self._pending.clear()

@@ -22,6 +22,7 @@ _RATE_ESTIMATES = 40
 _BLOCKS = "▁▂▃▄▅▆▇█"
 _PLAIN: dict[str, Any] = {"box": None, "padding": (0, 2, 0, 0), "header_style": "dim"}
 _HISTORY = 26
+_HISTORY_BESIDE_SIGMA = 19
 _WIDTH = 98
 
 
@@ -109,8 +110,16 @@ def _axis(heard: Heard, axis: int) -> tuple[Text, Text, Text]:
     """Name, newest value with its unit, and the newest estimates as a line."""
     unit = "m/s" if axis < 3 else "rad/s"
     values = [twist[axis] for twist in heard.twists]
-    newest = f"{values[-1]:+7.3f} {unit:5}" if values else ""
-    return Text(AXES[axis], style="bold"), Text(newest), Text(_line(values), style="cyan")
+    sigma = heard.last.sigma if heard.last is not None else None
+    spread = f" ±{_short(sigma[axis])}" if sigma is not None else ""
+    newest = f"{values[-1]:+7.3f}{spread} {unit:5}" if values else ""
+    shown = values if sigma is None else values[-_HISTORY_BESIDE_SIGMA:]
+    return Text(AXES[axis], style="bold"), Text(newest), Text(_line(shown), style="cyan")
+
+
+def _short(sigma: float) -> str:
+    """A standard deviation in five characters."""
+    return f"{sigma:5.3f}" if sigma < 9.9995 else f"{min(sigma, 99999):5.0f}"
 
 
 def _line(values: list[float]) -> str:

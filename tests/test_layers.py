@@ -108,7 +108,7 @@ def test_the_check_sees_the_whole_tree():
     seen = {path.parent.name for package in PRODUCT for path in (ROOT / package).rglob("*.py")}
     assert {"protocol", "neurove_core", "service"} <= seen
     bundle = (ROOT / "neurove_core" / "bundle.py").read_text()
-    assert {"torch", "neurove_core.network.NeuroVE"} <= {one.name for one in imports_of(bundle, "neurove_core")}
+    assert {"torch", "neurove_core.networks.Network"} <= {one.name for one in imports_of(bundle, "neurove_core")}
 
 
 @pytest.mark.parametrize(

@@ -1,14 +1,15 @@
 """The peers' neurons in our network: same weights, same input, their LIF layers as their users run them.
 
-They come with the extra `bench`, except spikingjelly, which would pull another torch:
-`pip install --no-deps spikingjelly` and `pip install loguru`. What is not installed is named and left out.
+They come with the extra `bench`, except those whose requirements would pull another torch:
+`pip install --no-deps spikingjelly norse nir nirtorch sinabs`. What is not installed is named and left out.
 """
 
 import copy
 import importlib
+import math
 import warnings
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 import torch
 from torch import Tensor, nn
@@ -36,9 +37,14 @@ def networks(network: NeuroVE, missing: Missing) -> dict[str, NeuroVE]:
     made = {
         "spikingjelly": _with_neurons(network, _spikingjelly(missing), stepwise=False),
         "snnTorch": _with_neurons(network, _snntorch(missing), stepwise=True),
+        "norse": _with_neurons(network, _norse(missing), stepwise=True),
+        "sinabs": _with_neurons(network, _sinabs(missing), stepwise=False),
     }
     return {name: peer for name, peer in made.items() if peer is not None}
 
+
+ELSEWISE: Final = ("snnTorch", "norse")
+"""Peers that compute something else by design: snnTorch resets a step later, norse rounds its potential elsewhere."""
 
 Neurons = Callable[[SpikingBlock], tuple[Callable[[Tensor], Tensor], Callable[[], None]]]
 """Of one block: currents to spikes, and back to rest."""
@@ -114,5 +120,55 @@ def _snntorch(missing: Missing) -> Neurons | None:
     def neurons(block: SpikingBlock) -> tuple[Callable[[Tensor], Tensor], Callable[[], None]]:
         leaky = module.Leaky(beta=block.lif.decay, threshold=block.lif.v_th, reset_mechanism="zero", init_hidden=True)
         return leaky, leaky.reset_mem
+
+    return neurons
+
+
+def _norse(missing: Missing) -> Neurons | None:
+    module = load("norse.torch", missing)
+    if module is None:
+        return None
+
+    def neurons(block: SpikingBlock) -> tuple[Callable[[Tensor], Tensor], Callable[[], None]]:
+        share = 1 - block.lif.decay
+        with torch.no_grad():  # v + share (i - v): the norm before it makes up for the share of the current
+            block.norm.weight.div_(share)
+            block.norm.bias.div_(share)
+        params = module.LIFBoxParameters(tau_mem_inv=torch.tensor(share), v_th=torch.tensor(block.lif.v_th))
+        cell = module.LIFBoxCell(params, dt=1.0)
+        state: list[Any] = []
+
+        def fire(current: Tensor) -> Tensor:
+            spikes: Tensor
+            spikes, after = cell(current, *state)
+            state[:] = [after]
+            return spikes
+
+        return fire, state.clear
+
+    return neurons
+
+
+def _sinabs(missing: Missing) -> Neurons | None:
+    module = load("sinabs.layers", missing)
+    if module is None:
+        return None
+    activation = importlib.import_module("sinabs.activation")
+
+    def neurons(block: SpikingBlock) -> tuple[Callable[[Tensor], Tensor], Callable[[], None]]:
+        layer = module.LIF(
+            tau_mem=-1 / math.log(block.lif.decay),
+            spike_threshold=torch.tensor(block.lif.v_th),
+            spike_fn=activation.SingleSpike,
+            reset_fn=activation.MembraneReset(),
+            surrogate_grad_fn=activation.SingleExponential(),
+            norm_input=False,
+        )
+
+        def fire(currents: Tensor) -> Tensor:
+            spikes: Tensor = layer(currents.transpose(0, 1))  # (B, T, ...), as it wants them
+            return spikes.transpose(0, 1)
+
+        return fire, layer.reset_states
 
     return neurons

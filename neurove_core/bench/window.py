@@ -2,11 +2,12 @@
 
 import copy
 from collections.abc import Callable
+from typing import cast
 
 import torch
 from torch import Tensor
 
-from neurove_core import bundle
+from neurove_core import bundle, int8
 from neurove_core.bench import Row, interleaved, machine, peers, rows
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
 from neurove_core.engine import Engine
@@ -31,24 +32,45 @@ def window(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool
     shapes = {"tiny, T=3": (TINY, 3)} if quick else {"reference, T=8": (REFERENCE, 8), "shipped, T=1": (SHIPPED, 1)}
     found: list[Row] = []
     for name, (config, steps) in shapes.items():
-        network = _network(config)
-        spikes, rest = draw(config, steps), network.initial_state(1)
-        engine = Engine(network)
-        others = peers.networks(network, missing) if with_peers else {}
-        runs: dict[str, Callable[[], object]] = {"ours": lambda e=engine, s=spikes, r=rest: e(s, r)}  # type: ignore[misc]
-        for peer, theirs in {"PyTorch, plain": network, **others}.items():
-            runs[peer] = _plainly(theirs, spikes, rest)
-        with torch.inference_mode():
-            fired = engine.features(spikes, rest)[0]
-            equal: dict[str, bool | None] = {"PyTorch, plain": _agree(engine, network, spikes, rest)}
-            with plain():
-                for peer, theirs in others.items():
-                    fires_alike = bool(torch.equal(peers.features(theirs, spikes), fired))
-                    equal[peer] = None if peer == "snnTorch" else fires_alike
-            times = interleaved({**runs, "peak": machine.peak()}, rounds)
-        limit_ms = times["peak"] * steps * machine.flops(config) / machine.PEAK_FLOPS
-        found += rows(f"window {name}", times, equal, limit_ms)
+        found += _windows(name, config, steps, rounds, missing, with_peers=with_peers)
+        found += _windows(
+            f"{name}, int8", with_precision(config, "int8"), steps, rounds, missing, with_peers=with_peers
+        )
     return found
+
+
+def with_precision(config: ModelConfig, precision: str) -> ModelConfig:
+    """The same network with its convolutions in float32 or int8."""
+    return config.model_copy(update={"network": config.network.model_copy(update={"precision": precision})})
+
+
+def _windows(
+    name: str, config: ModelConfig, steps: int, rounds: int, missing: peers.Missing, *, with_peers: bool
+) -> list[Row]:
+    """Where ours runs in int8 the peers run in float32, as their users do, and ours is compared to itself alone."""
+    network = _network(config)
+    quantised = config.network.precision == "int8"
+    in_float32 = _network(with_precision(config, "float32")) if quantised else network
+    spikes, rest = draw(config, steps), network.initial_state(1)
+    given = int8.codes(spikes) if quantised else spikes
+    engine = Engine(network)
+    others = peers.networks(in_float32, missing) if with_peers else {}
+    runs: dict[str, Callable[[], object]] = {"ours": lambda: engine(given, rest)}
+    for peer, theirs in {"PyTorch, plain": network, **others}.items():
+        runs[peer] = _plainly(theirs, spikes, rest)
+    with torch.inference_mode():
+        fired = engine.features(spikes, rest)[0]
+        equal: dict[str, bool | None] = {"PyTorch, plain": _agree(engine, network, spikes, rest)}
+        with plain():
+            for peer, theirs in others.items():
+                fires_alike = bool(torch.equal(peers.features(theirs, spikes), fired))
+                equal[peer] = None if quantised or peer in peers.ELSEWISE else fires_alike
+        if quantised:
+            wide = Engine(in_float32)
+            runs["ours, float32"], equal["ours, float32"] = lambda: wide(spikes, rest), None
+        times = interleaved({**runs, "peak": machine.peak()}, rounds)
+    limit_ms = None if quantised else times["peak"] * steps * machine.flops(config) / machine.PEAK_FLOPS
+    return rows(f"window {name}", times, equal, limit_ms)
 
 
 def train(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool) -> list[Row]:
@@ -71,20 +93,20 @@ def train(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool)
             runs[peer] = _inside_plain(step)
         loss = ours.loss()
         equal: dict[str, bool | None] = {
-            peer: None if peer == "snnTorch" else abs(value - loss) < 1e-4 * abs(loss) for peer, value in losses.items()
+            peer: None if peer in peers.ELSEWISE else abs(value - loss) < 1e-4 * abs(loss)
+            for peer, value in losses.items()
         }
         found += rows(f"training step {name}, batch 4", interleaved(runs, rounds, warm_up=1), equal)
     return found
 
 
 def streams(rounds: int, *, quick: bool) -> list[Row]:
-    """Eight streams on one core: one after the other, and their windows in one batch; milliseconds per window."""
+    """Streams on one core, milliseconds per window: eight in turn beside one alone, several at once beside in turn."""
     config = TINY if quick else SHIPPED
     network = _network(config)
     engine = Engine(network)
     inputs = [draw(config, 1, seed=seed) for seed in range(8)]
     states = [network.initial_state(1) for _ in inputs]
-    together, joint = torch.cat(inputs, dim=1), network.initial_state(8)
 
     def in_turn() -> None:
         for index, spikes in enumerate(inputs):
@@ -94,12 +116,25 @@ def streams(rounds: int, *, quick: bool) -> list[Row]:
         for _ in inputs:
             states[0] = engine(inputs[0], states[0])[1]
 
-    times = interleaved({"ours": in_turn, "one stream": alone, "batch of 8": lambda: engine(together, joint)}, rounds)
-    batch, _ = engine(together, joint)
-    each = torch.cat([engine(spikes, network.initial_state(1))[0] for spikes in inputs], dim=1)
-    equal = bool(torch.allclose(batch, each, rtol=1e-3, atol=1e-4))
-    per_window = {name: value / len(inputs) for name, value in times.items()}
-    return rows("8 streams in turn, shipped, per window", per_window, {"one stream": True, "batch of 8": equal})
+    def at_once(count: int) -> Callable[[], object]:
+        joint, rest = torch.cat(inputs[:count], dim=1), [network.initial_state(1)] * count
+        return lambda: engine.together(joint, rest)
+
+    batches = {count: at_once(count) for count in (2, 4, 8)}
+    runs = {f"{count} at once": run for count, run in batches.items()}
+    times = interleaved({"in turn": in_turn, "one stream": alone, **runs}, rounds)
+    per_window = {name: value / int(name[0]) for name, value in times.items() if "at once" in name}
+    turn, one = (times[name] / len(inputs) for name in ("in turn", "one stream"))
+    each = [engine(spikes, network.initial_state(1))[0] for spikes in inputs]
+    joined = [twists for twists, _ in engine.together(torch.cat(inputs, dim=1), [network.initial_state(1)] * 8)]
+    equal = all(torch.allclose(a, b, rtol=1e-3, atol=1e-4) for a, b in zip(joined, each, strict=True))
+    return [
+        Row("8 streams in turn, shipped, per window", turn, "one stream", one, one / turn, None, True),
+        *(
+            Row(f"{name}, shipped, per window", ours, "streams in turn", turn, turn / ours, None, equal)
+            for name, ours in per_window.items()
+        ),
+    ]
 
 
 def draw(config: ModelConfig, steps: int, batch: int = 1, seed: int = 1) -> Tensor:
@@ -110,7 +145,7 @@ def draw(config: ModelConfig, steps: int, batch: int = 1, seed: int = 1) -> Tens
 
 
 def _network(config: ModelConfig) -> NeuroVE:
-    return bundle.untrained(0, config).network.eval().requires_grad_(requires_grad=False)
+    return cast("NeuroVE", bundle.untrained(0, config).network.eval().requires_grad_(requires_grad=False))
 
 
 def _plainly(network: NeuroVE, spikes: Tensor, state: NetworkState) -> Callable[[], object]:

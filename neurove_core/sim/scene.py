@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from neurove_core.sim.panels import ENDLESS, SKY_COLUMNS, SKY_ROWS, Panels, Sky, box, panel, upright
 from neurove_core.sim.path import Moving
-from neurove_core.sim.street import CORRIDOR, STREET, Street
+from neurove_core.sim.street import BARE, CORRIDOR, STREET, Street
 from protocol.errors import InvalidField
 
 
@@ -35,6 +35,11 @@ class Fixed:
 def street(trajectory: Moving, seed: int) -> Scene:
     """Ground with lane lines, houses on both sides with gaps and side streets, parked cars, poles, a skyline."""
     return Street(trajectory, seed, STREET, _skyline(seed, STREET.far))
+
+
+def bare_street(trajectory: Moving, seed: int) -> Scene:
+    """The same street on a ground of one plain colour, without lines: nothing on it moves."""
+    return Street(trajectory, seed, BARE, _skyline(seed, BARE.far))
 
 
 def corridor(trajectory: Moving, seed: int) -> Scene:
@@ -109,6 +114,7 @@ def wall(trajectory: Moving, seed: int, distance_m: float = 1.0) -> Scene:
 
 SCENES: Final[dict[str, Callable[[Moving, int], Scene]]] = {
     "street": street,
+    "bare-street": bare_street,
     "corridor": corridor,
     "room": room,
     "wall": wall,

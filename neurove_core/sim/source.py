@@ -16,7 +16,13 @@ from protocol.errors import InvalidField
 from protocol.events import Sensor
 
 DEFAULT_SCENE: Final = "street"
-TRAJECTORY_OF: Final = {"street": "driving", "corridor": "driving", "room": "handheld", "wall": "slider?vx=0.3"}
+TRAJECTORY_OF: Final = {
+    "street": "driving",
+    "bare-street": "driving",
+    "corridor": "driving",
+    "room": "handheld",
+    "wall": "slider?vx=0.3",
+}
 """What moves the camera where nothing else is said."""
 
 _SEEDED: Final = ("driving", "handheld")

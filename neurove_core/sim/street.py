@@ -26,11 +26,15 @@ class Style(NamedTuple):
     things: float  # how many stand beside it, per block and side
     lanes: bool  # lines on the ground
     ceiling: float | None  # how high it is
+    ground: float = 9.0  # the ground's texture repeats so often; one as wide as BARE is a plain colour
 
 
 STREET: Final = Style(
     far=100.0, verge=(4.0, 10.0), height=(4.0, 12.0), gap=0.18, clearance=1.7, things=1.2, lanes=True, ceiling=None
 )
+BARE: Final = STREET._replace(lanes=False, ground=1e6)
+"""A street whose ground shows nothing: its speed is known to nobody who can not see how far the houses are."""
+
 CORRIDOR: Final = Style(
     far=50.0, verge=(1.6, 2.4), height=(3.0, 3.0), gap=0.0, clearance=0.9, things=0.25, lanes=False, ceiling=3.0
 )
@@ -74,11 +78,12 @@ class Street:
 
     def _ground(self, position: NDArray[np.float64]) -> Panels:
         """Ground, and ceiling; their texture stays where it is however far the camera goes."""
-        repeat = 9.0
+        repeat = self._style.ground
         middle = np.round(position[[0, 2]] / repeat) * repeat
         right, ahead = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
         size = (2 * ENDLESS, 2 * ENDLESS)
-        parts = [panel(np.array([middle[0], 0, middle[1]]), right, ahead, size, "asphalt", repeat_m=repeat)]
+        ground = panel(np.array([middle[0], 0, middle[1]]), right, ahead, size, "asphalt", repeat_m=repeat)
+        parts = [ground] if self._style.ground else [NOTHING]
         if self._style.ceiling:
             above = np.array([middle[0], -self._style.ceiling, middle[1]])
             parts.append(panel(above, right, ahead, size, "plaster", repeat_m=repeat))

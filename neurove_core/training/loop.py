@@ -4,7 +4,7 @@ import json
 import math
 import subprocess
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -16,11 +16,11 @@ from torch import Tensor
 
 from neurove_core import bundle, golden
 from neurove_core.about import About, MadeBy
+from neurove_core.carried import detached
 from neurove_core.encoding import to_spikes
 from neurove_core.estimator import Estimator
 from neurove_core.files import write_whole
 from neurove_core.loss import group_loss, scaled_sum
-from neurove_core.network import NetworkState
 from neurove_core.training.batches import Segment, draw
 from neurove_core.training.config import RecipeConfig, TrainingConfig
 from neurove_core.training.curve import Scalars, draw_curve
@@ -70,6 +70,7 @@ def train(
     out: Path,
     data: Path,
     *,
+    more: Sequence[Path] = (),
     resume: bool = False,
     devices: int = 1,
     device: str = "cpu",
@@ -81,6 +82,7 @@ def train(
         config: of the run.
         out: folder for the checkpoint, run.json, the curve and the bundle.
         data: folder of the sequences, filled by `Cache.fill` and `Recorded.fill`.
+        more: files of further sequences, as `data.save` writes them.
         resume: go on from the checkpoint in `out`, where there is one.
         devices: processes that share each batch, each with its own device.
         device: `cpu`, `cuda` or `auto`; see `ranks.device_of`.
@@ -95,7 +97,7 @@ def train(
     """
     out.mkdir(parents=True, exist_ok=True)
     resume = resume and (out / CHECKPOINT).exists()
-    sequences = Sequences([*Cache(data, config).paths(), *Recorded(data, config).paths()])
+    sequences = Sequences([*Cache(data, config).paths(), *Recorded(data, config).paths(), *more])
     begin(config, out, sequences, resume=resume, ranks=Ranks(count=devices))  # so that what is wrong is told by one
     with together(devices, device, follow, (config, out, sequences.paths, resume)) as ranks:
         run = begin(config, out, sequences, resume=resume, ranks=ranks)
@@ -103,7 +105,7 @@ def train(
             descend(run, sequences, out, on_progress, scalars.add)
     draw_curve(run.curve, out, f"{config.name}: {run.step} updates")
     path = out / f"{config.name}{bundle.SUFFIX}"
-    made = run.bundle(provenance(run), about(run))
+    made = run.bundle(provenance(run, len(more)), about(run))
     test = golden.record(Estimator(made), golden_windows(sequences))
     bundle.save(replace(made, golden=test), path)
     return path
@@ -183,18 +185,12 @@ def errors(run: Run, answers: Tensor, segment: Segment, chunk: slice) -> tuple[T
     return group_loss(error[..., :3] * segment.height_m[:, None, None]), group_loss(error[..., 3:])
 
 
-def detached(state: NetworkState) -> NetworkState:
-    """The state without its past: gradients do not flow into the chunk before."""
-    membranes = tuple(type(one)(*(tensor.detach() for tensor in one)) for one in state.membranes)
-    cells = tuple(type(one)(*(tensor.detach() for tensor in one)) for one in state.cells)
-    return NetworkState(membranes, cells, state.readout.detach())
-
-
-def provenance(run: Run) -> str:
-    """One line: how this model was made."""
+def provenance(run: Run, more: int = 0) -> str:
+    """One line: how this model was made; `more` sequences were learned from beside the configuration's."""
     recipe, data = run.config.recipe, run.config.data
     names = ", ".join(Path(one.source).name for one in data.recordings)
-    also = f", {len(data.recordings)} recordings ({names[:_NAMES_CHARS]})" if names else ""
+    also = f" and {more} more" if more else ""
+    also += f", {len(data.recordings)} recordings ({names[:_NAMES_CHARS]})" if names else ""
     also += f", {run.ranks.count} devices" if run.ranks.count > 1 else ""
     text = (
         f"neurove train {run.config.name}: {run.step} updates of {recipe.batch} x {recipe.chunk_windows} windows, "

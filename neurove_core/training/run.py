@@ -17,11 +17,12 @@ import torch
 from pydantic import ValidationError
 from torch import Tensor, nn
 
+from neurove_core import networks
 from neurove_core.about import About
 from neurove_core.bundle import PER_HEIGHT, Bundle
 from neurove_core.files import write_whole
 from neurove_core.loss import Balance
-from neurove_core.network import NeuroVE
+from neurove_core.networks import Network
 from neurove_core.training.config import RecipeConfig, TrainingConfig
 from neurove_core.training.data import Sequences
 from neurove_core.training.ranks import ALONE, Ranks, share_norms
@@ -36,7 +37,7 @@ class Run:
     """All that a run carries from one segment to the next."""
 
     config: TrainingConfig
-    network: NeuroVE
+    network: Network
     optimiser: torch.optim.Adam
     offset: Tensor  # (6): twist = network output * scale + offset
     scale: Tensor  # (6)
@@ -66,7 +67,7 @@ class Run:
 
     def bundle(self, provenance: str, about: About | None = None) -> Bundle:
         """The model as it is now."""
-        network = NeuroVE(self.config.model)
+        network = networks.make(self.config.model)
         network.load_state_dict(self.network.state_dict())
         return Bundle(
             name=self.config.name,
@@ -161,13 +162,13 @@ def _balance(ranks: Ranks) -> Balance:
     return Balance(*(mean.to(ranks.device) for mean in Balance.initial()))
 
 
-def _network(config: TrainingConfig, ranks: Ranks) -> tuple[NeuroVE, torch.optim.Adam]:
+def _network(config: TrainingConfig, ranks: Ranks) -> tuple[Network, torch.optim.Adam]:
     if ranks.count < 1 or config.recipe.batch % ranks.count:
         bound = f"recipe.batch={config.recipe.batch} does not split into so many equal parts"
         raise InvalidField("training", "devices", ranks.count, bound)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.recipe.seed)
-        network = NeuroVE(config.model)
+        network = networks.make(config.model)
     for norm in network.modules():
         if isinstance(norm, nn.BatchNorm1d | nn.BatchNorm2d):
             norm.momentum = config.recipe.norm_momentum

@@ -4,11 +4,11 @@ import importlib.util
 
 import pytest
 
-from neurove_core.bench import Row, chart, ingest, interleaved, machine, rows, simulate, sine, window
+from neurove_core.bench import Row, chart, ingest, interleaved, machine, peers, processes, rows, simulate, sine, window
 from neurove_core.config import ModelConfig
 
 QUICK = {"quick": True, "with_peers": True}
-PEERS = {"spikingjelly": "spikingjelly", "snntorch": "snnTorch"}
+PEERS = {"spikingjelly": "spikingjelly", "snntorch": "snnTorch", "norse": "norse", "sinabs": "sinabs"}
 INSTALLED = {name for module, name in PEERS.items() if importlib.util.find_spec(module)}
 
 
@@ -36,7 +36,8 @@ def test_what_is_timed_gives_equal_answers_and_peers_that_are_not_installed_are_
     found = compare(1, missing, **QUICK)
     assert any("PyTorch, plain" in row.peer for row in found)
     assert all(row.equal is not False for row in found)
-    assert all(row.equal for row in found if "snnTorch" not in row.peer)
+    as_wide = [row for row in found if "int8" not in row.name or row.peer == "PyTorch, plain"]
+    assert all(row.equal for row in as_wide if not any(name in row.peer for name in peers.ELSEWISE))
     for module, name in PEERS.items():
         assert (name in INSTALLED) == any(name in row.peer for row in found)
         assert (name in INSTALLED) != any(line.startswith(module) for line in missing)
@@ -51,7 +52,13 @@ def test_counts_and_decoded_events_equal_those_of_the_reference(compare):
 
 def test_streams_in_turn_and_in_a_batch_are_answered_alike():
     found = window.streams(1, quick=True)
-    assert {row.peer for row in found} == {"one stream", "batch of 8"}
+    assert [row.peer for row in found] == ["one stream", *["streams in turn"] * 3]
+    assert all(row.equal for row in found)
+
+
+def test_two_processes_give_the_answers_of_one():
+    found = processes.processes(1, quick=True)
+    assert [row.peer for row in found] == ["1 process"] * 2
     assert all(row.equal for row in found)
 
 

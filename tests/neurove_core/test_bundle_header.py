@@ -179,6 +179,7 @@ def test_a_pickle_is_refused_and_not_one_opcode_of_it_runs(tmp_path):
 def test_the_page_of_the_format_names_every_field_and_reason():
     page = (Path(neurove_core.__file__).parent / "BUNDLE.md").read_text()
     named = [*Header.model_fields, *MadeBy.model_fields, *Limits.model_fields, *manifest.Signed.model_fields]
+    named += [*bundle.UncertaintyHeader.model_fields, "spread.weight", "spread.bias", "output.correlation"]
     assert [name for name in named if f"`{name}`" not in page] == []
     for bound in (bundle.MAX_BYTES >> 20, bundle.MAX_HEADER_BYTES >> 20, golden.MAX_CELLS >> 20):
         assert f"{bound} MiB" in page

@@ -2,12 +2,18 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 
 from neurove_core import bundle, models
+from neurove_core.encoding import to_spikes
+from neurove_core.engine import Engine
 from neurove_core.estimator import Estimator
 from neurove_core.evaluation import answer, judge, report
 from neurove_core.io import open_source
+from neurove_core.training import data
+from neurove_core.training.batches import regained
 
 
 def test_it_is_trained_small_and_says_how_it_was_made():
@@ -28,3 +34,60 @@ def test_it_sees_how_fast_it_drives_from_any_height(height_m):
     assert told["re_v_l"] < 0.4 < told["zero"]["re_v_l"]
     assert told["rmse_v_a_deg_s"] < 6
     assert told["scaled"]
+
+
+def counts_of(scene):
+    """A drive through a scene, window by window (50, 2n, H, W)."""
+    found = models.find("default")
+    if found.uncertainty is None:
+        pytest.skip("the default model is not calibrated: neurove calibrate default")
+    recording = open_source(f"sim://{scene}?seed=7001&seconds=2.5&camera=pinhole:86x65:75&height=1")
+    return data.sequence_of(recording, found.config).counts
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return counts_of("street")
+
+
+def claimed(counts):
+    """Sigma of vz [1/s] after each window, and which windows are uncertain."""
+    found = models.find("default")
+    engine, state = Engine(found.network), found.network.initial_state()
+    scale, offset = found.scale.double().numpy(), found.offset.double().numpy()
+    sigmas, uncertain = [], []
+    for window in counts:
+        spikes = to_spikes(torch.from_numpy(window)[None, None], found.config.network.encoding)
+        twists, state = engine(spikes, state)
+        log_sigma = found.network.log_sigma(state)[0].double().numpy()
+        covariance = found.uncertainty.covariance(log_sigma, scale)
+        sigmas.append(np.sqrt(covariance[2, 2]))
+        uncertain.append(found.uncertainty.is_uncertain(twists[0, 0].double().numpy() * scale + offset, covariance))
+    return np.array(sigmas), np.array(uncertain)
+
+
+def test_it_is_sure_of_a_plain_drive_and_unsure_while_it_sees_nothing_or_little(drive):
+    usual, flagged = claimed(drive)
+    assert flagged[16:].mean() < 0.2
+    blank, few = drive.copy(), drive.copy()
+    blank[30:] = 0
+    few[30:] = regained(np.random.default_rng(0), few[30:], 0.01)
+    for counts in (blank, few):
+        sigma, flagged = claimed(counts)
+        assert (sigma[:30] == usual[:30]).all()
+        assert np.median(sigma[35:]) > 1.5 * np.median(usual[35:])
+        assert flagged[35:].mean() > 0.5
+
+
+def test_over_a_ground_without_texture_it_is_unsure(drive):
+    (sigma, flagged), (usual, _) = claimed(counts_of("bare-street")), claimed(drive)
+    assert np.median(sigma) > 1.5 * np.median(usual)
+    assert flagged[16:].mean() > 0.5
+
+
+def test_a_gap_makes_it_unsure_and_it_becomes_sure_again(drive):
+    counts = drive.copy()
+    counts[30:40] = 0
+    (sigma, _), (usual, _) = claimed(counts), claimed(drive)
+    assert sigma[36:41].mean() > 1.3 * usual[36:41].mean()
+    assert sigma[-3:].mean() < 1.3 * usual[-3:].mean()

@@ -100,6 +100,25 @@ def test_window_by_window_equals_the_whole_sequence(config):
         torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-5)
 
 
+@each_shape
+@torch.no_grad()
+def test_a_spread_is_the_same_in_the_engine_in_its_plain_form_and_in_the_network_and_moves_no_answer(config):
+    network, spikes = make_network(config), make_spikes(config, batch=2)
+    without, _ = Engine(network)(spikes, network.initial_state(2))
+    torch.nn.init.normal_(network.add_spread().weight, generator=torch.Generator().manual_seed(5))
+    engine, start = Engine(network), network.initial_state(2)
+    twists, state = engine(spikes, start)
+    with plain():
+        _, plain_state = engine(spikes, start)
+    found = network.log_sigma(state)
+    assert found.shape == (2, 6)
+    assert found.abs().max() > 0
+    torch.testing.assert_close(twists, without)
+    torch.testing.assert_close(found, network.log_sigma(plain_state), rtol=1e-4, atol=1e-5)
+    first = [network.log_sigma(one(spikes[:1], start)[1]) for one in (engine, network)]
+    torch.testing.assert_close(*first, rtol=1e-4, atol=1e-5)
+
+
 def test_the_layout_of_the_input_does_not_matter():
     network, spikes = make_network(SMALL), make_spikes(SMALL)
     engine = Engine(network)

@@ -16,7 +16,7 @@ import neurove_core
 from neurove_core import bundle
 from neurove_core.bundle import Bundle
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from neurove_core.estimator import Answer, Estimator, StreamState, WindowEstimate
+from neurove_core.estimator import Answer, Estimator, Push, StreamState, WindowEstimate
 from protocol import CameraInfo, Events, Sensor
 from protocol.errors import BadModel, InvalidField
 from tests.builders import SENSOR, make_events
@@ -151,6 +151,33 @@ def test_streams_of_several_threads_share_an_estimator_and_are_answered_as_each_
         assert_same_estimates(one, other)
 
 
+@pytest.mark.parametrize("precision", ["float32", "int8"])
+def test_streams_pushed_at_once_are_answered_as_each_alone(precision):
+    """Streams of different ages, one with a hole and one without a window; in int8 equal bit for bit."""
+    estimator = Estimator(make_bundle(network=CONFIG.network.model_copy(update={"precision": precision})))
+    hole = [*windows_of_events(3), *windows_of_events(3, first=20)]
+    packets = [windows_of_events(6, seed=50), hole, [make_events(9, seed=1)] * 6, [Events.join(hole), *[tick(30)] * 5]]
+    alone = [feed(estimator, one) for one in packets]
+    states = [estimator.initial_state(SENSOR) for _ in packets]
+    together: list[list[Answer]] = []
+    for turn in zip(*packets, strict=True):
+        pushes = [Push(events, state, int(events.t[0])) for events, state in zip(turn, states, strict=True)]
+        answers = estimator.push_many(pushes)
+        states = [answer.state for answer in answers]
+        together.append(answers)
+    for stream, want in enumerate(alone):
+        got = [answers[stream] for answers in together]
+        estimates = list(chain.from_iterable(one.estimates for one in got))
+        assert [one[:2] for one in estimates] == [one[:2] for one in want.estimates]
+        assert [sum(one[2:][k] for one in got) for k in range(3)] == list(want[2:])
+        if precision == "int8":
+            assert_same_estimates(estimates, want.estimates)
+            assert_same_state(states[stream], want.state)
+        for one, other in zip(estimates, want.estimates, strict=True):
+            np.testing.assert_allclose(one.twists, other.twists, rtol=1e-3, atol=1e-4)
+    assert estimator.push_many([]) == []
+
+
 @pytest.mark.parametrize("as_one_packet", [True, False])
 def test_after_a_hole_too_long_to_bridge_a_stream_answers_as_a_fresh_one(estimator, as_one_packet):
     before, after = windows_of_events(5), [*windows_of_events(3, first=9), tick(12)]
@@ -269,6 +296,37 @@ def test_windows_after_a_hole_are_followed_from_rest(estimator):
 )
 def test_models_that_cut_or_see_otherwise_are_told_apart(estimator, change):
     assert not Estimator(make_bundle(seed=3, **change)).cuts_like(estimator)
+
+
+def arrays_of(value) -> list[np.ndarray]:
+    """All arrays of nested tuples, with the tensors among them as arrays."""
+    if isinstance(value, torch.Tensor):
+        return [value.numpy()]
+    if isinstance(value, np.ndarray):
+        return [value]
+    return [one for part in value for one in arrays_of(part)] if isinstance(value, tuple) else []
+
+
+@pytest.mark.parametrize(
+    ("sensor", "grid", "most_mib"),
+    [
+        (Sensor(346, 260), CanonicalConfig(), 8),
+        (Sensor(346, 260), CanonicalConfig(width=173, height=130), 8),
+        (Sensor(1280, 720), CanonicalConfig(), 40),
+        (Sensor(1280, 720), CanonicalConfig(width=320, height=180), 40),
+    ],
+    ids=str,
+)
+def test_a_stream_that_has_run_for_long_holds_a_bounded_state(sensor, grid, most_mib):
+    estimator = Estimator(bundle.untrained(0, ModelConfig(canonical=grid)))
+    state, sizes = estimator.initial_state(sensor), []
+    for k in range(20):  # more than the 16 windows that prime another model
+        events = make_events(50, seed=k, sensor=sensor, start_us=k * 50_000, duration_us=50_000)
+        state = estimator.push(events, state, k * 50_000).state
+        whole = {id(array.base if array.base is not None else array): array for array in arrays_of(state)}
+        sizes.append(sum((array.base if array.base is not None else array).nbytes for array in whole.values()))
+    assert sizes[-1] == sizes[-2]
+    assert sizes[-1] < most_mib << 20
 
 
 def test_a_model_that_is_fit_warms_up_and_answers_as_before():

@@ -12,12 +12,13 @@ import torch
 from torch import nn
 
 from neurove_core import bundle
+from neurove_core.carried import detached
 from neurove_core.encoding import to_spikes
 from neurove_core.loss import scaled_sum
 from neurove_core.training import data
 from neurove_core.training.batches import Segment, draw
 from neurove_core.training.config import TrainingConfig
-from neurove_core.training.loop import CHECKPOINT, RUN_JSON, descend, detached, errors, learn, learning_rate, train
+from neurove_core.training.loop import CHECKPOINT, RUN_JSON, descend, errors, learn, learning_rate, train
 from neurove_core.training.ranks import ALONE, LostRank, SharedNorm, device_of, together
 from neurove_core.training.run import Run
 from protocol.errors import BadModel, InvalidField

@@ -123,6 +123,7 @@ EXAMPLES: dict[str, Fields] = {
         "epoch": 2,
         "events": 9_214,
         "flags": ["settling", "uncalibrated"],
+        "covariance": [0.25 if i == j else 0.125 if i + j == 2 else 0.0 for i in range(6) for j in range(6)],
         "trace": {"received_ns": 1_000, "queued_ns": 2_000, "computed_ns": 3_000, "published_ns": 4_000},
     },
     "StreamStatus": STATUS,
@@ -313,6 +314,15 @@ def cameras(draw: st.DrawFn) -> Fields:
 
 
 @st.composite
+def covariances(draw: st.DrawFn) -> list[float]:
+    rows = draw(st.lists(floats.map(abs), min_size=6, max_size=6))
+    upper = draw(st.lists(floats, min_size=15, max_size=15))
+    found = {(i, i): variance for i, variance in enumerate(rows)}
+    found |= dict(zip(((i, j) for i in range(6) for j in range(i + 1, 6)), upper, strict=True))
+    return [found[min(i, j), max(i, j)] for i in range(6) for j in range(6)]
+
+
+@st.composite
 def estimates(draw: st.DrawFn) -> Fields:
     bins = draw(st.integers(1, 6))
     start_us = draw(st.integers(-(2**63), 2**63 - 2))
@@ -329,6 +339,7 @@ def estimates(draw: st.DrawFn) -> Fields:
         "epoch": draw(counts),
         "events": draw(counts),
         "flags": draw(st.lists(sentences, max_size=4)),
+        "covariance": draw(st.none() | covariances()),
         "trace": draw(st.fixed_dictionaries(dict.fromkeys(EXAMPLES["TwistEstimate"]["trace"], int64s))),
     }
 

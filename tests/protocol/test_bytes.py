@@ -51,11 +51,12 @@ def test_bytes_that_are_no_map_are_malformed(kind: Kind, data: bytes) -> None:
 @every_kind
 def test_a_key_that_stands_twice_is_malformed_at_any_depth(kind: Kind) -> None:
     for name, value in kind.fields().items():
-        body = kind.bytes()[1:]
-        twice = bytes([kind.bytes()[0] + 1]) + body + pack(name) + pack(value) if kind.bytes()[0] < 0x8F else None
-        if twice is None:  # 16 fields and more have a longer head
-            (count,) = struct.unpack(">H", kind.bytes()[1:3])
-            twice = struct.pack(">BH", 0xDE, count + 1) + kind.bytes()[3:] + pack(name) + pack(value)
+        head = kind.bytes()[0]
+        long = head == 0xDE  # 16 fields and more
+        count, body = (
+            (struct.unpack(">H", kind.bytes()[1:3])[0], kind.bytes()[3:]) if long else (head & 15, kind.bytes()[1:])
+        )
+        twice = struct.pack(">BH", 0xDE, count + 1) + body + pack(name) + pack(value)
         assert "twice" in refusal(kind, twice).message
     assert "twice" in refusal(kind, with_value("added", b"\x82\xa1a\x01\xa1a\x01")).message
 

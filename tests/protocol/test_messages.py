@@ -38,6 +38,7 @@ WRONG: dict[type, tuple[Any, ...]] = {
     type(None): (b"", [], {}),
 }
 NULLABLE = {
+    ("TwistEstimate", "covariance"),
     ("CameraInfo", "height_m"),
     ("StreamStatus", "latency_ms"),
     ("HealthReply", "latency_ms"),
@@ -79,6 +80,7 @@ OUT_OF_BOUND: dict[str, dict[str, tuple[Any, ...]]] = {
         "digest": ("", "5e" * 31, "5E" * 32, "5e" * 33, "5e" * 32 + "\n", "xy" * 32),
         "epoch": (-1, 1 << 63),
         "events": (-1, 1 << 63),
+        "covariance": ([], [0.0] * 35, [0.0] * 37, [0.0, 1.0] + [0.0] * 34, [-1.0] + [0.0] * 35),
         "trace.received_ns": (1 << 63,),
     },
     "StreamStatus": {

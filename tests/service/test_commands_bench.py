@@ -29,6 +29,27 @@ def test_peers_that_are_not_installed_are_named(capsys, monkeypatch):
     assert "faery" in capsys.readouterr().err
 
 
+def test_packets_over_a_real_link_are_counted_as_plain_numpy_counts_them(capsys):
+    assert main(["bench", "wire", "--quick", "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)
+    assert row["peer"] == "receive and frombuffer"
+    assert row["equal"]
+
+
+def test_a_machine_of_narrow_vectors_gives_equal_answers(capsys):
+    assert main(["bench", "narrow", "--quick", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert all(row["equal"] and row["name"].endswith("AVX2 at most") for row in found)
+
+
+def test_another_processor_has_no_narrow_row_and_says_so(capsys, monkeypatch):
+    monkeypatch.setattr("platform.machine", lambda: "aarch64")
+    assert main(["bench", "narrow", "--json"]) == 0
+    out, err = capsys.readouterr()
+    assert json.loads(out) == []
+    assert "aarch64" in err
+
+
 def test_an_unknown_benchmark_is_refused(capsys):
     with pytest.raises(SystemExit) as refused:
         main(["bench", "cooking"])

@@ -1,13 +1,20 @@
+import copy
 import itertools
+from dataclasses import replace
 
 import pytest
+import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from neurove_core import bundle
+from neurove_core.uncertainty import Uncertainty
 from protocol import CameraInfo, Flag, Sensor
 from protocol.errors import InvalidField
+from service.model_slot import ModelSlot
 from service.stream import Arrival, Stream
 from tests.builders import make_packet, make_packets
+from tests.service.conftest import SMALL
 
 WINDOW_US = 50_000
 
@@ -215,3 +222,26 @@ def test_few_events_and_a_young_state_are_flagged(stream):
     assert flagged(estimates, Flag.SETTLING) == [0, 1, 2, 3]
     assert flagged(estimates, Flag.RESET) == [0]
     assert all(Flag.UNTRAINED in one.flags for one in estimates)
+
+
+def test_an_estimate_of_a_calibrated_model_carries_its_covariance_and_says_when_it_is_uncertain(tmp_path):
+    plain = bundle.untrained(1, SMALL, "one")
+    network = copy.deepcopy(plain.network)
+    network.add_spread()  # sigma is 1 in every axis
+    sure, unsure = (
+        replace(plain, network=network, uncertainty=Uncertainty(torch.eye(6), bound, "a test")) for bound in (1e6, 1e-6)
+    )
+    for model, flags in ((sure, []), (unsure, [0, 1, 2, 3])):
+        path = tmp_path / "model.safetensors"
+        bundle.save(model, path)
+        estimates = feed(Stream("cam0", ModelSlot(str(path))), make_packets(60))
+        assert flagged(estimates, Flag.UNCERTAIN) == flags
+        assert estimates[-1].covariance == tuple(torch.eye(6).flatten().tolist())
+        assert estimates[-1].sigma == (1,) * 6
+        assert type(estimates[-1]).decode(estimates[-1].encode()) == estimates[-1]
+
+
+def test_an_estimate_of_a_model_without_calibration_has_no_covariance(stream):
+    (newest, *_) = reversed(feed(stream, make_packets(60)))
+    assert (newest.covariance, newest.sigma) == (None, None)
+    assert Flag.UNCERTAIN not in newest.flags

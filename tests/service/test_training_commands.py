@@ -36,7 +36,8 @@ SOURCE = "sim://street?seed=3&seconds=0.8&camera=pinhole:24x18:75"
 def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("train")
     (folder / "tiny.toml").write_text(CONFIG)
-    assert cli.main(["train", str(folder / "tiny.toml"), "--out", str(folder / "out"), "--json"]) == 0
+    arguments = ["train", str(folder / "tiny.toml"), "--out", str(folder / "out"), "--calibration", "16", "--json"]
+    assert cli.main(arguments) == 0
     return folder
 
 
@@ -62,7 +63,9 @@ def test_training_leaves_a_bundle_a_checkpoint_and_its_account(trained):
 def test_a_finished_run_resumed_gives_the_same_model(trained, run):
     path = trained / "out" / "tiny.safetensors"
     weights = bundle.load(path).network.state_dict()
-    code, out, err = run("train", str(trained / "tiny.toml"), "--out", str(trained / "out"), "--resume")
+    code, out, err = run(
+        "train", str(trained / "tiny.toml"), "--out", str(trained / "out"), "--resume", "--calibration", "16"
+    )
     assert (code, out.startswith("wrote ")) == (0, True)
     assert "simulated" not in err
     again = bundle.load(path).network.state_dict()
@@ -86,7 +89,7 @@ def test_evaluate_tells_people_a_table_and_draws(trained, run, tmp_path):
     assert {"tiny", "zero velocity", "mean of the truth", "wy"} <= {line[:24].strip() for line in out.splitlines()} | {
         line.split()[0] for line in out.splitlines() if line
     }
-    assert err.count("wrote ") == 2
+    assert err.count("wrote ") == 4  # the drive and the reliability, each as PNG and SVG
     assert {file.suffix for file in (tmp_path / "plots").iterdir()} == {".png", ".svg"}
 
 
@@ -122,3 +125,38 @@ def test_a_wrong_configuration_ends_in_one_line(run, tmp_path):
     code, _, err = run("train", str(tmp_path / "bad.toml"))
     assert (code, err.count("\n")) == (2, 1)
     assert "recipe.steps" in err
+
+
+def test_training_ends_with_a_calibrated_model_and_calibrating_again_tells_how_well_it_holds(trained, run):
+    path = trained / "out" / "tiny.safetensors"
+    assert bundle.load(path).uncertainty.provenance.startswith("neurove calibrate: 16 simulated sequences")
+    arguments = (
+        "calibrate",
+        str(path),
+        "--config",
+        str(trained / "tiny.toml"),
+        "--data",
+        str(trained / "out" / "data"),
+    )
+    out = trained / "again.safetensors"
+    code, text, err = run(*arguments, "--sequences", "16", "--out", str(out))
+    assert (code, "simulated" in err) == (0, False)
+    assert text.startswith(f"wrote {out}\nshare of the truth in the 90% interval")
+    assert bundle.load(out).digest == bundle.load(path).digest
+    code, text, _ = run(*arguments, "--sequences", "16", "--out", str(out), "--json")
+    assert json.loads(text)["groups"]["as it is"]["vz"]["0.9"] > 0.8
+
+
+def test_a_calibrated_model_is_evaluated_by_its_coverage_and_the_reliability_is_drawn(trained, run, tmp_path):
+    path = trained / "out" / "tiny.safetensors"
+    code, text, _ = run("evaluate", str(path), SOURCE, "--plot", str(tmp_path), "--json")
+    told = json.loads(text)["uncertainty"]
+    assert code == 0
+    assert set(told["coverage"]) == {"vx", "vy", "vz", "wx", "wy", "wz"}
+    assert told["coverage"]["wy"]["0.5"] <= told["coverage"]["wy"]["0.99"] <= 1
+    assert told["per_axis"]["vz"]["median_sigma_m_s"] > 0
+    assert (tmp_path / "reliability.png").stat().st_size > 1000
+    _, text, _ = run("evaluate", str(path), SOURCE)
+    assert "share of the truth in its interval" in text
+    _, text, _ = run("evaluate", "untrained", SOURCE)
+    assert "neurove calibrate gives it one" in text

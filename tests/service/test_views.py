@@ -42,6 +42,16 @@ def test_a_board_shows_the_newest_velocity_its_flags_and_every_loss(stream):
         assert word in text
 
 
+def test_a_board_shows_how_far_off_each_axis_may_be(stream):
+    board = Board()
+    for estimate in (one for packet in make_packets(60) for one in stream.accept(packet, Arrival(1, 2))):
+        covariance = [0.0] * 36
+        covariance[0], covariance[35] = 0.0625, 4e8
+        board.on_estimate(estimate.model_copy(update={"covariance": tuple(covariance)}))
+    assert "±0.250 m/s" in seen(board)
+    assert "±20000 rad/s" in seen(board)
+
+
 def test_a_board_counts_estimates_that_did_not_come(stream):
     board = Board()
     estimates = [one for packet in make_packets(60) for one in stream.accept(packet, Arrival(1, 2))]

@@ -1,0 +1,67 @@
+"""The equal-size network without spikes, a baseline: convolutions, LSTM and readout as NeuroVE has them."""
+
+import itertools
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from neurove_core import carried
+from neurove_core.cells import readout_step
+from neurove_core.config import ModelConfig
+
+
+class AnnState(NamedTuple):
+    """All that streams from window to window, for a batch of B streams."""
+
+    h: Tensor  # of the LSTM (L, B, N)
+    c: Tensor  # (L, B, N)
+    readout: Tensor  # potential of the outputs (B, 6n)
+
+    def finite(self) -> bool:
+        """Whether no number of it is nan or infinite."""
+        return carried.finite(self)
+
+
+class Ann(nn.Module):
+    """As `network.NeuroVE`, with a ReLU for each LIF, and torch's LSTM for the ASLSTM; no other difference.
+
+    What has no counterpart: membranes of the feature extractor, which would be a memory of its own.
+    """
+
+    def __init__(self, config: ModelConfig) -> None:
+        super().__init__()
+        net = config.network
+        self.config = config
+        self.bins = config.window.bins
+        rows, columns = config.canonical.height, config.canonical.width
+        self.convs, self.norms = nn.ModuleList(), nn.ModuleList()
+        for a, b in itertools.pairwise((2 * self.bins, *net.channels)):
+            self.convs.append(nn.Conv2d(a, b, 3, stride=2, padding=1, bias=False))
+            self.norms.append(nn.BatchNorm2d(b))
+            rows, columns = (rows + 1) // 2, (columns + 1) // 2
+        self.project = nn.Linear(net.channels[-1] * rows * columns, net.features, bias=False)
+        self.project_norm = nn.BatchNorm1d(net.features)
+        self.lstm = nn.LSTM(net.features, net.hidden, net.cells)
+        self.readout = nn.Linear(net.hidden, 6 * self.bins)
+        self.kappa_logit = nn.Parameter(torch.tensor(-1.386))  # sigmoid gives 0.2
+
+    def initial_state(self, batch: int = 1) -> AnnState:
+        """Every memory of `batch` streams at rest."""
+        zeros, net = self.readout.weight.new_zeros, self.config.network
+        shape = (net.cells, batch, net.hidden)
+        return AnnState(zeros(shape), zeros(shape), zeros(batch, 6 * self.bins))
+
+    def forward(self, spikes: Tensor, state: AnnState) -> tuple[Tensor, AnnState]:
+        """Velocities of T consecutive windows, and the state after them; see `NeuroVE.forward`."""
+        steps, batch = spikes.shape[:2]
+        x = spikes.flatten(0, 1).contiguous(memory_format=torch.channels_last)
+        for conv, norm in zip(self.convs, self.norms, strict=True):
+            x = torch.relu(norm(conv(x)))
+        features = self.project_norm(self.project(x.flatten(1))).unflatten(0, (steps, batch))
+        out, (h, c) = self.lstm(features, (state.h, state.c))
+        y, kappa, answers = state.readout, torch.sigmoid(self.kappa_logit), []
+        for z in out:
+            y = readout_step(z, y, self.readout.weight, self.readout.bias, kappa)
+            answers.append(y)
+        return torch.stack(answers).view(steps, batch, self.bins, 6), AnnState(h, c, y)

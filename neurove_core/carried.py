@@ -1,0 +1,36 @@
+"""What a network carries from window to window: tensors in named tuples, nested in whatever way."""
+
+from collections.abc import Iterator
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+S = TypeVar("S")
+
+
+def tensors_of(state: Any) -> Iterator[Tensor]:
+    """All tensors of a state, in its order.
+
+    >>> from neurove_core.neurons import LIFState
+    >>> [float(one) for one in tensors_of((LIFState(torch.tensor(1.0)), torch.tensor(2.0)))]
+    [1.0, 2.0]
+    """
+    if isinstance(state, Tensor):
+        yield state
+        return
+    for part in state:
+        yield from tensors_of(part)
+
+
+def finite(state: Any) -> bool:
+    """Whether no number of a state is nan or infinite."""
+    return all(bool(torch.isfinite(tensor).all()) for tensor in tensors_of(state))
+
+
+def detached(state: S) -> S:
+    """The state without its past: gradients do not flow into the chunk before."""
+    if isinstance(state, Tensor):
+        return state.detach()  # type: ignore[return-value]  # S is Tensor here
+    parts = [detached(part) for part in state]  # type: ignore[attr-defined]  # a tuple, by what a state is
+    return type(state)(*parts) if hasattr(state, "_fields") else type(state)(parts)  # type: ignore[call-arg]  # tuples

@@ -1,0 +1,227 @@
+"""What the velocity experiment judges on, and the real drives that it also learns from: all of it simulated once, kept.
+
+No scene and no way of it is one that a configuration of ours trains on: those have seeds from 1,000,000 on.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from neurove_core.baselines import angular
+from neurove_core.config import ModelConfig
+from neurove_core.files import write_whole
+from neurove_core.sim.camera import named_camera
+from neurove_core.sim.pixels import USUAL, PixelConfig
+from neurove_core.sim.simulate import Simulation, simulate
+from neurove_core.sim.trajectory import Trajectory, driving, hand_held, parse_trajectory
+from neurove_core.training.data import FORMAT, Part, save, sequence_of
+from protocol.errors import InvalidField
+from protocol.events import Events
+
+CAMERA: Final = "davis346-half"
+"""MVSEC's equidistant lens and sensor, with pixels of twice the size."""
+
+HEIGHT_M: Final = 1.5
+DAY1, DAY2 = "mvsec/outdoor_day1_odom.h5", "mvsec/outdoor_day2_odom.h5"
+"""MVSEC's poses in a folder of recordings."""
+
+DAY1_TRAINED_S: Final = 150.0
+"""How much of day 1 is learned from; the rest of its 257 s, some seconds later, is judged on."""
+
+_DAY1_TESTED_S: Final = range(154, 245, 10)  # where each begins
+_DAY2_S: Final = 600.0
+_TRAIN_DRIVES: Final = 48  # of them 38 along day 2
+_HAND_SLOWED: Final = 4.0
+_QUICK_CAMERA: Final = "pinhole:24x18:75"
+_QUICK_S: Final = 1.0
+_WINDOW_US: Final = 50_000  # of contrast maximisation
+_CM_INSTANTS: Final = 5  # per recording
+
+
+class Item(NamedTuple):
+    """One recording to judge on, or to learn from."""
+
+    group: str
+    name: str
+    simulation: Simulation
+
+
+GROUPS: Final = {
+    "driving": "unseen streets at 1.5 m, MVSEC's lens",
+    "heights": "unseen streets, camera at 0.3 to 2.5 m",
+    "cameras": "unseen streets, five other lenses and resolutions",
+    "pixels": "unseen streets, thresholds 0.12 and 0.5, and 50 times the noise (5 Hz per pixel)",
+    "hand-held": "a camera waved about in unseen rooms, at a quarter of a wild hand's speed",
+    "bare street": "unseen streets whose ground has no texture",
+    "town 1": "24 s through an unseen town",
+    "town 2": "24 s through another",
+    "mvsec": "the unused part of MVSEC's outdoor_day1, its real way through unseen streets",
+}
+"""What is judged on, by name."""
+
+CM_GROUPS: Final = ("driving", "hand-held", "town 1", "town 2", "mvsec")
+"""Where contrast maximisation is asked too."""
+
+_CAMERAS: Final = ("pinhole:86x65:75", "pinhole:128x96:90", "pinhole:172x130:55", "davis240c", "pinhole:320x240:62")
+_PIXELS: Final = {
+    "threshold 0.12": USUAL.model_copy(update={"threshold_on": 0.12, "threshold_off": 0.12}),
+    "threshold 0.5": USUAL.model_copy(update={"threshold_on": 0.5, "threshold_off": 0.5}),
+    "noise 5 Hz": USUAL.model_copy(update={"shot_noise_hz": 5.0}),
+}
+
+
+def items(recordings: Path | None = None, *, quick: bool = False) -> list[Item]:
+    """All that is judged on, group by group.
+
+    Args:
+        recordings: where MVSEC's poses lie; without them its group is missing.
+        quick: the first of each group alone, a second long, through a tiny camera.
+    """
+    found = [
+        *(_street("driving", f"seed {seed}", seed, 8.0) for seed in range(6000, 6006)),
+        *(
+            _street("heights", f"{h} m", 6010 + i, 6.0, height_m=h)
+            for i, h in enumerate((0.3, 0.5, 0.8, 1.1, 2.0, 2.5))
+        ),
+        *(_street("cameras", name, 6000 + i, 6.0, camera=name) for i, name in enumerate(_CAMERAS)),
+        *(_street("pixels", name, 6000 + i, 6.0, pixels=made) for i, (name, made) in enumerate(_PIXELS.items())),
+        *(_item("hand-held", f"seed {seed}", "room", _waved(seed, 6.0), seed) for seed in range(6020, 6024)),
+        *(_item("bare street", f"seed {seed}", "bare-street", driving(seed, 6.0), seed) for seed in (6030, 6031)),
+        *(_street(f"town {number}", f"seed {7000 + number}", 7000 + number, 24.0) for number in (1, 2)),
+    ]
+    if recordings is not None and (recordings / DAY1).exists():
+        for start_s in _DAY1_TESTED_S:
+            way = _part(recordings / DAY1, start_s, 10.0)
+            found.append(_item("mvsec", f"from {start_s} s", "street", way, 8000 + start_s))
+    if not quick:
+        return found
+    firsts = {item.group: item for item in reversed(found)}
+    camera = named_camera(_QUICK_CAMERA, HEIGHT_M)
+    return [
+        item._replace(simulation=replace(item.simulation, lens=camera, duration_s=_QUICK_S))
+        for item in reversed(firsts.values())
+    ]
+
+
+def drives(recordings: Path | None, seconds: float, motion_px: float, *, quick: bool = False) -> list[Item]:
+    """What is learned from beside a configuration's sequences: MVSEC's day 2, and the first part of day 1.
+
+    Source: NeuroVE, section IV-A: trained on outdoor_day2 and a subset of outdoor_day1, judged on the rest of it.
+
+    Args:
+        recordings: where the poses lie; without them, nothing.
+        seconds: length of each.
+        motion_px: of the simulation, see `Simulation`.
+        quick: two of them, through a tiny camera.
+    """
+    if recordings is None or not all((recordings / day).exists() for day in (DAY1, DAY2)):
+        return []
+    count = 2 if quick else _TRAIN_DRIVES
+    on_day1 = max(1, round(count * DAY1_TRAINED_S / (DAY1_TRAINED_S + _DAY2_S)))
+    found: list[Item] = []
+    for day, number, until_s in ((DAY1, on_day1, DAY1_TRAINED_S), (DAY2, count - on_day1, _DAY2_S)):
+        for start in np.linspace(0, until_s - seconds - 1, number).round(2).tolist():
+            way = _part(recordings / day, start, seconds)
+            name = f"{Path(day).stem} from {start:g} s"
+            item = _item("drives", name, "street", way, 9000 + len(found), _QUICK_CAMERA if quick else CAMERA)
+            found.append(item._replace(simulation=replace(item.simulation, motion_px=motion_px)))
+    return found
+
+
+def _waved(seed: int, seconds: float) -> Trajectory:
+    """A wild hand's way at a quarter of its speed: some 87 deg/s in the root mean square."""
+    return Part(hand_held(seed, seconds), 0.0, _HAND_SLOWED, seconds)
+
+
+def _part(poses: Path, start_s: float, seconds: float) -> Trajectory:
+    return parse_trajectory(f"{poses}?start={start_s:g}", seconds)
+
+
+def _street(
+    group: str,
+    name: str,
+    seed: int,
+    seconds: float,
+    *,
+    camera: str = CAMERA,
+    height_m: float = HEIGHT_M,
+    pixels: PixelConfig = USUAL,
+) -> Item:
+    return _item(group, name, "street", driving(seed, seconds), seed, camera, height_m, pixels)
+
+
+def _item(
+    group: str,
+    name: str,
+    scene: str,
+    way: Trajectory,
+    seed: int,
+    camera: str = CAMERA,
+    height_m: float = HEIGHT_M,
+    pixels: PixelConfig = USUAL,
+) -> Item:
+    return Item(group, name, simulate(scene, way, named_camera(camera, height_m), pixels, seed=seed))
+
+
+class Kept:
+    """Simulated items in a folder; what is missing is made.
+
+    Args:
+        folder: of all items, whatever the model.
+        config: how its windows are cut and what it sees.
+    """
+
+    def __init__(self, folder: Path, config: ModelConfig) -> None:
+        self._folder, self._config = folder / "held-out", config
+
+    def path(self, item: Item) -> Path:
+        """The file of an item, as `training.data.save` writes it."""
+        return self._folder / f"{self._key(item)}.safetensors"
+
+    def turning_path(self, item: Item) -> Path:
+        """The file of what contrast maximisation says of an item."""
+        return self._folder / f"{self._key(item)}.turning.json"
+
+    def fill(self, wanted: list[Item]) -> Iterator[Item]:
+        """Make all that is missing; yields each item once it is there."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+        for item in wanted:
+            if not self.path(item).exists():
+                save(sequence_of(item.simulation, self._config), self.path(item))
+            if item.group in CM_GROUPS and not self.turning_path(item).exists():
+                told = list(_turning(item.simulation))
+                write_whole(self.turning_path(item), json.dumps(told).encode())
+            yield item
+
+    def _key(self, item: Item) -> str:
+        made = item.simulation
+        kind: list[Any] = [FORMAT, *item[:2], made.name, made.seed, made.duration_s, made.motion_px, made.lens.name]
+        kind += [made.lens.info.model_dump(), made.lens.pitch_deg, made.pixels.model_dump()]
+        kind += [self._config.window.model_dump(), self._config.canonical.model_dump()]
+        return hashlib.sha256(json.dumps(kind, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _turning(simulation: Simulation) -> Iterator[dict[str, Any]]:
+    """What contrast maximisation says at some instants: `truth` and `answer` [rad/s], mean over a window."""
+    last_s = simulation.duration_s - _WINDOW_US / 1e6
+    count = _CM_INSTANTS if simulation.duration_s > _QUICK_S else 1
+    for start_s in np.linspace(0.5, last_s - 0.02, count).round(2).tolist():
+        start_us = round(start_s * 1e6)
+        events = Events.empty()
+        for step in simulation.steps(start_s):
+            events = Events.join([events, step.events])
+            if step.stop_us >= start_us + _WINDOW_US:
+                break
+        events = events.span(0, int(events.t.searchsorted(start_us + _WINDOW_US)))
+        t_s = start_s + (np.arange(20) + 0.5) * _WINDOW_US / 20e6
+        truth = simulation.trajectory.twist(t_s)[:, 3:].mean(axis=0)
+        try:
+            answer = angular(events, simulation.lens.info).w_rad_s
+        except InvalidField:  # next to no events: it stood still
+            answer = np.zeros(3)
+        yield {"t_s": start_s, "truth": truth.tolist(), "answer": answer.tolist()}

@@ -1,0 +1,300 @@
+"""What a model makes of real events that nobody tuned it on: one check after the other, each with the figure asked for.
+
+The recordings are third parties' and do not come with the project; a check whose recording is not there says so.
+"""
+
+import json
+import math
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurove_core.baselines import angular
+from neurove_core.estimator import Estimator
+from neurove_core.evaluation import NoTruth, answer
+from neurove_core.experiments import save_text
+from neurove_core.io import open_source
+from neurove_core.io.recording import Recording
+from neurove_core.metrics import SKIP_S
+from neurove_core.sim.camera import CAMERAS
+from protocol import CameraInfo
+from protocol.errors import NeuroVEError
+from protocol.events import Events
+
+Array = NDArray[np.float64]
+
+REST_M_S: Final = 0.1
+REST_RAD_S: Final = 0.05
+"""At most so much is called rest; the speed for a camera 1 m above the ground, for none of these tells its height."""
+
+_REST_S: Final = (
+    0.1,
+    0.6,
+)  # after the first window, when shapes_rotation_1.43s rests: until 0.65 s; the first two windows settle
+_LEAST_EVENTS: Final = 500  # of a window from which contrast maximisation tells a rate; with fewer it is at rest
+
+
+class Measured(NamedTuple):
+    """What came out of a check, and what it was made of."""
+
+    value: float
+    made_of: dict[str, Any]
+
+
+class Check(NamedTuple):
+    """One thing that is asked of a model on one recording."""
+
+    recording: str  # its place in the folder of recordings
+    what: str
+    least: float
+    most: float
+    measure: Callable[[Estimator, Path], Measured]
+
+    @property
+    def asked(self) -> str:
+        """The bound, for people."""
+        if math.isinf(self.most):
+            return "above 0" if self.least < 1e-3 else f"at least {self.least:g}"
+        return f"at most {self.most:g}" if math.isinf(self.least) else f"{self.least:g} to {self.most:g}"
+
+
+def run(estimator: Estimator, folder: Path) -> Iterator[dict[str, Any]]:
+    """Judge a model, check by check.
+
+    Args:
+        estimator: the model.
+        folder: where the recordings lie.
+
+    Yields:
+        per check a row: recording, what, asked, value, met, made_of, skipped; where `skipped` says why it was not made,
+        value and met are None.
+    """
+    for check in CHECKS:
+        row: dict[str, Any] = {"recording": check.recording, "what": check.what, "asked": check.asked}
+        empty: dict[str, Any] = {"value": None, "met": None, "made_of": {}}
+        if not (folder / check.recording).exists():
+            yield row | empty | {"skipped": "the recording is not there"}
+            continue
+        try:
+            found = check.measure(estimator, folder)
+        except NeuroVEError as error:
+            yield row | empty | {"skipped": error.message}
+            continue
+        met = check.least <= found.value <= check.most
+        yield row | {"value": found.value, "met": met, "made_of": found.made_of, "skipped": None}
+
+
+def markdown(rows: list[dict[str, Any]], model: str) -> str:
+    """The rows as a table in Markdown."""
+    lines = [
+        f"Real events, no tuning on them, {model}",
+        "",
+        "| recording | what | asked | found | |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    for row in rows:
+        found = f"skipped: {row['skipped']}" if row["skipped"] else f"{row['value']:.3g}"
+        verdict = {True: "yes", False: "no", None: ""}[row["met"]]
+        made_of = ", ".join(f"{name} {_shown(value)}" for name, value in row["made_of"].items())
+        found += made_of and f" ({made_of})"
+        lines.append(f"| {row['recording']} | {row['what']} | {row['asked']} | {found} | {verdict} |")
+    return "\n".join(lines) + "\n"
+
+
+def save(rows: list[dict[str, Any]], about: dict[str, Any], out: Path) -> list[Path]:
+    """Write real.json and real.md into a folder; returns both.
+
+    Args:
+        rows: of `run`.
+        about: the model, as its ModelInfo, and how this was made.
+        out: folder, made where it is missing.
+
+    Raises:
+        InvalidField: a file can not be written.
+    """
+    told = json.dumps(about | {"checks": rows}, indent=1) + "\n"
+    return [save_text(told, out / "real.json"), save_text(markdown(rows, title(about)), out / "real.md")]
+
+
+def title(about: dict[str, Any]) -> str:
+    """The model's name and the beginning of its digest, as a table names it."""
+    return f"model `{about['model']['name']}` ({about['model']['digest'][:12]})"
+
+
+def _shown(value: float | list[float]) -> str:
+    return " ".join(f"{one:.3g}" for one in value) if isinstance(value, list) else f"{value:.3g}"
+
+
+# --- what each check measures -----------------------------------------------------------------------------------------
+
+
+class _Seen(NamedTuple):
+    """A model's answers to a recording, window by window."""
+
+    recording: Recording
+    camera: CameraInfo
+    start_us: NDArray[np.int64]  # (W,) of the windows, all that lie wholly within the recording
+    since_s: Array  # (W,) of the windows' starts, from the first on
+    twist: Array  # (W, 6) mean over a window's bins
+    events: NDArray[np.int64]  # (W,)
+    low_activity: NDArray[np.bool_]  # (W,)
+    window_us: int
+
+    @property
+    def end_us(self) -> int:
+        """Of the last window."""
+        return int(self.start_us[-1]) + self.window_us
+
+    def later(self, start_s: float, stop_s: float = math.inf) -> NDArray[np.bool_]:
+        """Which windows begin in this span, from the first window on."""
+        return (self.since_s >= start_s) & (self.since_s < stop_s)
+
+
+def _seen(estimator: Estimator, path: Path) -> _Seen:
+    """Answers to a recording; where it tells no lens, that of a DAVIS of its size is assumed.
+
+    That of shapes_rotation_1.43s is the very one. A DVXplorer is taken for a DAVIS240C with larger pixels: it rests.
+    """
+    recording = open_source(str(path))
+    camera = recording.camera("real") or CAMERAS["davis346" if "davis346" in path.name else "davis240c"]
+    if camera.sensor != recording.sensor:
+        wider, higher = recording.sensor.width / camera.width, recording.sensor.height / camera.height
+        size = {"width": recording.sensor.width, "height": recording.sensor.height}
+        lens = {"fx": camera.fx * wider, "fy": camera.fy * higher, "cx": camera.cx * wider, "cy": camera.cy * higher}
+        camera = camera.model_copy(update=size | lens)
+    said = answer(estimator, recording, camera)
+    window_us = said.bin_us * said.twists.shape[1]
+    first_us, last_us = int(next(recording.chunks()).t[0]), _last_us(recording)
+    whole = (said.start_us >= first_us) & (said.start_us + window_us <= last_us)
+    if not whole.any():
+        raise NoTruth(f"{path.name}: it has no whole window of {window_us / 1e3:g} ms")
+    start_us = said.start_us[whole]
+    twist, low = said.twists.mean(axis=1)[whole], said.low_activity[whole]
+    return _Seen(recording, camera, start_us, (start_us - start_us[0]) / 1e6, twist, said.events[whole], low, window_us)
+
+
+def _last_us(recording: Recording) -> int:
+    last_us = 0
+    for chunk in recording.chunks():
+        last_us = int(chunk.t[-1])
+    return last_us
+
+
+def _pitch(name: str, estimator: Estimator, folder: Path) -> Measured:
+    seen = _seen(estimator, folder / name)
+    truth = seen.recording.twists()
+    if truth is None:
+        raise NoTruth("its ground-truth_3Dcam.txt is not beside it")
+    true, found = float(np.nanmean(truth.twist[:, 3])), float(seen.twist[seen.later(SKIP_S), 3].mean())
+    return Measured(found / true, {"estimate [rad/s]": found, "truth [rad/s]": true})
+
+
+def _direction(name: str, estimator: Estimator, folder: Path) -> Measured:
+    seen = _seen(estimator, folder / name)
+    truth = seen.recording.twists()
+    if truth is None:
+        raise NoTruth("its groundtruth.txt is not beside it")
+    true = truth.at(seen.start_us + seen.window_us // 2)
+    known = np.isfinite(true).all(axis=1)
+    a, b = seen.twist[known, :3].mean(0), true[known, :3].mean(0)
+    cosine = float(a @ b / max(1e-12, float(np.linalg.norm(a) * np.linalg.norm(b))))
+    angle = math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
+    return Measured(angle, {"estimate at 1 m [m/s]": a.tolist(), "truth [m/s]": b.tolist()})
+
+
+def _rate(name: str, estimator: Estimator, folder: Path) -> Measured:
+    seen = _seen(estimator, folder / name)
+    true = angular(_between(seen.recording, int(seen.start_us[0]), seen.end_us), seen.camera).w_rad_s
+    found = seen.twist[:, 3:].mean(axis=0)
+    off = float(np.linalg.norm(found - true) / np.linalg.norm(true))
+    return Measured(off, {"estimate [rad/s]": found.tolist(), "contrast maximisation [rad/s]": true.tolist()})
+
+
+def _profile(name: str, estimator: Estimator, folder: Path) -> Measured:
+    seen = _seen(estimator, folder / name)
+    chosen = seen.later(SKIP_S)
+    starts = seen.start_us[chosen].tolist()
+    true = np.array([_yaw(_between(seen.recording, t, t + seen.window_us), seen.camera) for t in starts])
+    return _alike(seen.twist[chosen, 4], true)
+
+
+def _yaw(events: Events, lens: CameraInfo) -> float:
+    return float(angular(events, lens).w_rad_s[1]) if events.n >= _LEAST_EVENTS else 0.0
+
+
+def _turning_at_rest(name: str, estimator: Estimator, folder: Path) -> Measured:
+    seen = _seen(estimator, folder / name)
+    rates = np.linalg.norm(seen.twist[seen.later(*_REST_S), 3:], axis=1)
+    return Measured(float(rates.max()), {"median": float(np.median(rates))})
+
+
+def _gyro_profile(name: str, estimator: Estimator, folder: Path) -> Measured:
+    true, found = _beside_gyro(name, estimator, folder)
+    return _alike(found, true)
+
+
+def _gyro_sign(name: str, estimator: Estimator, folder: Path) -> Measured:
+    true, found = _beside_gyro(name, estimator, folder)
+    made_of = {"estimate [rad/s]": float(found.mean()), "gyro [rad/s]": float(true.mean())}
+    return Measured(float(found.mean() / true.mean()), made_of)
+
+
+def _beside_gyro(name: str, estimator: Estimator, folder: Path) -> tuple[Array, Array]:
+    """Yaw rate by the gyro and by the model, (W,) each [rad/s]."""
+    seen = _seen(estimator, folder / name)
+    samples = list(seen.recording.imu())
+    t, yaw = np.concatenate([one.t for one in samples]), np.concatenate([one.gyro_rad_s[:, 1] for one in samples])
+    chosen = seen.later(SKIP_S)
+    spans = [t.searchsorted([start, start + seen.window_us]) for start in seen.start_us[chosen]]
+    return np.array([yaw[a:b].mean() for a, b in spans]), seen.twist[chosen, 4]
+
+
+def _speed_at_rest(name: str, estimator: Estimator, folder: Path) -> Measured:
+    seen = _seen(estimator, folder / name)
+    chosen = seen.later(_REST_S[0])
+    speed, rate = (np.linalg.norm(seen.twist[chosen, part], axis=1) for part in (slice(0, 3), slice(3, 6)))
+    return Measured(float(np.median(speed)), {"turning [rad/s]": float(np.median(rate))})
+
+
+def _low_activity(name: str, estimator: Estimator, folder: Path) -> Measured:
+    seen = _seen(estimator, folder / name)
+    return Measured(float(seen.low_activity.mean()), {"events in a window": float(np.median(seen.events))})
+
+
+def _alike(found: Array, true: Array) -> Measured:
+    """Correlation, beside the slope of the one over the other."""
+    spread = float(found.std() * true.std())
+    covariance = float(((found - found.mean()) * (true - true.mean())).mean())
+    return Measured(covariance / max(spread, 1e-12), {"slope": covariance / float(true.var()), "windows": found.size})
+
+
+def _between(recording: Recording, start_us: int, stop_us: int) -> Events:
+    events = Events.join([Events.empty(), *recording.since(start_us)])
+    return events.span(0, int(events.t.searchsorted(stop_us)))
+
+
+def _check(recording: str, what: str, span: tuple[float, float], measure: Callable[..., Measured]) -> Check:
+    return Check(recording, what, *span, partial(measure, recording))
+
+
+CHECKS: Final = (
+    _check("evbench/seq_0001_e.mat", "rotation about x over its truth", (0.7, 1.3), _pitch),
+    _check("evbench/seq_0002_e.mat", "rotation about x over its truth", (0.7, 1.3), _pitch),
+    _check("slider_depth/events_chunk.txt", "direction of motion, off by [deg]", (-math.inf, 20), _direction),
+    _check(
+        "ecd/shapes_rotation/events.txt", "rate of turning, off contrast maximisation's by", (-math.inf, 0.25), _rate
+    ),
+    _check("ecd/shapes_rotation_1.43s.txt", "yaw, correlation with contrast maximisation", (0.8, math.inf), _profile),
+    _check("ecd/shapes_rotation_1.43s.txt", "turning at rest [rad/s]", (-math.inf, REST_RAD_S), _turning_at_rest),
+    _check("aedat2/IMU_translBoxes.aedat", "yaw, correlation with the gyro", (0.8, math.inf), _gyro_profile),
+    _check("aedat2/IMU_translBoxes.aedat", "mean yaw over the gyro's (its sign)", (1e-6, math.inf), _gyro_sign),
+    _check("aedat4/davis346.aedat4", "speed at rest at 1 m [m/s]", (-math.inf, REST_M_S), _speed_at_rest),
+    _check("aedat4/davis346.aedat4", "share of windows flagged low activity", (0.5, math.inf), _low_activity),
+    _check("aedat4/dvxplorer.aedat4", "speed at rest at 1 m [m/s]", (-math.inf, REST_M_S), _speed_at_rest),
+    _check("aedat4/dvxplorer.aedat4", "share of windows flagged low activity", (0.5, math.inf), _low_activity),
+)
+"""All checks, in the order of their rows."""

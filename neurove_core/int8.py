@@ -1,0 +1,230 @@
+"""Convolutions in 8-bit integers, for networks whose bundle asks for them: same spikes as in float32, bit for bit.
+
+    precision = "int8": every convolution's weights are whole multiples q of a step per output channel, |q| <= 127,
+    and the network's input is rounded to 1/32. Spikes are 0 or 1.
+
+So a convolution is a sum of products of whole numbers, exact in any order and any arithmetic that can hold it: int32,
+or float32 below 2**24. The norm's factor and offset follow in float32, one product and one sum for each neuron, and
+then the LIF scan. `neurons.plain()` computes the same with the public float32 operators; tests compare bit for bit.
+Training sees the rounding (`rounded`) and passes gradients through it.
+"""
+
+from collections.abc import Callable
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import conv2d
+
+from neurove_core.compiled import compiled
+from neurove_core.convolution import Convolution, say_once
+from neurove_core.neurons import LIFParams, LIFState, is_plain, lif_scan_reference
+
+LEVELS: Final = 32
+"""Of the input per unit; log1p of a saturated count, 5.5, becomes 177."""
+
+_MOST: Final = 127  # of a weight
+_EXACT: Final = 1 << 24  # whole numbers below this are exact in float32
+_BLOCK: Final = 1024  # neurons whose potentials stay in the first cache over all steps
+
+Array = NDArray[Any]
+
+
+class Quantised(NamedTuple):
+    """Weights as whole numbers."""
+
+    q: Tensor  # (C', C, 3, 3) int8
+    step: Tensor  # (C') float32, positive: weight = q * step
+
+
+def quantised(weight: Tensor) -> Quantised:
+    """The nearest multiples of a step per output channel, which is its largest weight / 127."""
+    largest = weight.detach().abs().flatten(1).amax(dim=1)
+    step = torch.where(largest > 0, largest, torch.ones_like(largest)) / _MOST
+    q = (weight.detach() / step.view(-1, 1, 1, 1)).round().clamp(-_MOST, _MOST)
+    return Quantised(q.to(torch.int8), step)
+
+
+def rounded(weight: Tensor) -> Tensor:
+    """The weights that `quantised` stands for, in float32; gradients pass as if nothing were rounded."""
+    q, step = quantised(weight)
+    return weight + (q * step.view(-1, 1, 1, 1) - weight).detach()
+
+
+def rounded_input(spikes: Tensor) -> Tensor:
+    """The input in steps of 1 / LEVELS."""
+    return codes(spikes).to(spikes.dtype) / LEVELS
+
+
+def codes(spikes: Tensor) -> Tensor:
+    """The input as whole numbers, uint8, layout kept."""
+    return (spikes * LEVELS).round_().clamp_(0, 255).to(torch.uint8)
+
+
+class Layer(NamedTuple):
+    """One block of the extractor: whole numbers in, spikes out."""
+
+    weights: Quantised
+    factor: Tensor  # (C') float32: of the norm and the steps
+    offset: Tensor  # (C') float32
+
+
+class Extractor:
+    """The feature extractor of one network in whole numbers.
+
+    Args:
+        layers: its blocks; the first sees codes, the others spikes.
+        sizes: rows and columns of each block's input.
+        lif: of its neurons.
+    """
+
+    def __init__(self, layers: list[Layer], sizes: list[tuple[int, int]], lif: LIFParams) -> None:
+        self._layers, self._lif = layers, lif
+        self._blocks = [(_over_a_block(layer.factor), _over_a_block(layer.offset)) for layer in layers]
+        tops = [255] + [1] * (len(layers) - 1)
+        self._plain = [plain_sums(layer.weights.q, top) for layer, top in zip(layers, tops, strict=True)]
+        self._fast = [sums(layer.weights.q, top, *size) for layer, top, size in zip(layers, tops, sizes, strict=False)]
+
+    def __call__(self, spikes: Tensor, membranes: tuple[LIFState, ...]) -> tuple[Tensor, tuple[LIFState, ...]]:
+        """Input (T * B, 2n, H, W), as float32 or as uint8 codes, to spikes (T * B, C', H', W') and potentials."""
+        x = (spikes if spikes.dtype == torch.uint8 else codes(spikes)).contiguous(memory_format=torch.channels_last)
+        after = []
+        for index, (layer, membrane) in enumerate(zip(self._layers, membranes, strict=True)):
+            if is_plain():
+                x, v = self._plain_fire(self._plain[index](x), layer, membrane.v)
+            else:
+                x, v = self._fire(self._fast[index](x), self._blocks[index], membrane.v)
+            after.append(LIFState(v))
+        return x.float(), tuple(after)
+
+    def _plain_fire(self, found: Tensor, layer: Layer, v: Tensor) -> tuple[Tensor, Tensor]:
+        currents = found * layer.factor.view(-1, 1, 1) + layer.offset.view(-1, 1, 1)
+        spikes, after = lif_scan_reference(currents.view(-1, *v.shape), LIFState(v), self._lif)
+        return spikes.flatten(0, 1).to(torch.uint8), after.v
+
+    def _fire(self, found: Tensor, block: tuple[Array, Array], v: Tensor) -> tuple[Tensor, Tensor]:
+        rows = found.permute(0, 2, 3, 1).contiguous()
+        before = np.ascontiguousarray(v.detach().numpy().transpose(0, 2, 3, 1))
+        after = np.empty_like(before)
+        spikes = torch.empty_like(rows, dtype=torch.uint8)
+        flat, decay, v_th = before.size, np.float32(self._lif.decay), np.float32(self._lif.v_th)
+        sums_of_steps, fired = rows.numpy().reshape(-1, flat), spikes.numpy().reshape(-1, flat)
+        _scan(sums_of_steps, *block, before.reshape(-1), after.reshape(-1), decay, v_th, fired)
+        return spikes.permute(0, 3, 1, 2), torch.from_numpy(after).permute(0, 3, 1, 2)
+
+
+def _over_a_block(by_channel: Tensor) -> Array:
+    """Numbers of the channels, again and again, for a block of neurons: a loop that the compiler turns into vectors."""
+    return by_channel.repeat(max(1, _BLOCK // by_channel.numel())).numpy()
+
+
+# --- sums of products of whole numbers --------------------------------------------------------------------------------
+
+
+def sums(q: Tensor, top: int, rows: int, columns: int) -> Convolution:
+    """A convolution of uint8 maps with int8 weights, its sums as float32, by this machine's 8-bit products.
+
+    The operator is private to torch, and on processors without such products it may saturate: at load it is tried on
+    the largest sums that there are. Where it is missing or wrong, `plain_sums` serves, slower; said once in the log.
+
+    Args:
+        q: (C', C, 3, 3) int8.
+        top: largest number of a map.
+        rows: of the map that it mostly sees.
+        columns: of the same.
+    """
+    if not _exact_in_float32(q, top):
+        return plain_sums(q, top)
+    try:
+        fast = _packed(q, rows, columns)
+        agrees = _agrees(q, top, rows, columns)
+    except (AttributeError, RuntimeError, NotImplementedError, TypeError) as error:
+        say_once("8-bit convolutions", str(error).partition("\n")[0])
+        return plain_sums(q, top)
+    if not agrees:
+        say_once("8-bit convolutions", "they compute something else")
+        return plain_sums(q, top)
+    return fast
+
+
+def plain_sums(q: Tensor, top: int) -> Convolution:
+    """The same by torch's public operator, in float32 where that holds every sum, else in float64."""
+    kind = torch.float32 if _exact_in_float32(q, top) else torch.float64
+    weight = q.to(kind).contiguous(memory_format=torch.channels_last)
+    return lambda x: conv2d(x.to(kind), weight, stride=2, padding=1).to(torch.float32)
+
+
+def _exact_in_float32(q: Tensor, top: int) -> bool:
+    return int(q.abs().to(torch.int64).flatten(1).sum(dim=1).max()) * top < _EXACT
+
+
+def _packed(q: Tensor, rows: int, columns: int) -> Convolution:
+    run: Callable[..., Tensor] = torch.ops.onednn.qconv2d_pointwise.default
+    one, zero = torch.ones(q.shape[0]), torch.zeros(q.shape[0], dtype=torch.int32)
+    where: tuple[list[int], ...] = ([2, 2], [1, 1], [1, 1])  # stride, padding, dilation
+    with torch.inference_mode():
+        own = torch.ops.onednn.qconv_prepack(q, one, 1.0, 0, *where, 1, [1, q.shape[1], rows, columns])
+
+    def convolve(x: Tensor) -> Tensor:
+        return run(x, 1.0, 0, own, one, zero, None, *where, 1, 1.0, 0, torch.float32, "none", [], "")
+
+    return convolve
+
+
+@torch.inference_mode()
+def _agrees(q: Tensor, top: int, rows: int, columns: int) -> bool:
+    """Whether the private operator is exact: on the largest sums, of both signs, and on random ones; 1 and 3 maps."""
+    generator = torch.Generator().manual_seed(0)
+    random = torch.randint(-_MOST, _MOST + 1, q.shape, generator=generator, dtype=torch.int8)
+    for weight in (torch.full_like(q, _MOST), torch.full_like(q, -_MOST), random, q):
+        if not _exact_in_float32(weight, top):
+            continue  # more than these weights can ever sum to
+        fast, plain = _packed(weight, rows, columns), plain_sums(weight, top)
+        for count in (1, 3):
+            x = torch.randint(0, top + 1, (count, q.shape[1], rows, columns), generator=generator, dtype=torch.uint8)
+            x[0] = top
+            x = x.contiguous(memory_format=torch.channels_last)
+            if not torch.equal(fast(x), plain(x)):
+                return False
+    return True
+
+
+@compiled
+def _scan(
+    found: Array,
+    factor: Array,
+    offset: Array,
+    before: Array,
+    after: Array,
+    decay: Any,
+    v_th: Any,
+    spikes: NDArray[np.uint8],
+) -> None:  # pragma: no cover (machine code)
+    """As scan._in_place, of currents found * factor + offset; channels vary fastest.
+
+    Args:
+        found: (T, N).
+        factor: of a block of neurons (M): those of the channels, again and again.
+        offset: of the same.
+        before: potentials (N).
+        after: potentials (N), written.
+        decay: per step.
+        v_th: firing threshold.
+        spikes: (T, N), written.
+    """
+    steps, n = found.shape
+    one, none = after.dtype.type(1), after.dtype.type(0)
+    for start in range(0, n, factor.size):
+        stop = min(start + factor.size, n)
+        v_before, v_now = before[start:stop], after[start:stop]
+        for i in range(stop - start):
+            v_now[i] = v_before[i]
+        for t in range(steps):
+            row, s = found[t, start:stop], spikes[t, start:stop]
+            for i in range(stop - start):
+                u = decay * v_now[i] + (row[i] * factor[i] + offset[i])
+                fires = u - v_th >= none
+                s[i] = np.uint8(fires)
+                v_now[i] = u * (none if fires else one)

@@ -1,0 +1,41 @@
+"""The networks that a model may be made of, by the `kind` of its configuration: NeuroVE and its learned baselines.
+
+All of them speak one protocol, so that training, evaluation and the estimator serve any:
+
+    network.initial_state(batch) -> state            tensors in named tuples, see `carried`
+    network(spikes, state) -> (twists, state)        (T, B, 2n, H, W) -> (T, B, n, 6), in scaled units
+
+The paper's w/o is a NeuroVE with `network.diffusion = false`.
+"""
+
+from collections.abc import Callable
+from typing import Final
+
+from torch import Tensor
+
+from neurove_core.ann import Ann, AnnState
+from neurove_core.config import ModelConfig
+from neurove_core.network import NetworkState, NeuroVE
+from neurove_core.snn_ang import SnnAng, SnnAngState
+
+Network = NeuroVE | Ann | SnnAng
+State = NetworkState | AnnState | SnnAngState
+
+KINDS: Final[dict[str, Callable[[ModelConfig], Network]]] = {"neurove": NeuroVE, "ann": Ann, "snn-ang": SnnAng}
+"""The classes by the kind of a configuration."""
+
+
+def make(config: ModelConfig) -> Network:
+    """The network of a configuration, its weights drawn anew."""
+    return KINDS[config.kind](config)
+
+
+def fired(state: State) -> dict[str, Tensor]:
+    """Which neurons fired in the step before, by layer; none of a network without spikes.
+
+    The state tells it: the membrane of a neuron of the feature extractor that has just fired is exactly 0.
+    """
+    membranes = () if isinstance(state, AnnState) else state.membranes
+    cells = state.cells if isinstance(state, NetworkState) else ()
+    layers = {f"block {number}": one.v == 0 for number, one in enumerate(membranes, 1)}
+    return layers | {f"cell {number}": one.s > 0 for number, one in enumerate(cells, 1)}

@@ -1,0 +1,122 @@
+"""An int8 network fires in 8-bit integers as in float32, bit for bit, and learns through the rounding."""
+
+import logging
+
+import pytest
+import torch
+
+from neurove_core import bundle, convolution, int8
+from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
+from neurove_core.encoding import to_codes, to_spikes
+from neurove_core.engine import Engine
+from neurove_core.estimator import Estimator
+from neurove_core.neurons import plain
+from tests.builders import SENSOR, make_events
+
+SMALL = ModelConfig(
+    window=WindowConfig(duration_us=10_000, bins=2),
+    canonical=CanonicalConfig(width=19, height=14),
+    network=NetworkConfig(channels=(6, 40), features=13, hidden=11, v_th=0.4, precision="int8"),
+)
+SHIPPED = ModelConfig(network=NetworkConfig(v_th=0.4, precision="int8"))
+
+
+def network_of(config: ModelConfig, seed: int = 0):
+    return bundle.untrained(seed, config).network.requires_grad_(requires_grad=False)
+
+
+def draw(config: ModelConfig, batch: int = 1, steps: int = 5, seed: int = 1):
+    shape = (steps, batch, 2 * config.window.bins, config.canonical.height, config.canonical.width)
+    return torch.poisson(torch.full(shape, 0.4), generator=torch.Generator().manual_seed(seed)).log1p()
+
+
+@pytest.mark.parametrize("config", [SMALL, SHIPPED], ids=["small", "shipped"])
+@pytest.mark.parametrize("batch", [1, 3])
+@pytest.mark.parametrize("seed", range(3))
+def test_spikes_in_8_bits_equal_those_of_float32_bit_for_bit(seed, batch, config):
+    network = network_of(config, seed)
+    engine, spikes = Engine(network), draw(config, batch, seed=seed)
+    fired, after = engine.features(spikes, network.initial_state(batch))
+    with plain():
+        expected, expected_after = engine.features(spikes, network.initial_state(batch))
+    assert torch.equal(fired, expected)
+    assert 0 < fired.mean() < 1
+    for one, other in zip(after, expected_after, strict=True):
+        assert torch.equal(one.v, other.v)
+
+
+@torch.no_grad()
+def test_the_engine_answers_as_the_network_does_that_training_sees():
+    network, spikes = network_of(SHIPPED), draw(SHIPPED)
+    answer, expected = (
+        Engine(network)(spikes[:1], network.initial_state(1)),
+        network(spikes[:1], network.initial_state(1)),
+    )
+    torch.testing.assert_close(answer[0], expected[0], rtol=1e-4, atol=1e-5)
+    for one, other in zip(answer[1].membranes, expected[1].membranes, strict=True):
+        assert ((one.v == 0) != (other.v == 0)).double().mean() < 5e-3
+
+
+def test_weights_move_by_half_a_step_at_most_and_rounding_again_changes_nothing():
+    weight = torch.randn(5, 4, 3, 3) * torch.tensor([1e-3, 1.0, 50.0, 0.0, 1.0]).view(-1, 1, 1, 1)
+    rounded, step = int8.rounded(weight), int8.quantised(weight).step
+    assert torch.all((rounded - weight).abs() <= 0.501 * step.view(-1, 1, 1, 1))
+    assert torch.equal(int8.quantised(rounded).q, int8.quantised(weight).q)
+
+
+def test_gradients_pass_the_rounding_as_if_it_were_not_there():
+    weight = torch.randn(5, 4, 3, 3, requires_grad=True)
+    pull = torch.randn(5, 4, 3, 3)
+    int8.rounded(weight).backward(pull)
+    torch.testing.assert_close(weight.grad, pull)
+
+
+@pytest.mark.parametrize("encoding", ["binary", "log1p"])
+def test_counts_become_the_codes_of_their_spikes_and_a_network_may_be_given_either(encoding):
+    counts = torch.arange(256, dtype=torch.uint8).repeat(2, 16).reshape(1, 1, 4, 32, 64)[..., :14, :19].contiguous()
+    found, spikes = to_codes(counts, encoding), to_spikes(counts, encoding)
+    assert torch.equal(found, int8.codes(spikes))
+    engine = Engine(network_of(SMALL))
+    state = network_of(SMALL).initial_state(1)
+    assert torch.equal(engine(found, state)[0], engine(spikes, state)[0])
+
+
+@pytest.mark.parametrize("top", [1, 255])
+def test_the_largest_sums_are_exact(top):
+    q = torch.full((4, 58 if top == 255 else 200, 3, 3), 127, dtype=torch.int8)
+    x = torch.full((2, q.shape[1], 9, 7), top, dtype=torch.uint8).contiguous(memory_format=torch.channels_last)
+    found = int8.sums(q, top, 9, 7)(x)
+    assert found[0, 0, 2, 2] == 9 * q.shape[1] * 127 * top
+    assert torch.equal(found, int8.plain_sums(q, top)(x))
+
+
+@pytest.mark.parametrize("wrong", ["missing", "other sums"])
+def test_without_fast_8_bit_products_plain_ones_give_the_same_and_it_is_said_once(monkeypatch, caplog, wrong):
+    spikes, network = draw(SMALL), network_of(SMALL)
+    expected = Engine(network)(spikes, network.initial_state(1))[0]
+
+    def broken(q, rows, columns):
+        if wrong == "missing":
+            raise AttributeError("no such operator")
+        return lambda x: int8.plain_sums(q, 255)(x) + 1
+
+    convolution.forget_warnings()
+    monkeypatch.setattr(int8, "_packed", broken)
+    with caplog.at_level(logging.WARNING):
+        engine = Engine(network)
+    assert torch.equal(engine(spikes, network.initial_state(1))[0], expected)
+    assert [record.getMessage().startswith("8-bit convolutions are off") for record in caplog.records] == [True]
+
+
+def test_an_int8_bundle_is_saved_loaded_and_serves_a_stream(tmp_path):
+    made = bundle.untrained(0, SMALL)
+    bundle.save(made, tmp_path / "a.safetensors")
+    loaded = bundle.load(tmp_path / "a.safetensors")
+    assert loaded.config.network.precision == "int8"
+    events = make_events(3_000, seed=0, duration_us=60_000)
+    answers = []
+    for one in (made, loaded):
+        estimator = Estimator(one)
+        answers.append(estimator.push(events, estimator.initial_state(SENSOR), 60_000).estimates)
+    assert len(answers[0]) == 6
+    assert [one.twists.tolist() for one in answers[0]] == [one.twists.tolist() for one in answers[1]]
