@@ -28,7 +28,8 @@ from protocol.control import (
 from protocol.errors import Downgrade, NeuroVEError, RolledBack
 from service.active_file import ActiveFile
 from service.health import node_verdict
-from service.model_slot import ModelSlot, Serving
+from service.lane import Serving
+from service.model_slot import ModelSlot
 from service.model_store import ModelStore
 from service.progress import OnProgress, Progress
 from service.pull import Pull

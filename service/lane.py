@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from neurove_core.estimator import Estimator, StreamState, WindowEstimate
+from neurove_core.network import NetworkState
 from neurove_core.windows import Window
 from protocol import EventPacket
 from service.comparison import Answered
@@ -109,6 +110,9 @@ class Lane:
 
 
 def _rate(state: StreamState) -> float:
+    """Share of the estimator's cells that fired; 0 in a network without spiking cells."""
+    if not isinstance(state.network, NetworkState):
+        return 0.0
     return float(torch.stack([cell.s.mean() for cell in state.network.cells]).mean())
 
 

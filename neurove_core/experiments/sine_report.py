@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 RECIPES = {
-    "aslstm": Recipe(model="aslstm", closed_share=0.2),
+    "aslstm": Recipe(model="aslstm", closed_share=0.3),
     "aslstm-spiking": Recipe(
         model="aslstm", v_th=0.6, alpha=0.1, damping=0.1, rate=0.012, updates=4000, fine_updates=3000
     ),
