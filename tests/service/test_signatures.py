@@ -1,0 +1,86 @@
+"""What a node that trusts keys takes: pushed or from its folder, only what one of these keys has signed."""
+
+import hashlib
+import threading
+
+import pytest
+
+from neurove_core import manifest, signing_keys
+from protocol.control import ActivateRequest, ModelsReply, ModelsRequest, PushRequest
+from protocol.errors import Downgrade, InvalidField, Untrusted
+from service.active_file import Active, ActiveFile
+from service.handlers import Handlers
+from service.model_slot import ModelSlot, Rules
+from service.model_store import ModelStore
+from service.signatures import verifier
+
+KEY, OTHER = signing_keys.new(), signing_keys.new()
+
+
+@pytest.fixture
+def key_file(tmp_path):
+    path = tmp_path / "release.pub"
+    path.write_bytes(signing_keys.public_pem(KEY.public_key()))
+    return path
+
+
+@pytest.fixture
+def folder(models_dir, tmp_path):
+    """`one` signed by a trusted key, `two` by nobody."""
+    data = (models_dir / "one.safetensors").read_bytes()
+    (tmp_path / "one.safetensors").write_bytes(data)
+    (tmp_path / "one.safetensors.sig").write_bytes(manifest.sign(data, KEY, release=3))
+    (tmp_path / "two.safetensors").write_bytes((models_dir / "two.safetensors").read_bytes())
+    return tmp_path
+
+
+def handlers_of(folder, key_file, highest_release=0):
+    store = ModelStore(folder / "state", folder, verify=verifier((key_file,)))
+    active_file = ActiveFile(None)
+    active_file.keep(Active(digest="0" * 64, previous=None, configured="x", highest_release=highest_release))
+    slot = ModelSlot("untrained", folder, Rules(probation_s=0.1), pushed=store.files)
+    return Handlers("edge", slot, list, lambda: 0, store, active_file)
+
+
+def test_what_a_trusted_key_signed_may_serve_and_what_nobody_signed_may_not(folder, key_file):
+    handlers = handlers_of(folder, key_file)
+    handlers.activate(ActivateRequest(model="one").encode())
+    with pytest.raises(Untrusted, match="only models that are signed"):
+        handlers.activate(ActivateRequest(model="two").encode())
+    models = ModelsReply.decode(handlers.models(ModelsRequest().encode()))
+    assert models.active.name == "one"
+    states = {info.name: info.signature for info in models.available}
+    assert (states["one"], states["two"]) == ("trusted", "untrusted")
+
+
+def test_the_release_that_counts_is_the_signed_one(folder, key_file):
+    with pytest.raises(Downgrade, match="release=3: release 4 was here before"):
+        handlers_of(folder, key_file, highest_release=4).activate(ActivateRequest(model="one").encode())
+    handlers_of(folder, key_file, highest_release=3).activate(ActivateRequest(model="one").encode())
+
+
+@pytest.mark.parametrize(
+    ("signature", "reason"),
+    [(None, "unsigned"), (OTHER, "unknown_key"), (b"{}", "malformed")],
+)
+def test_a_push_without_a_trusted_signature_leaves_nothing_on_the_node(folder, key_file, signature, reason):
+    handlers, data = handlers_of(folder, key_file), (folder / "two.safetensors").read_bytes()
+    signed = manifest.sign(data, signature, release=1) if signature is OTHER else signature
+    digest = hashlib.sha256(data).hexdigest()
+    request = PushRequest(digest=digest, size=len(data), name="two.safetensors", signature=signed)
+
+    def chunk(_, wanted):
+        return data[wanted.offset : wanted.offset + wanted.length]
+
+    with pytest.raises(Untrusted) as refused:
+        handlers.push(request.encode(), lambda _: None, chunk, threading.Event())
+    assert refused.value.details["reason"] == reason
+    assert not list((folder / "state").rglob("*.safetensors"))
+
+
+def test_a_key_that_can_not_be_read_stops_the_start(tmp_path):
+    with pytest.raises(InvalidField, match=r"trusted_keys=.*none\.pub.*No such file"):
+        verifier((tmp_path / "none.pub",))
+    (tmp_path / "text.pub").write_text("hello")
+    with pytest.raises(InvalidField):
+        verifier((tmp_path / "text.pub",))
