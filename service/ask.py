@@ -100,7 +100,10 @@ def nodes(transport: Transport, config: ClientConfig, node: str | None, every: b
         return [node]
     alive = sorted({config.keys.node_of(key) for key in transport.tokens(config.keys.alive(), ANSWER_S)})
     if not alive:
-        raise NoService(f"no service behind {', '.join(config.connect)}; is `neurove serve` running there?")
+        behind = ", ".join(config.connect)
+        raise NoService(
+            f"no service behind {behind}; is `neurove serve` running there, and does its access list know you?"
+        )
     if len(alive) > 1 and not every:
         raise SeveralNodes(f"several nodes are alive: {', '.join(alive)}; name one with --node, or say --all")
     return alive
@@ -180,7 +183,9 @@ def _change(
             ErrorReply(code=error.code, message=f"{node}: {error.message}", details=error.details)
         ) from None
     if said is None:
-        raise NoService(f"no service answers {key}; is `neurove serve` running there?")
+        raise NoService(
+            f"no service answers {key}; is `neurove serve` running there, and does its access list let you ask?"
+        )
     raise NoService(f"{node} left or took over {timeout_s:g} s; the last that was heard: {said.step}: {said.text}")
 
 

@@ -228,8 +228,8 @@ class TestWhoMayNot:
             for node in ("edge1", "*") * 3:
                 (answer,) = asked(operator, KEYS.health(node), HealthRequest().encode())
                 assert HealthReply.decode(answer).node == "edge1"
-                (answer,) = asked(operator, KEYS.activate(node), ActivateRequest(model="nowhere").encode())
-                assert b"not on this node" in answer
+                answers = asked(operator, KEYS.activate(node), ActivateRequest(model="nowhere").encode())
+                assert len([one for one in answers if b"not on this node" in one]) == len(answers) > 0  # steps, refusal
             assert asked(operator, f"{KEYS.prefix}/@push/{DIGEST}", timeout_s=1.0) == []
         assert reached == []
 

@@ -38,6 +38,7 @@ from tests.recordings import shared
 SMALL = named_camera("pinhole:86x65:75")
 TRAJECTORIES = {
     "street": driving(3, 30),
+    "bare-street": driving(3, 30),
     "corridor": slider(0, 0, 2, 30),
     "room": hand_held(1, 10),
     "wall": slider(0.3, 0, 0, 5),
