@@ -6,7 +6,6 @@ each other, the gradient) is averaged over all of them: N devices take the step 
 
 import contextlib
 import multiprocessing
-import multiprocessing.connection
 import os
 import signal
 import socket
@@ -216,10 +215,11 @@ class _Other(NamedTuple):
 
     def wait(self) -> None:
         """Until it is up: joining a group that one of them never joins would take the whole timeout."""
-        multiprocessing.connection.wait([self.ready, self.process.sentinel])
-        if not self.ready.poll():
+        try:
+            self.ready.recv()
+        except EOFError:  # it ended before it was up
             self.process.join()
-            raise self.error()
+            raise self.error() from None
 
     def ended(self) -> bool:
         self.process.join(1.0)  # its connections are closed a moment before it is gone

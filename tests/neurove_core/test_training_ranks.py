@@ -4,6 +4,7 @@ import copy
 import json
 import multiprocessing
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,6 +26,12 @@ from protocol.errors import BadModel, InvalidField
 from tests.neurove_core.test_training import TINY
 
 CONFIG, RECIPE = TINY, TINY.recipe
+
+
+@pytest.fixture(autouse=True)
+def _tests_can_be_imported(monkeypatch):
+    """By the processes that are started, which get this one's path: what they run stands in this file."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2]))
 
 
 @pytest.fixture(scope="module")
