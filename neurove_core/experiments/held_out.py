@@ -19,7 +19,7 @@ from neurove_core.sim.camera import named_camera
 from neurove_core.sim.pixels import USUAL, PixelConfig
 from neurove_core.sim.simulate import Simulation, simulate
 from neurove_core.sim.trajectory import Trajectory, driving, hand_held, parse_trajectory
-from neurove_core.training.data import FORMAT, Part, save, sequence_of
+from neurove_core.training.data import DRIVE_S, FORMAT, Part, log_uniform, save, sequence_of, turning_part
 from protocol.errors import InvalidField
 from protocol.events import Events
 
@@ -37,10 +37,12 @@ _DAY1_TESTED_S: Final = range(154, 245, 10)  # where each begins
 _DAY2_S: Final = 600.0
 _TRAIN_DRIVES: Final = 48  # of them 38 along day 2
 _HAND_SLOWED: Final = 4.0
+_DRIVE_SLOWED: Final = (1.0, 2.0)
 _QUICK_CAMERA: Final = "pinhole:24x18:75"
 _QUICK_S: Final = 1.0
 _WINDOW_US: Final = 50_000  # of contrast maximisation
 _CM_INSTANTS: Final = 5  # per recording
+_KEY_POINTS: Final = 16  # of a way, by which its file is known again
 
 
 class Item(NamedTuple):
@@ -92,7 +94,7 @@ def items(recordings: Path | None = None, *, quick: bool = False) -> list[Item]:
         *(_street("pixels", name, 6000 + i, 6.0, pixels=made) for i, (name, made) in enumerate(_PIXELS.items())),
         *(_item("hand-held", f"seed {seed}", "room", _waved(seed, 6.0), seed) for seed in range(6020, 6024)),
         *(_item("bare street", f"seed {seed}", "bare-street", driving(seed, 6.0), seed) for seed in (6030, 6031)),
-        *(_street(f"town {number}", f"seed {7000 + number}", 7000 + number, 24.0) for number in (1, 2)),
+        *(_item(f"town {n}", f"seed {7000 + n}", "street", driving(7000 + n, 24.0), 7000 + n) for n in (1, 2)),
     ]
     if recordings is not None and (recordings / DAY1).exists():
         for start_s in _DAY1_TESTED_S:
@@ -138,8 +140,15 @@ def _waved(seed: int, seconds: float) -> Trajectory:
     return Part(hand_held(seed, seconds), 0.0, _HAND_SLOWED, seconds)
 
 
+def _turning_drive(seed: int, seconds: float) -> Trajectory:
+    """Of three parts of a drive the one that turns most, up to twice as slow: most of any drive goes straight on."""
+    rng = np.random.default_rng((seed, 204))
+    slowed = log_uniform(rng, _DRIVE_SLOWED)
+    return turning_part(rng, driving(seed, DRIVE_S + seconds), slowed, seconds)
+
+
 def _part(poses: Path, start_s: float, seconds: float) -> Trajectory:
-    return parse_trajectory(f"{poses}?start={start_s:g}", seconds)
+    return parse_trajectory(f"{poses}?start={start_s:g}&flat=1", seconds)
 
 
 def _street(
@@ -152,7 +161,7 @@ def _street(
     height_m: float = HEIGHT_M,
     pixels: PixelConfig = USUAL,
 ) -> Item:
-    return _item(group, name, "street", driving(seed, seconds), seed, camera, height_m, pixels)
+    return _item(group, name, "street", _turning_drive(seed, seconds), seed, camera, height_m, pixels)
 
 
 def _item(
@@ -203,6 +212,8 @@ class Kept:
         kind: list[Any] = [FORMAT, *item[:2], made.name, made.seed, made.duration_s, made.motion_px, made.lens.name]
         kind += [made.lens.info.model_dump(), made.lens.pitch_deg, made.pixels.model_dump()]
         kind += [self._config.window.model_dump(), self._config.canonical.model_dump()]
+        position_m, _ = made.trajectory.placed(np.linspace(0, made.duration_s, _KEY_POINTS))
+        kind += position_m.round(6).tolist()  # names do not tell how a way was made
         return hashlib.sha256(json.dumps(kind, sort_keys=True).encode()).hexdigest()[:16]
 
 

@@ -36,7 +36,9 @@ from neurove_core.windows import WindowsState
 FORMAT: Final = 1
 """Of the files; part of their folder's name."""
 
-_DRIVE_S: Final = 120.0  # a sequence is a part of a drive of this length
+DRIVE_S: Final = 120.0
+"""A sequence is a part of a drive of this length."""
+
 _SAMPLES: Final = 4  # of the exact twist in each bin, whose mean is the bin's
 
 
@@ -84,25 +86,25 @@ def drawn(config: DataConfig, index: int) -> Simulation:
     rng = np.random.default_rng((config.seed, 201, index))
     seed = config.seed + index
     scene = _choice(rng, config.scenes)
-    height_m, pitch_deg = _log_uniform(rng, config.height_m), rng.uniform(*config.pitch_deg)
+    height_m, pitch_deg = log_uniform(rng, config.height_m), rng.uniform(*config.pitch_deg)
     camera = _camera(rng, config, height_m, float(pitch_deg))
-    on = _log_uniform(rng, config.threshold)
+    on = log_uniform(rng, config.threshold)
     pixels = PixelConfig(
         threshold_on=on,
         threshold_off=on * float(rng.uniform(0.85, 1.15)),
         threshold_sigma=float(rng.uniform(*config.threshold_sigma)),
         refractory_us=int(rng.uniform(*config.refractory_us)),
         leak_hz=float(rng.uniform(*config.leak_hz)),
-        shot_noise_hz=_log_uniform(rng, config.shot_noise_hz),
-        cutoff_hz=_log_uniform(rng, config.cutoff_hz),
-        eps=_log_uniform(rng, config.eps),
+        shot_noise_hz=log_uniform(rng, config.shot_noise_hz),
+        cutoff_hz=log_uniform(rng, config.cutoff_hz),
+        eps=log_uniform(rng, config.eps),
     )
-    slowed = _log_uniform(rng, config.slowed_hand if scene == "room" else config.slowed_drive)
+    slowed = log_uniform(rng, config.slowed_hand if scene == "room" else config.slowed_drive)
     trajectory: Trajectory
     if scene == "room":
         trajectory = _in_a_hand(rng, config, seed, slowed)
     else:
-        trajectory = _turning_part(rng, driving(seed, _DRIVE_S + config.seconds), slowed, config.seconds)
+        trajectory = turning_part(rng, driving(seed, DRIVE_S + config.seconds), slowed, config.seconds)
     mounted = Mounted(trajectory, camera.height_m, camera.pitch_deg)
     simulation = Simulation(scene, named_scene(scene), mounted, camera, pixels, seed, config.seconds)
     return replace(simulation, motion_px=config.motion_px)
@@ -239,16 +241,16 @@ def _in_a_hand(rng: np.random.Generator, config: DataConfig, seed: int, slowed: 
     way = _choice(rng, config.hands)
     if way == "spun":
         axis = rng.standard_normal(3) * (0.4, 1.0, 0.4)
-        rate = _log_uniform(rng, config.spun_rad_s) * axis / np.linalg.norm(axis)
+        rate = log_uniform(rng, config.spun_rad_s) * axis / np.linalg.norm(axis)
         wx, wy, wz = (float(one) for one in rate)
         return rotation(wx, wy, wz, config.seconds)
     moved, turned = {"waved": (1.0, 1.0), "turned": (0.0, 1.0), "slid": (1.0, 0.0)}[way]
     return Part(hand_held(seed, config.seconds, moved, turned), 0.0, slowed, config.seconds)
 
 
-def _turning_part(rng: np.random.Generator, drive: Trajectory, slowed: float, seconds: float) -> Part:
+def turning_part(rng: np.random.Generator, drive: Trajectory, slowed: float, seconds: float) -> Part:
     """Of three parts of a drive the one that turns most: most of any drive goes straight on."""
-    parts = [Part(drive, float(start_s), slowed, seconds) for start_s in rng.uniform(0, _DRIVE_S, 3)]
+    parts = [Part(drive, float(start_s), slowed, seconds) for start_s in rng.uniform(0, DRIVE_S, 3)]
     t_s = np.linspace(0, seconds, 100)
     return max(parts, key=lambda part: float(np.abs(part.twist(t_s)[:, 4]).mean()))
 
@@ -259,7 +261,8 @@ def _choice(rng: np.random.Generator, shares: dict[str, float]) -> str:
     return str(rng.choice(names, p=weights / weights.sum()))
 
 
-def _log_uniform(rng: np.random.Generator, span: Span) -> float:
+def log_uniform(rng: np.random.Generator, span: Span) -> float:
+    """A number between these two, drawn so that its logarithm is uniform."""
     return math.exp(rng.uniform(math.log(span[0]), math.log(span[1])))
 
 
