@@ -28,7 +28,7 @@ METHODS: Final[dict[str, dict[str, Any]]] = {
 }
 """What of the model's configuration each method changes; nothing else differs between them."""
 
-STEPS: Final = 1500
+STEPS: Final = 1000
 """Updates of each method, where nothing else is said."""
 
 Show = Callable[[str, int, int, str], None]
