@@ -10,7 +10,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from neurove_core import bundle
+from neurove_core import bundle, models
+from neurove_core.bundle import Bundle
 from neurove_core.experiments.held_out import CM_GROUPS, Item, Kept, drives, items
 from neurove_core.experiments.tracks import Track, blind, follow, summaries, summary
 from neurove_core.snn_ang import CHANNELS
@@ -88,7 +89,7 @@ def base_config(source: str | None = None, steps: int | None = None, *, quick: b
         return found
     if steps < 1:
         raise InvalidField("reproduce velocity", "steps", steps, "must be at least 1")
-    return found.model_copy(update={"recipe": found.recipe.model_copy(update={"steps": steps})})
+    return found.model_copy(update={"recipe": found.recipe.model_copy(update={"steps": steps, "cycles": 1})})
 
 
 def reproduce(plan: Plan, folder: Path, out: Path, show: Show, workers: int = 1) -> Iterator[Trained]:
@@ -131,7 +132,7 @@ def trained(config: TrainingConfig, out: Path, folder: Path, more: Sequence[Path
     run = out / (f"{config.name}-mvsec" if more else config.name)
     path, about = run / f"{config.name}{bundle.SUFFIX}", run / RUN_JSON
     if path.exists() and about.exists():
-        if json.loads(about.read_text())["config"] != config.model_dump(mode="json"):
+        if TrainingConfig.model_validate(json.loads(about.read_text())["config"]) != config:
             why = "it holds a run of another configuration: choose another --out, or delete it"
             raise InvalidField("reproduce velocity", "out", run.name, why)
         return run
@@ -151,25 +152,44 @@ def trained(config: TrainingConfig, out: Path, folder: Path, more: Sequence[Path
 def _judged(method: str, config: TrainingConfig, run: Path, judged_on: list[Item], kept: Kept) -> Trained:
     model = bundle.load(run / f"{config.name}{bundle.SUFFIX}")
     about = json.loads((run / RUN_JSON).read_text())
+    figures, tracks = _figures(model, judged_on, kept)
+    row = {
+        "method": method,
+        "seed": config.recipe.seed,
+        "updates": about["step"],
+        "commit": about["commit"],
+        "torch": about["torch"],
+        "curve": [{name: value for name, value in point.items() if name != "cpu_s"} for point in about["curve"]],
+    }
+    return Trained(row | figures, tracks, about["cpu_s"] / about["step"])
+
+
+def _figures(model: Bundle, judged_on: list[Item], kept: Kept) -> tuple[dict[str, Any], list[Track]]:
     spikes, neurons, tracks = 0, 0, []
     for item in judged_on:
         track, fires = follow(model, kept.path(item), item)
         tracks.append(track)
         spikes, neurons = spikes + fires[0], neurons + fires[1]
-    row = {
-        "method": method,
-        "seed": config.recipe.seed,
+    told = {
         "parameters": model.info.parameters,
         "digest": model.digest,
-        "updates": about["step"],
-        "commit": about["commit"],
-        "torch": about["torch"],
         "firing_rate": spikes / neurons if neurons else None,
-        "curve": [{name: value for name, value in point.items() if name != "cpu_s"} for point in about["curve"]],
         "groups": summaries(tracks),
         "recordings": {f"{track.group}: {track.name}": summary([track]) for track in tracks},
     }
-    return Trained(row, tracks, about["cpu_s"] / about["step"])
+    return told, tracks
+
+
+def shipped(plan: Plan, folder: Path) -> dict[str, Any] | None:
+    """What the default model reaches on the same items, which `reproduce` has made; None where it sees another grid.
+
+    It learned longer than the methods, and from none of MVSEC's ways.
+    """
+    model = models.find(models.DEFAULT)
+    if (model.config.window, model.config.canonical) != (plan.config.model.window, plan.config.model.canonical):
+        return None
+    figures, _ = _figures(model, items(plan.recordings, quick=plan.quick), Kept(folder, plan.config.model))
+    return figures | {"updates": model.about.made_by.updates if model.about.made_by else None}
 
 
 def turning(plan: Plan, folder: Path) -> dict[str, dict[str, Any]]:
@@ -215,5 +235,6 @@ def results(plan: Plan, folder: Path, found: list[Trained]) -> dict[str, Any]:
             for group in groups
         },
         "runs": runs,
+        "shipped": shipped(plan, folder),
         "blind": {"contrast maximisation": turning(plan, folder), **blind(tracks)},
     }

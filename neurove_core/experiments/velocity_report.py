@@ -36,6 +36,7 @@ SIMULATED: Final = (
 )
 
 _NAMES: Final = {
+    "shipped": "NeuroVE as shipped",
     "nve": "NeuroVE",
     "nve-wo": "NeuroVE w/o",
     "ann": "equal-size ANN",
@@ -62,6 +63,9 @@ def markdown(told: Told) -> str:
         f"RE counts |v| > {LINEAR_FLOOR_M_S:g} m/s and |w| > {ANGULAR_FLOOR_RAD_S:g} rad/s; without these floors it is "
         f"in brackets. The first {SKIP_S:g} s are left out.",
     ]
+    if told["shipped"]:
+        updates = told["shipped"]["updates"]
+        parts.append(f"NeuroVE as shipped is the default model: {updates} updates, one seed, none of MVSEC's ways.")
     if told["quick"]:
         parts.append("A quick run: it shows that everything works, and its figures mean nothing.")
     parts += [_table_3(told), _table_4(told), _by_group(told), _ratios(told), _gehrig(told), _sizes(told)]
@@ -81,7 +85,7 @@ def save(told: Told, out: Path) -> list[Path]:
 
 def methods_of(told: Told) -> list[str]:
     """The learned methods, in the tables' order, and then the predictors that learn nothing."""
-    learned = {run["method"] for run in told["runs"]}
+    learned = {run["method"] for run in told["runs"]} | ({"shipped"} if told["shipped"] else set())
     return [name for name in _NAMES if name in learned or name in told["blind"]]
 
 
@@ -89,6 +93,7 @@ def over_seeds(told: Told, method: str, group: str, figure: str) -> list[float]:
     """A figure of a method on a group, seed by seed; empty where there is none."""
     rows = [run["groups"] for run in told["runs"] if run["method"] == method]
     rows += [told["blind"][method]] if method in told["blind"] else []
+    rows += [told["shipped"]["groups"]] if method == "shipped" and told["shipped"] else []
     found = [row[group][figure] for row in rows if group in row]
     return [value for value in found if value is not None]
 

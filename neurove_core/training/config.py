@@ -94,12 +94,15 @@ class DataConfig(Config):
 class RecipeConfig(Config):
     """How the network learns; the defaults are recipe L of research/velocity.md."""
 
-    steps: int = Field(4000, ge=1, description="Updates of the weights.")
+    steps: int = Field(4000, ge=1, description="Updates of the weights, in each cycle.")
+    cycles: int = Field(1, ge=1, le=100, description="How often the learning rate rises and falls; a run can get more.")
     seed: int = Field(0, ge=0, description="Of the weights, and of what is drawn on the way.")
     batch: int = Field(16, ge=1, le=4096, description="B: streams side by side.")
     segment_windows: int = Field(32, ge=1, description="A stream is followed so long from a state at rest.")
     chunk_windows: int = Field(8, ge=1, description="T: an update and the reach of its gradient, in windows.")
-    learning_rate: float = Field(1e-3, gt=0, le=1, description="At its peak; it then falls as a cosine to 0.")
+    learning_rate: float = Field(
+        1e-3, gt=0, le=1, description="At its peak; it then falls as a cosine to 0. Half of it in the next cycle."
+    )
     warm_up_steps: int = Field(100, ge=0, description="Updates until the peak.")
     clip_norm: float = Field(5.0, gt=0, description="Greatest norm of the gradient.")
     norm_momentum: float = Field(0.02, gt=0, le=1, description="How fast tdBN's statistics follow the batches.")
@@ -123,6 +126,11 @@ class RecipeConfig(Config):
                 f"segment_windows={self.segment_windows} does not split into chunks of {self.chunk_windows}"
             )
         return self
+
+    @property
+    def updates(self) -> int:
+        """Updates of all cycles."""
+        return self.steps * self.cycles
 
     @property
     def chunks(self) -> int:

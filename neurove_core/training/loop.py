@@ -56,13 +56,19 @@ class _Losses(NamedTuple):
 def learning_rate(step: int, recipe: RecipeConfig) -> float:
     """Of update `step`, counted from 0: rises in a line to the recipe's, then falls as half a cosine to 0.
 
-    >>> [round(learning_rate(step, RecipeConfig(steps=300, warm_up_steps=100)), 6) for step in (0, 99, 200, 300)]
-    [1e-05, 0.001, 0.0005, 0.0]
+    Each further cycle does so again, to half the peak of the one before (warm restarts, Loshchilov 2017). A run of more
+    cycles begins as one of fewer does, so a finished run can go on.
+
+    >>> recipe = RecipeConfig(steps=300, warm_up_steps=100, cycles=2)
+    >>> [round(learning_rate(step, recipe), 6) for step in (0, 99, 200, 299, 399, 500, 600)]
+    [1e-05, 0.001, 0.0005, 0.0, 0.0005, 0.00025, 0.0]
     """
+    cycle = min(step // recipe.steps, recipe.cycles - 1)
+    step, peak = step - cycle * recipe.steps, recipe.learning_rate * 0.5**cycle
     if step < recipe.warm_up_steps:
-        return recipe.learning_rate * (step + 1) / recipe.warm_up_steps
+        return peak * (step + 1) / recipe.warm_up_steps
     done = (step - recipe.warm_up_steps) / max(1, recipe.steps - recipe.warm_up_steps)
-    return recipe.learning_rate * 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
+    return peak * 0.5 * (1 + math.cos(math.pi * min(1.0, done)))
 
 
 def train(
@@ -132,18 +138,18 @@ def descend(
     """Learn to the end of the recipe; the first rank leaves checkpoints and run.json in `out`."""
     recipe, share = run.config.recipe, run.share
     spent_s, saved_s, began_s, recent = run.cpu_s, time.monotonic(), time.process_time(), list[_Losses]()
-    while run.step < recipe.steps:
+    while run.step < recipe.updates:
         recent += learn(run, draw(run.rng, sequences, share))
         mean = _mean(recent)
-        on_progress(Progress(run.step, recipe.steps, 2 * mean.linear, 2 * mean.angular))
-        if len(recent) < min(_CURVE_STEPS, recipe.steps / 100) and run.step < recipe.steps:
+        on_progress(Progress(run.step, recipe.updates, 2 * mean.linear, 2 * mean.angular))
+        if len(recent) < min(_CURVE_STEPS, recipe.steps / 100) and run.step < recipe.updates:
             continue
         ranks = run.ranks.gathered((run.order, time.process_time() - began_s))
         run.cpu_s = spent_s + sum(cpu_s for _, cpu_s in ranks)
         run.curve.append(_point(run, mean))
         on_point(run.curve[-1])
         recent = []
-        due = time.monotonic() - saved_s >= recipe.checkpoint_s or run.step >= recipe.steps
+        due = time.monotonic() - saved_s >= recipe.checkpoint_s or run.step >= recipe.updates
         if due and run.ranks.first:
             run.save(out / CHECKPOINT, [order for order, _ in ranks])
             _write_run(run, out)

@@ -189,7 +189,7 @@ def _restore_optimiser(optimiser: torch.optim.Adam, parameters: list[Any], tenso
 def _same_config(path: Path, began: dict[str, Any], config: TrainingConfig) -> None:
     """Refuse to go on with another recipe than the run began with: its curve would belong to neither.
 
-    A setting that did not exist when the run began had its default.
+    A setting that did not exist when the run began had its default. More cycles are the same run, longer.
     """
     try:
         found = TrainingConfig.model_validate(began).model_dump(mode="json")
@@ -198,6 +198,7 @@ def _same_config(path: Path, began: dict[str, Any], config: TrainingConfig) -> N
     for part, fields in config.model_dump(mode="json").items():
         for name, value in fields.items() if isinstance(fields, dict) else ((part, fields),):
             was = found[part][name] if isinstance(fields, dict) else found[part]
-            if was != value:
+            longer = (part, name) == ("recipe", "cycles") and value > was
+            if was != value and not longer:
                 why = f"it began with {part}.{name}={was}, the configuration says {value}"
                 raise BadModel(path.name, why)

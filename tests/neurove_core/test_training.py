@@ -203,6 +203,19 @@ def test_a_run_that_goes_on_from_its_checkpoint_ends_as_one_that_was_never_stopp
     assert [point["linear_error_m_s"] for point in curves[0]] == [point["linear_error_m_s"] for point in curves[1]]
 
 
+def test_a_finished_run_goes_on_for_another_cycle_as_if_it_had_been_planned(folder, tmp_path):
+    recipe = TINY.recipe.model_copy(update={"cycles": 2})
+    planned = TINY.model_copy(update={"recipe": recipe})
+    at_once = bundle.load(train(planned, tmp_path / "planned", folder))
+    train(TINY, tmp_path / "longer", folder)
+    longer_run = bundle.load(train(planned, tmp_path / "longer", folder, resume=True))
+    assert longer_run.about.made_by.updates == 2 * TINY.recipe.steps
+    weights = longer_run.network.state_dict()
+    assert all(torch.equal(tensor, weights[name]) for name, tensor in at_once.network.state_dict().items())
+    with pytest.raises(BadModel, match="recipe.cycles=2, the configuration says 1"):
+        train(TINY, tmp_path / "longer", folder, resume=True)
+
+
 def test_a_checkpoint_of_another_recipe_is_refused_with_the_field_that_differs(folder, tmp_path):
     train(TINY, tmp_path, folder)
     with pytest.raises(BadModel, match="recipe.steps=12, the configuration says 16"):
