@@ -27,6 +27,7 @@ from neurove_core.networks import Network
 from neurove_core.uncertainty import Uncertainty, why_no_correlation
 from protocol.control import ModelInfo
 from protocol.errors import BadModel, shown
+from protocol.fields import WrongField
 
 BUNDLE_VERSION: Final = 1
 SUFFIX = ".safetensors"
@@ -240,10 +241,8 @@ def read_header(data: bytes, name: str) -> Header:
     try:
         return Header.model_validate(fields)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in first["loc"])[:80]  # an unknown one is the file's, of any length
-        value = "missing" if first["type"] == "missing" else shown(first["input"])
-        raise BadModel(name, f"header field {where}={value}: {first['msg']}") from None
+        wrong = WrongField.of(error)
+        raise BadModel(name, f"header{' field' if wrong.path else ':'} {wrong.sentence}") from None
 
 
 def untrained(seed: int = 0, config: ModelConfig | None = None, name: str = "untrained") -> Bundle:

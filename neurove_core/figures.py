@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from neurove_core.extras import MissingExtra
+from neurove_core.files import written_whole
 from protocol.errors import InvalidField
 
 if TYPE_CHECKING:
@@ -38,10 +39,21 @@ def save_figure(figure: "Figure", stem: Path) -> list[Path]:
     with mpl.rc_context({"svg.hashsalt": stem.name}):  # else the SVG's ids are random
         for file in files:
             try:
-                figure.savefig(file, dpi=150, metadata={"Date": None} if file.suffix == ".svg" else None)
+                write_figure(figure, file)
             except OSError as error:
                 raise unwritable(file, error) from None
     return files
+
+
+def write_figure(figure: "Figure", file: Path, dpi: int = 150) -> None:
+    """Write a PNG, or where the suffix says so an SVG; it is whole, or what was there before.
+
+    Raises:
+        OSError: it can not be written.
+    """
+    kind = "svg" if file.suffix.lower() == ".svg" else "png"
+    with written_whole(file) as part:
+        figure.savefig(part, format=kind, dpi=dpi, metadata={"Date": None} if kind == "svg" else None)
 
 
 def unwritable(file: Path, error: OSError) -> InvalidField:

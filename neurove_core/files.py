@@ -1,7 +1,28 @@
 """Files that are whole or what they were before, however a process ends."""
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+
+@contextmanager
+def written_whole(path: Path) -> Iterator[Path]:
+    """Another name beside a file, to write to; where the block ends without an error, what is there becomes the file.
+
+    Until then the file is what it was before; several processes may write the same one.
+
+    Raises:
+        OSError: it can not be written; nothing is left beside it.
+    """
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    try:
+        yield part
+        sync(part)
+        part.replace(path)
+        sync(path.parent)
+    finally:
+        part.unlink(missing_ok=True)  # it is there only where writing failed
 
 
 def write_whole(path: Path, data: bytes) -> None:
@@ -10,16 +31,8 @@ def write_whole(path: Path, data: bytes) -> None:
     Raises:
         OSError: it can not be written; nothing is left beside it.
     """
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    try:
-        with part.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-        sync(path.parent)
-    finally:
-        part.unlink(missing_ok=True)  # it is there only where writing failed
+    with written_whole(path) as part:
+        part.write_bytes(data)
 
 
 def sync(path: Path) -> None:

@@ -22,6 +22,7 @@ from neurove_core.bundle import MAX_BYTES, Header, object_without_duplicates, re
 from neurove_core.config import Config
 from neurove_core.signing_keys import key_id
 from protocol.errors import Downgrade, InvalidField, Untrusted, shown
+from protocol.fields import WrongField
 
 SUFFIX: Final = ".sig"
 """Added to the bundle's whole file name."""
@@ -212,10 +213,6 @@ def _parsed(kind: type[_T], text: str | bytes, what: str, name: str) -> _T:
             raise Untrusted(name, "malformed", f"{what}: an object is expected, not {shown(fields)}")
         return kind.model_validate(fields)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in first["loc"])[:80]
-        value = "missing" if first["type"] == "missing" else shown(first["input"])
-        why = f"{what}: {where}={value}: {first['msg']}" if where else f"{what}: {first['msg']}"
-        raise Untrusted(name, "malformed", why) from None
+        raise Untrusted(name, "malformed", f"{what}: {WrongField.of(error).sentence}") from None
     except (ValueError, RecursionError) as error:
         raise Untrusted(name, "malformed", f"{what}: not JSON that can be read: {error}") from None

@@ -7,6 +7,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from pydantic_core import PydanticCustomError
 
 from protocol.errors import InvalidField, Malformed, UnsupportedVersion
+from protocol.fields import WrongField
 from protocol.keys import NAME_RULE, is_name
 
 PROTOCOL_VERSION: Final = 1
@@ -66,10 +67,8 @@ def validate(kind: type[MessageT], fields: dict[str, Any]) -> MessageT:
     try:
         return kind.model_validate(fields)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        name = ".".join(str(part) for part in first["loc"]) or "?"
-        value = "missing" if first["type"] == "missing" else first["input"]
-        raise InvalidField(kind.what, name, value, first["msg"]) from None
+        wrong = WrongField.of(error)
+        raise InvalidField(kind.what, wrong.name or "?", wrong.value, wrong.why) from None
 
 
 def unpack(data: bytes, what: str, max_bytes: int = MAX_MESSAGE_BYTES) -> dict[str, Any]:

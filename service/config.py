@@ -19,6 +19,7 @@ from pydantic_settings import (
 
 from protocol.errors import NeuroVEError
 from protocol.events import Limits
+from protocol.fields import WrongField
 from protocol.keys import DEFAULT_PREFIX, Keys, check_name
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
@@ -163,9 +164,9 @@ def load(kind: type[SettingsT], flags: dict[str, Any], file: Path | None = None)
     try:
         return kind(**values), origin
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        field = str(first["loc"][0])
-        raise _wrong(field, first["input"], first["msg"].removeprefix("Value error, "), origin[field], kind) from None
+        wrong = WrongField.of(error)
+        field = str(wrong.path[0])
+        raise _wrong(field, wrong.value, wrong.why, origin[field], kind) from None
     except NeuroVEError as error:  # a name or prefix that is no key
         field = str(error.details.get("field"))
         raise _wrong(field, values.get(field), str(error.details.get("bound")), origin.get(field, "?"), kind) from None

@@ -11,6 +11,9 @@ from protocol import Events
 ADDR_Y, ADDR_X, BASE_X, VECT_12, VECT_8, TIME_LOW, TIME_HIGH = 0, 2, 3, 4, 5, 6, 8
 TRIGGER, OTHERS = 0xA, 0xE
 
+HEADER_EVT2 = b"% date 2020-09-25 07:48:31\n% evt 2.0\n% geometry 64x48\n"
+HEADER_EVT3 = b"% evt 3.0\n% format EVT3;height=48;width=64\n% end\n"
+
 
 class Written(NamedTuple):
     words: NDArray[np.unsignedinteger]

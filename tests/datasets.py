@@ -10,8 +10,14 @@ from numpy.typing import NDArray
 
 from neurove_core import rotations
 from neurove_core.geometry import Poses
-from neurove_core.io import Imu
+from neurove_core.io import Imu, open_source, write_dsec
 from protocol import Events
+from tests.builders import SENSOR, make_events
+
+DAY_US = 1_506_117_902_000_000
+EVENTS = make_events(1000, seed=1, start_us=500_000, duration_us=1_000_000)
+LATE = EVENTS._replace(t=EVENTS.t + DAY_US)
+"""The same on a clock that shows the date, as MVSEC's and DSEC's do."""
 
 CHUNK = 100  # rows per stored chunk: small, so that a garbled byte costs little
 
@@ -133,3 +139,28 @@ def write_m3ed(
             file["Cn_T_C0"] = np.linalg.inv(matrices(poses))
             file["ts"] = poses.t.astype(np.float64)
     return str(path)
+
+
+def mvsec_file(folder: Path) -> str:
+    return write_mvsec(folder, LATE)
+
+
+def dsec_file(folder: Path) -> str:
+    return write_dsec_file(folder / "events.h5", LATE, offset_us=DAY_US)
+
+
+def m3ed_file(folder: Path) -> str:
+    return write_m3ed(folder, LATE._replace(t=EVENTS.t))
+
+
+def own_file(folder: Path) -> str:
+    write_dsec(open_source(mvsec_file(folder), SENSOR), folder / "own.h5")
+    return str(folder / "own.h5")
+
+
+def spoil(path: Path, data: h5py.Dataset, number: int) -> None:
+    """Overwrite a stored chunk."""
+    chunk = data.id.get_chunk_info(number)
+    with path.open("r+b") as file:
+        file.seek(chunk.byte_offset)
+        file.write(b"\xff" * chunk.size)

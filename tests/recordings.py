@@ -8,7 +8,10 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
+from neurove_core.io import BrokenRecording, Imu, Recording, Triggers
+from neurove_core.io.recording import CHUNK_EVENTS
 from protocol import Events, Sensor
+from protocol.events import check_events
 
 SHARED = Path(__file__).resolve().parents[1].parent / "shared/data"
 
@@ -18,6 +21,50 @@ def shared(path: str) -> Path:
     if not (SHARED / path).exists():
         pytest.skip(f"the recording shared/data/{path} is not on this machine")
     return SHARED / path
+
+
+def put(folder: Path, name: str, data: bytes) -> str:
+    """A file of these bytes, and its path as a source."""
+    (folder / name).write_bytes(data)
+    return str(folder / name)
+
+
+def read(recording: Recording) -> Events:
+    """All of it, after checking what every recording promises of its chunks."""
+    last_us, parts = None, []
+    for chunk in recording.chunks():
+        assert 0 < chunk.n <= CHUNK_EVENTS
+        assert [column.dtype for column in chunk] == [np.int64, np.uint16, np.uint16, np.uint8]
+        assert chunk.p.max() <= 1
+        check_events(chunk, recording.sensor, last_us)
+        last_us = int(chunk.t[-1])
+        parts.append(chunk)
+    return Events.join(parts)
+
+
+def read_broken(recording: Recording) -> tuple[Events, BrokenRecording | None]:
+    """What is whole, and what ended it."""
+    parts = []
+    try:
+        for chunk in recording.chunks():
+            parts.append(chunk)  # noqa: PERF402 what came before the error counts
+    except BrokenRecording as error:
+        return Events.join(parts), error
+    return Events.join(parts), None
+
+
+def all_samples(recording: Recording) -> Imu:
+    return Imu(*(np.concatenate(columns) for columns in zip(*recording.imu(), strict=True)))
+
+
+def all_triggers(recording: Recording) -> Triggers:
+    return Triggers(*(np.concatenate(columns) for columns in zip(*recording.triggers(), strict=True)))
+
+
+def assert_same(got: Events, want: Events) -> None:
+    for name, a, b in zip("txyp", got, want, strict=True):
+        np.testing.assert_array_equal(a, b, err_msg=name)
+        assert a.dtype == b.dtype
 
 
 def ecd_text(events: Events) -> bytes:

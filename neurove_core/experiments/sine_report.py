@@ -18,6 +18,7 @@ from neurove_core.extras import MissingExtra
 from neurove_core.figures import blank_figure, save_figure
 from neurove_core.recurrence import Array
 from protocol.errors import InvalidField
+from protocol.fields import WrongField
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -113,10 +114,9 @@ def changed(recipe: Recipe, changes: Mapping[str, str]) -> Recipe:
     try:
         return Recipe.model_validate(recipe.model_dump() | dict(changes))
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        name = str(first["loc"][0]) if first["loc"] else "set"
-        why = f"known are {', '.join(Recipe.model_fields)}" if first["type"] == "extra_forbidden" else first["msg"]
-        raise InvalidField("recipe", name, first["input"], why) from None
+        wrong = WrongField.of(error)
+        why = f"known are {', '.join(Recipe.model_fields)}" if wrong.kind == "extra_forbidden" else wrong.why
+        raise InvalidField("recipe", wrong.name or "set", wrong.value, why) from None
 
 
 def _run(model: str, seed: int, recipe: Recipe, progress: Progress | None) -> Run:

@@ -15,6 +15,7 @@ from typing import IO, Any, Final, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from neurove_core.files import written_whole
 from neurove_core.geometry import Poses, Twists, twists
 from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.place import BROKEN_ZIP
@@ -220,7 +221,7 @@ def write(
     Returns:
         How many events were written.
     """
-    partial, raw = path.with_name(path.name + ".partial"), path.with_name(path.name + ".events")
+    raw = path.with_name(path.name + ".events")
     try:
         with raw.open("wb") as file:
             n = sum(file.write(np.ascontiguousarray(part, RECORD).tobytes()) for part in events) // RECORD.itemsize
@@ -232,7 +233,7 @@ def write(
         if poses is not None:
             names = ("pose_t_ns", "location", "rotation_deg")
             small |= dict(zip(names, poses(), strict=True))
-        with zipfile.ZipFile(partial, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        with written_whole(path) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             for name, value in small.items():
                 with archive.open(f"{name}.npy", "w") as member:
                     np.lib.format.write_array(member, np.asanyarray(value), allow_pickle=False)
@@ -241,8 +242,6 @@ def write(
                 np.lib.format.write_array_header_1_0(member, described)
                 while block := file.read(BLOCK_BYTES):
                     member.write(block)
-        partial.replace(path)
     finally:
         raw.unlink(missing_ok=True)
-        partial.unlink(missing_ok=True)
     return n

@@ -1,12 +1,12 @@
 """Any recording as HDF5 in DSEC's layout; dsec.py says what is added to it."""
 
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from neurove_core.files import written_whole
 from neurove_core.io import hdf5
 from neurove_core.io.dsec import LENS_FIELDS
 from neurove_core.io.recording import Recording
@@ -48,16 +48,9 @@ def write_dsec(recording: Recording, path: Path, progress: Callable[[int], None]
     if recording.endless:
         raise InvalidField("write_dsec", "recording", recording.name, "one that ends is expected")
     h5py = hdf5.library()
-    part = path.with_name(path.name + ".part")
-    try:
-        with h5py.File(part, "w") as file:
-            n = _write_events(recording, file, progress)
-            streams = ("events", *_write_truth(recording, file), *_write_imu(recording, file))
-        with part.open("rb+") as whole:
-            os.fsync(whole.fileno())
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)  # it is there only where writing failed
+    with written_whole(path) as part, h5py.File(part, "w") as file:
+        n = _write_events(recording, file, progress)
+        streams = ("events", *_write_truth(recording, file), *_write_imu(recording, file))
     return Written(n, streams, tuple(stream for stream in recording.streams if stream not in streams))
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.figures import blank_figure
+from neurove_core.figures import blank_figure, write_figure
 from neurove_core.io.summary import SLICE_US, Survey
 from protocol.errors import InvalidField
 
@@ -30,12 +30,9 @@ def draw(survey: Survey, file: Path) -> None:
     if file.suffix.lower() not in _SUFFIXES:
         raise InvalidField("info", "plot", str(file), f"the suffix must be {' or '.join(_SUFFIXES)}")
     figure = _figure(survey)
-    part = file.with_name(f".{file.stem}.part{file.suffix}")
     try:
-        figure.savefig(part, dpi=150, metadata={"Date": None} if file.suffix.lower() == ".svg" else None)
-        part.replace(file)
+        write_figure(figure, file)
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise InvalidField("info", "plot", str(file), error.strerror or str(error)) from None
 
 

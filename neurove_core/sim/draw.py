@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.figures import blank_figure
+from neurove_core.figures import blank_figure, write_figure
 from neurove_core.sim.camera import as_image, rays_of
 from neurove_core.sim.simulate import INTERVAL_US, Simulation
 from protocol.errors import InvalidField
@@ -47,10 +47,8 @@ def draw(simulation: Simulation, path: Path, t_s: float = 1.0) -> None:
     figure.colorbar(drawn, ax=figure.axes[-1], ticks=ticks, shrink=0.8).ax.set_yticklabels(
         [f"{10**tick:.2g}" for tick in ticks]
     )
-    partly = path.with_name(path.name + ".part")
     try:
-        figure.savefig(partly, dpi=120, format="png")
-        partly.replace(path)
+        write_figure(figure, path, dpi=120)
     except OSError as error:
         raise InvalidField("picture", "path", str(path), error.strerror or str(error)) from None
 

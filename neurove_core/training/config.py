@@ -7,7 +7,8 @@ from typing import Annotated, Final, Self
 from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
 from neurove_core.config import Config, ModelConfig
-from protocol.errors import InvalidField, shown
+from protocol.errors import InvalidField
+from protocol.fields import WrongField
 
 CONFIGS: Final = Path(__file__).parent / "configs"
 """The configurations that come with the package, by name."""
@@ -182,6 +183,5 @@ def load(source: str) -> TrainingConfig:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InvalidField("training", "config", source, f"not TOML: {error}") from None
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in first["loc"])[:80] or "config"
-        raise InvalidField("training", where, shown(first["input"]), first["msg"]) from None
+        wrong = WrongField.of(error)
+        raise InvalidField("training", wrong.name or "config", wrong.value, wrong.why) from None

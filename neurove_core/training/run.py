@@ -27,6 +27,7 @@ from neurove_core.training.config import RecipeConfig, TrainingConfig
 from neurove_core.training.data import Sequences
 from neurove_core.training.ranks import ALONE, Ranks, share_norms
 from protocol.errors import BadModel, InvalidField
+from protocol.fields import WrongField
 
 _KEY = "neurove_run"
 _SYMMETRIC = [0, 4, 5]  # vx wy wz: as often to one side as to the other, for half of what is seen is mirrored
@@ -194,7 +195,8 @@ def _same_config(path: Path, began: dict[str, Any], config: TrainingConfig) -> N
     try:
         found = TrainingConfig.model_validate(began).model_dump(mode="json")
     except ValidationError as error:
-        raise BadModel(path.name, f"it began with a configuration that is none: {error.errors()[0]['msg']}") from None
+        why = f"it began with a configuration that is none: {WrongField.of(error).sentence}"
+        raise BadModel(path.name, why) from None
     for part, fields in config.model_dump(mode="json").items():
         for name, value in fields.items() if isinstance(fields, dict) else ((part, fields),):
             was = found[part][name] if isinstance(fields, dict) else found[part]

@@ -1,6 +1,5 @@
-"""MVSEC, DSEC and M3ED in HDF5, in files that are written here in those layouts, and what neurove itself writes."""
+"""Recordings in HDF5, whatever the layout: MVSEC, DSEC, M3ED and our own, in files that are written here."""
 
-import itertools
 import re
 import sys
 import tracemalloc
@@ -11,81 +10,29 @@ import hdf5plugin
 import numpy as np
 import pytest
 
-from neurove_core import rotations
 from neurove_core.extras import MissingExtra
-from neurove_core.geometry import Twists, twists
-from neurove_core.io import (
-    BrokenRecording,
-    EventsOnly,
-    Imu,
-    Recording,
-    UnknownSource,
-    hdf5,
-    mvsec,
-    open_source,
-    read_poses,
-    write_dsec,
-)
-from neurove_core.io.dsec_write import MAX_SPAN_S
+from neurove_core.io import BrokenRecording, UnknownSource, hdf5, open_source
 from neurove_core.io.recording import CHUNK_EVENTS
-from protocol import Events, NeuroVEError, Sensor
-from protocol.errors import InvalidField
+from protocol import Events, NeuroVEError
 from protocol.events import check_events
 from tests.builders import SENSOR, make_events
-from tests.datasets import CHUNK, make_imu, make_poses, matrices, rigid, write_dsec_file, write_m3ed, write_mvsec
-from tests.recordings import shared
-
-DAY_US = 1_506_117_902_000_000
-EVENTS = make_events(1000, seed=1, start_us=500_000, duration_us=1_000_000)
-LATE = EVENTS._replace(t=EVENTS.t + DAY_US)
-
-
-def read(recording: Recording) -> Events:
-    return Events.join(list(recording.chunks()))
-
-
-def read_broken(recording: Recording) -> tuple[Events, BrokenRecording | None]:
-    """What is whole, and what ended it."""
-    parts = []
-    try:
-        for chunk in recording.chunks():
-            parts.append(chunk)  # noqa: PERF402 what came before the error counts
-    except BrokenRecording as error:
-        return Events.join(parts), error
-    return Events.join(parts), None
-
-
-def assert_same(got: Events, want: Events) -> None:
-    for name, a, b in zip("txyp", got, want, strict=True):
-        np.testing.assert_array_equal(a, b, err_msg=name)
-        assert a.dtype == b.dtype
-
-
-def imu_of(recording: Recording) -> Imu:
-    return Imu(*(np.concatenate(parts) for parts in zip(*recording.imu(), strict=True)))
-
-
-def mvsec_file(folder: Path) -> str:
-    return write_mvsec(folder, LATE)
-
-
-def dsec_file(folder: Path) -> str:
-    return write_dsec_file(folder / "events.h5", LATE, offset_us=DAY_US)
-
-
-def m3ed_file(folder: Path) -> str:
-    return write_m3ed(folder, LATE._replace(t=EVENTS.t))
-
-
-def own_file(folder: Path) -> str:
-    write_dsec(open_source(mvsec_file(folder), SENSOR), folder / "own.h5")
-    return str(folder / "own.h5")
-
+from tests.datasets import (
+    CHUNK,
+    DAY_US,
+    EVENTS,
+    LATE,
+    dsec_file,
+    m3ed_file,
+    make_poses,
+    mvsec_file,
+    own_file,
+    spoil,
+    write_m3ed,
+    write_mvsec,
+)
+from tests.recordings import assert_same, read, read_broken
 
 each_layout = pytest.mark.parametrize("written", [mvsec_file, dsec_file, m3ed_file, own_file])
-
-
-# --- all layouts ----------------------------------------------------------------------------------------------------
 
 
 @each_layout
@@ -122,14 +69,6 @@ def test_what_is_before_a_time_is_not_read(written, name, tmp_path):
     events = EVENTS if written is m3ed_file else LATE
     assert read_broken(recording)[0].n == 0
     assert_same(Events.join(list(recording.since(int(events.t[700])))), events.span(700, 1000))
-
-
-def spoil(path: Path, data: h5py.Dataset, number: int) -> None:
-    """Overwrite a stored chunk."""
-    chunk = data.id.get_chunk_info(number)
-    with path.open("r+b") as file:
-        file.seek(chunk.byte_offset)
-        file.write(b"\xff" * chunk.size)
 
 
 @each_layout
@@ -297,7 +236,12 @@ def test_an_empty_data_set_has_no_events(tmp_path):
     assert recording.twists() is None
 
 
-# --- which layout, which stream -------------------------------------------------------------------------------------
+def test_a_compressed_file_of_another_packing_is_read_too(tmp_path):
+    path = write_mvsec(tmp_path, LATE, compression=hdf5plugin.Zstd())
+    assert_same(read(open_source(path, SENSOR)), LATE)
+
+
+# --- which layout, which stream --------------------------------------------------------------------------------------
 
 
 def test_a_file_of_no_known_layout_is_told_what_was_looked_for(tmp_path):
@@ -357,406 +301,3 @@ def test_without_h5py_its_absence_is_told(tmp_path, monkeypatch):
         open_source(path)
     with pytest.raises(MissingExtra):
         hdf5.library()
-
-
-# --- MVSEC ----------------------------------------------------------------------------------------------------------
-
-
-def test_mvsec_gives_events_images_imu_and_truth(tmp_path):
-    poses, imu = make_poses(start_us=DAY_US), make_imu(start_us=DAY_US)
-    images = np.random.default_rng(3).integers(0, 256, (4, 260, 346), np.uint8)
-    recording = open_source(write_mvsec(tmp_path, LATE, imu=imu, poses=poses, images=images))
-    assert recording.sensor == Sensor(346, 260)
-    assert recording.streams == ("events", "imu", "frames", "poses", "twists")
-    frames = list(recording.frames())
-    np.testing.assert_array_equal(np.stack([frame.image for frame in frames]), images)
-    assert [frame.t_us - int(LATE.t[0]) for frame in frames] == [0, 25_000, 50_000, 75_000]
-    got = recording.poses()
-    assert got is not None
-    np.testing.assert_array_equal(got.t, poses.t)
-    np.testing.assert_allclose(got.position_m, poses.position_m, atol=1e-12)
-    np.testing.assert_allclose(matrices(got), matrices(poses), atol=1e-12)
-    truth, want = recording.twists(), twists(poses)
-    assert truth is not None
-    np.testing.assert_allclose(truth.twist, want.twist, atol=1e-9)
-
-
-def test_mvsecs_imu_is_turned_into_the_cameras_frame(tmp_path):
-    imu = make_imu(start_us=DAY_US)
-    got = imu_of(open_source(write_mvsec(tmp_path, LATE, imu=imu)))
-    turn = np.array(mvsec.CAMERA_FROM_IMU["davis/left"])
-    np.testing.assert_array_equal(got.t, imu.t)
-    np.testing.assert_allclose(got.gyro_rad_s, imu.gyro_rad_s @ turn.T, atol=1e-12)
-    np.testing.assert_allclose(got.accel_m_s2, imu.accel_m_s2 @ turn.T, atol=1e-12)
-    assert np.abs(got.gyro_rad_s - imu.gyro_rad_s).max() > 0.01
-
-
-def test_mvsecs_constants_are_those_of_its_calibration():
-    text = shared("mvsec/camchain-imucam-indoor_flying.yaml").read_text()
-    numbers = {word.strip(",[] \n") for word in text.replace("[", " ").replace("]", " ").split()}
-    told = [value for lens in mvsec.LENS_INDOOR_FLYING.values() for value in lens.distortion]
-    told += [getattr(lens, f) for lens in mvsec.LENS_INDOOR_FLYING.values() for f in ("fx", "fy", "cx", "cy")]
-    told += [value for rows in mvsec.CAMERA_FROM_IMU.values() for row in rows for value in row]
-    told += list(itertools.chain(*mvsec.RIGHT_FROM_LEFT))
-    assert [value for value in told if str(value) not in numbers] == []
-    for turn in mvsec.CAMERA_FROM_IMU.values():
-        np.testing.assert_allclose(np.array(turn) @ np.array(turn).T, np.eye(3), atol=1e-8)
-
-
-def test_mvsecs_lens_is_equidistant_and_that_of_its_sequence(tmp_path):
-    indoor = open_source(write_mvsec(tmp_path, LATE)).camera("cam0")
-    outdoor = open_source(write_mvsec(tmp_path, LATE, name="outdoor_day2")).camera("cam0")
-    assert indoor is not None
-    assert outdoor is not None
-    assert (indoor.stream, indoor.lens, indoor.fx) == ("cam0", "equidistant", 226.38018519795807)
-    assert (outdoor.lens, outdoor.fx) == ("equidistant", 223.9940010790056)
-    assert open_source(write_mvsec(tmp_path, LATE), SENSOR).camera("cam0") is None
-
-
-def test_the_right_camera_of_mvsec_stands_ten_centimetres_to_the_right_and_turns_as_the_left(tmp_path):
-    poses = make_poses(start_us=DAY_US)
-    path = write_mvsec(tmp_path, LATE, right=LATE, poses=poses, imu=make_imu(start_us=DAY_US))
-    left, right = open_source(path).poses(), open_source(path, topic="davis/right").poses()
-    assert left is not None
-    assert right is not None
-    offset = rotations.turn(rotations.inverse(left.orientation), right.position_m - left.position_m)
-    np.testing.assert_allclose(offset, np.broadcast_to([0.0999, 0, 0], offset.shape), atol=3e-3)
-    want = np.vstack([mvsec.RIGHT_FROM_LEFT, [0, 0, 0, 1]])
-    got = np.linalg.inv(matrices(right)) @ matrices(left)
-    np.testing.assert_allclose(got, np.broadcast_to(want, got.shape), atol=1e-7)
-    one, other = (imu_of(open_source(path, topic=topic)) for topic in mvsec.TOPICS)
-    np.testing.assert_allclose(np.linalg.norm(one.gyro_rad_s, axis=1), np.linalg.norm(other.gyro_rad_s, axis=1))
-
-
-def test_mvsec_without_truth_has_none(tmp_path):
-    recording = open_source(write_mvsec(tmp_path, LATE))
-    assert recording.streams == ("events",)
-    assert recording.poses() is None
-    assert recording.twists() is None
-    assert list(recording.frames()) == []
-
-
-@pytest.mark.parametrize(("row", "value"), [(7, np.nan), (7, np.inf), (7, 1.0)])
-def test_a_bad_imu_sample_ends_the_stream_at_its_row(row, value, tmp_path):
-    imu = make_imu(start_us=DAY_US)
-    path = write_mvsec(tmp_path, LATE, imu=imu)
-    with h5py.File(path, "r+") as file:
-        file["davis/left/imu_ts"][row] = value
-    blocks = open_source(path).imu()
-    assert next(blocks).t.tolist() == imu.t[:row].tolist()
-    with pytest.raises(BrokenRecording, match=f"row {row} of davis/left/imu"):
-        next(blocks)
-
-
-def test_images_of_another_kind_are_refused(tmp_path):
-    path = write_mvsec(tmp_path, LATE, images=np.zeros((2, 260, 346)))  # type: ignore[arg-type]  # on purpose
-    with pytest.raises(BrokenRecording, match="images of uint8 are expected, not float64"):
-        list(open_source(path).frames())
-
-
-def test_an_imu_that_can_not_be_read_on_ends_there(tmp_path):
-    path = Path(own_file(tmp_path))
-    with h5py.File(path, "r+") as file:
-        imu = make_imu(250, start_us=DAY_US)
-        for name, rows in zip(("t", "accel", "gyro"), imu, strict=True):
-            chunks = (CHUNK, *rows.shape[1:])
-            file.create_dataset(f"imu/{name}", data=rows, chunks=chunks, compression=hdf5plugin.Zstd())
-    with h5py.File(path) as file:
-        spoil(path, file["imu/gyro"], 1)
-    blocks = open_source(str(path)).imu()
-    assert next(blocks).t.tolist() == imu.t[:CHUNK].tolist()
-    with pytest.raises(BrokenRecording, match=f"row {CHUNK} of imu"):
-        next(blocks)
-
-
-def test_images_out_of_order_are_told_by_their_row(tmp_path):
-    path = write_mvsec(tmp_path, LATE, images=np.zeros((4, 260, 346), np.uint8))
-    with h5py.File(path, "r+") as file:
-        file["davis/left/image_raw_ts"][2] = 1.0
-    with pytest.raises(BrokenRecording, match="row 2 of davis/left/image_raw"):
-        list(open_source(path).frames())
-
-
-def test_a_truth_that_is_no_rigid_motion_is_told_by_its_row(tmp_path):
-    path = write_mvsec(tmp_path, LATE, poses=make_poses(start_us=DAY_US))
-    with h5py.File(tmp_path / "indoor_flying1_gt.hdf5", "r+") as file:
-        file["davis/left/odometry"][5, 0, 0] = 3.0
-    with pytest.raises(InvalidField, match="row 5 of davis/left/odometry: matrix="):
-        open_source(path).poses()
-
-
-# --- DSEC -----------------------------------------------------------------------------------------------------------
-
-
-def test_dsec_is_640x480_and_its_offset_may_be_absent(tmp_path):
-    recording = open_source(write_dsec_file(tmp_path / "events.h5", EVENTS))
-    assert recording.sensor == Sensor(640, 480)
-    assert_same(read(recording), EVENTS)
-    assert recording.camera("cam0") is None
-
-
-def test_a_file_in_dsecs_layout_of_a_larger_sensor_asks_for_it(tmp_path):
-    """TUM-VIE's are such files."""
-    events = make_events(100, seed=4, sensor=Sensor(1280, 720))
-    path = write_dsec_file(tmp_path / "events.h5", events)
-    _, error = read_broken(open_source(path))
-    assert error is not None
-    assert "lies outside the sensor 640x480, which is DSEC's" in error.message
-    assert "--sensor WIDTHxHEIGHT" in error.message
-    assert_same(read(open_source(path, Sensor(1280, 720))), events)
-
-
-def test_dsec_without_an_index_is_read_from_a_time_on_all_the_same(tmp_path):
-    recording = open_source(write_dsec_file(tmp_path / "events.h5", LATE, offset_us=DAY_US, index=False))
-    assert_same(Events.join(list(recording.since(int(LATE.t[600]) + 1))), LATE.span(601, 1000))
-
-
-@pytest.mark.parametrize("offset", [2**63, [1, 2], b"soon"])
-def test_a_time_offset_that_is_none_is_named(offset, tmp_path):
-    path = write_dsec_file(tmp_path / "events.h5", EVENTS)
-    with h5py.File(path, "r+") as file:
-        file["t_offset"] = np.array(offset, "u8") if isinstance(offset, int) else offset
-    with pytest.raises(BrokenRecording, match="t_offset"):
-        open_source(path)
-
-
-def test_what_is_written_in_dsecs_layout_is_read_back_with_all_that_the_source_had(tmp_path):
-    poses, imu = make_poses(start_us=DAY_US), make_imu(start_us=DAY_US)
-    images = np.zeros((4, 260, 346), np.uint8)
-    source = open_source(write_mvsec(tmp_path, LATE, imu=imu, poses=poses, images=images))
-    told: list[int] = []
-    written = write_dsec(source, tmp_path / "out.h5", told.append)
-    assert written == (LATE.n, ("events", "poses", "twists", "imu"), ("frames",))
-    assert told == [LATE.n]
-    copy = open_source(str(tmp_path / "out.h5"))
-    assert copy.sensor == source.sensor
-    assert copy.camera("cam0") == source.camera("cam0")
-    assert_same(read(copy), read(source))
-    assert set(copy.streams) == {"events", "imu", "poses", "twists"}
-    for a, b in zip(imu_of(copy), imu_of(source), strict=True):
-        np.testing.assert_array_equal(a, b)
-    for mine, theirs in ((copy.poses(), source.poses()), (copy.twists(), source.twists())):
-        assert mine is not None
-        assert theirs is not None
-        for a, b in zip(mine, theirs, strict=True):
-            np.testing.assert_allclose(a, b, rtol=0, atol=1e-15)
-    assert read_poses(tmp_path / "out.h5").t.tolist() == poses.t.tolist()
-
-
-def test_the_index_that_is_written_is_that_of_dsecs_own_example(tmp_path):
-    t = [0, 500, 2100, 5000, 5000, 7100, 7200, 7200, 8100, 9000]
-    write_dsec(Given([Events.from_columns(np.array(t) + 77, [1] * 10, [2] * 10, [1] * 10)]), tmp_path / "a.h5")
-    with h5py.File(tmp_path / "a.h5") as file:
-        assert file["ms_to_idx"][()].tolist() == [0, 2, 2, 3, 3, 3, 5, 5, 8, 9]
-        assert file["t_offset"][()] == 77
-        assert file["events/t"][()].tolist() == t
-        assert {name: file[f"events/{name}"].dtype.str for name in "pxy"} == {"p": "|u1", "x": "<u2", "y": "<u2"}
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_what_is_written_does_not_depend_on_how_the_source_cuts_its_chunks(seed, tmp_path):
-    events = make_events(3000, seed=seed, start_us=123, duration_us=50_000)
-    cuts = [0, *sorted(np.random.default_rng(seed).choice(np.arange(1, 3000), 20, replace=False).tolist()), 3000]
-    write_dsec(Given([events]), tmp_path / "one.h5")
-    write_dsec(Given([events.span(a, b) for a, b in itertools.pairwise(cuts)]), tmp_path / "many.h5")
-    with h5py.File(tmp_path / "one.h5") as one, h5py.File(tmp_path / "many.h5") as many:
-        np.testing.assert_array_equal(one["ms_to_idx"], many["ms_to_idx"])
-        t = one["events/t"][()]
-        for ms, entry in enumerate(one["ms_to_idx"][()].tolist()):
-            assert t[entry] >= ms * 1000
-            assert entry == 0 or t[entry - 1] < ms * 1000
-    assert_same(read(open_source(str(tmp_path / "many.h5"))), events)
-
-
-class Given(EventsOnly):
-    """A recording of these chunks, and an error after them."""
-
-    name, sensor, endless = "given", SENSOR, False
-
-    def __init__(self, parts: list[Events], error: Exception | None = None) -> None:
-        self.parts, self.error = parts, error
-
-    def chunks(self):
-        yield from self.parts
-        if self.error:
-            raise self.error
-
-
-def test_a_source_that_breaks_leaves_nothing_behind_and_what_was_there_stays(tmp_path):
-    out = tmp_path / "out.h5"
-    out.write_bytes(b"precious")
-    broken = Given([EVENTS], BrokenRecording(Path("a.raw"), "byte 7", "why not"))
-    with pytest.raises(BrokenRecording, match="byte 7"):
-        write_dsec(broken, out)
-    assert out.read_bytes() == b"precious"
-    assert list(tmp_path.iterdir()) == [out]
-
-
-def test_a_source_without_end_or_with_a_jump_in_time_is_not_written(tmp_path):
-    with pytest.raises(InvalidField, match="one that ends is expected"):
-        write_dsec(open_source("pattern://"), tmp_path / "out.h5")
-    jump = Events.from_columns([5, MAX_SPAN_S * 1_000_000 + 6], [1, 1], [1, 1], [1, 1])
-    with pytest.raises(InvalidField, match=f"at most {MAX_SPAN_S} s"):
-        write_dsec(Given([jump]), tmp_path / "out.h5")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_recording_without_events_is_written_and_read(tmp_path):
-    assert write_dsec(Given([]), tmp_path / "out.h5") == (0, ("events",), ())
-    recording = open_source(str(tmp_path / "out.h5"))
-    assert (read(recording).n, recording.sensor) == (0, SENSOR)
-
-
-def test_a_long_gap_is_indexed(tmp_path):
-    gap = Events.from_columns([5, 3_600_000_005], [1, 2], [1, 2], [1, 0])
-    write_dsec(Given([gap]), tmp_path / "out.h5")
-    assert (tmp_path / "out.h5").stat().st_size < 1 << 20
-    assert_same(Events.join(list(open_source(str(tmp_path / "out.h5")).since(6))), gap.span(1, 2))
-
-
-@pytest.mark.parametrize("path", ["prophesee/evt3.raw", "ecd/shapes_rotation", "aedat4/davis346.aedat4"])
-def test_a_real_recording_survives_the_way_through_dsecs_layout(path, tmp_path):
-    source = open_source(str(shared(path)))
-    write_dsec(source, tmp_path / "out.h5")
-    copy = open_source(str(tmp_path / "out.h5"))
-    assert_same(read(copy), read(source))
-    assert copy.sensor == source.sensor
-    assert copy.camera("cam0") == source.camera("cam0")
-    middle = int(read(source).t[10_000])
-    assert next(copy.since(middle)).t[0] == next(source.since(middle)).t[0] >= middle
-
-
-@pytest.mark.parametrize(
-    ("group", "name", "value"),
-    [
-        ("events", "width", "wide"),
-        ("events", "width", 0),
-        ("events", "height", np.inf),
-        ("camera", "fx", -1.0),
-        ("camera", "distortion", [1.0]),
-    ],
-)
-def test_attributes_that_were_spoilt_are_named(group, name, value, tmp_path):
-    path = tmp_path / "out.h5"
-    write_dsec(open_source(write_mvsec(tmp_path, LATE)), path)
-    with h5py.File(path, "r+") as file:
-        file[group].attrs[name] = value
-    with pytest.raises(BrokenRecording, match=f"attributes of {group}"):
-        open_source(str(path))
-
-
-def test_twists_that_run_backwards_are_told_by_their_row(tmp_path):
-    write_dsec(open_source(write_mvsec(tmp_path, LATE, poses=make_poses(start_us=DAY_US))), tmp_path / "out.h5")
-    with h5py.File(tmp_path / "out.h5", "r+") as file:
-        file["twists/t"][3] = 0
-    with pytest.raises(BrokenRecording, match="row 3 of twists"):
-        open_source(str(tmp_path / "out.h5")).twists()
-    with h5py.File(tmp_path / "out.h5", "r+") as file:
-        del file["twists"]
-    recording = open_source(str(tmp_path / "out.h5"))
-    assert "twists" in recording.streams
-    assert isinstance(recording.twists(), Twists)
-
-
-# --- M3ED -----------------------------------------------------------------------------------------------------------
-
-
-def test_m3ed_gives_its_lens_imu_and_truth_in_the_cameras_frame(tmp_path):
-    poses, imu = make_poses(), make_imu()
-    mount = rigid((0.3, -1.2, 0.5), (0.1, 0.2, 0.3))
-    recording = open_source(write_m3ed(tmp_path, EVENTS, imu=imu, poses=poses, mounts={"imu": mount}))
-    assert recording.streams == ("events", "imu", "poses", "twists")
-    assert recording.sensor == SENSOR
-    camera = recording.camera("cam0")
-    assert camera is not None
-    assert (camera.stream, camera.lens, camera.sensor) == ("cam0", "pinhole", SENSOR)
-    assert (camera.fx, camera.cy, camera.distortion) == (60.0, 24.5, (-0.1, 0.02, 0.001, -0.002))
-    got = recording.poses()
-    assert got is not None
-    np.testing.assert_allclose(matrices(got), matrices(poses), atol=1e-12)
-    samples = imu_of(recording)
-    np.testing.assert_allclose(samples.gyro_rad_s, imu.gyro_rad_s @ mount[:3, :3].T, atol=1e-12)
-    np.testing.assert_allclose(samples.accel_m_s2, imu.accel_m_s2 @ mount[:3, :3].T, atol=1e-12)
-    assert open_source(write_m3ed(tmp_path, EVENTS), Sensor(100, 100)).camera("cam0") is None
-
-
-def test_m3eds_matrices_are_the_inverse_of_mvsecs_and_one_motion_gives_one_truth(tmp_path):
-    poses = make_poses(start_us=DAY_US)
-    one = open_source(write_mvsec(tmp_path, LATE, poses=poses)).twists()
-    other = open_source(write_m3ed(tmp_path, EVENTS, poses=poses)).twists()
-    assert one is not None
-    assert other is not None
-    np.testing.assert_allclose(one.twist, other.twist, atol=1e-9)
-
-
-def test_the_right_camera_of_m3ed_is_where_its_calibration_says(tmp_path):
-    poses, imu = make_poses(), make_imu()
-    mounts = {"imu": rigid((0.3, -1.2, 0.5), (0, 0, 0)), "right": rigid((0.01, 0.02, 0.03), (0.12, 0, 0))}
-    path = write_m3ed(tmp_path, EVENTS, right=EVENTS, imu=imu, poses=poses, mounts=mounts)
-    recording = open_source(path, topic="prophesee/right")
-    got = recording.poses()
-    assert got is not None
-    np.testing.assert_allclose(matrices(got), matrices(poses) @ mounts["right"], atol=1e-12)
-    turn = (np.linalg.inv(mounts["right"]) @ mounts["imu"])[:3, :3]
-    np.testing.assert_allclose(imu_of(recording).gyro_rad_s, imu.gyro_rad_s @ turn.T, atol=1e-12)
-
-
-def test_samples_that_m3eds_imu_never_took_are_left_out(tmp_path):
-    imu = make_imu()
-    holes = imu._replace(t=imu.t.copy(), accel_m_s2=imu.accel_m_s2.copy(), gyro_rad_s=imu.gyro_rad_s.copy())
-    for row in (0, 7, 8):  # as its writer leaves them: nan, and in the times what a cast makes of nan
-        holes.t[row], holes.accel_m_s2[row], holes.gyro_rad_s[row] = np.iinfo(np.int64).min, np.nan, np.nan
-    got = imu_of(open_source(write_m3ed(tmp_path, EVENTS, imu=holes)))
-    keep = np.setdiff1d(np.arange(imu.t.size), [0, 7, 8])
-    np.testing.assert_array_equal(got.t, imu.t[keep])
-    np.testing.assert_array_equal(got.gyro_rad_s, imu.gyro_rad_s[keep])
-
-
-def test_m3ed_without_calibration_is_1280x720_and_has_no_imu_in_a_frame_that_is_known(tmp_path):
-    path = write_m3ed(tmp_path, EVENTS, imu=make_imu(), poses=make_poses())
-    with h5py.File(path, "r+") as file:
-        del file["prophesee/left/calib"]
-        del file["prophesee/left/ms_map_idx"]
-    recording = open_source(path)
-    assert recording.sensor == Sensor(1280, 720)
-    assert recording.streams == ("events",)
-    assert recording.camera("cam0") is None
-    assert list(recording.imu()) == []
-    assert recording.poses() is None
-    assert_same(Events.join(list(recording.since(int(EVENTS.t[600]) + 1))), EVENTS.span(601, 1000))
-
-
-@pytest.mark.parametrize(
-    ("name", "value", "why"),
-    [
-        ("distortion_model", "omni", "distortion_model='pinhole-omni'"),
-        ("intrinsics", [1.0, 2.0], "fx fy cx cy"),
-        ("intrinsics", [-1.0, 2.0, 3.0, 4.0], "fx fy cx cy"),
-        ("resolution", [0, 48], "fx fy cx cy"),
-        ("resolution", [np.inf, 48], "fx fy cx cy"),
-        ("distortion_coeffs", [1.0], "fx fy cx cy"),
-        ("distortion_coeffs", "none", "fx fy cx cy"),
-    ],
-)
-def test_a_calibration_that_is_none_is_named_when_the_file_is_opened(name, value, why, tmp_path):
-    path = write_m3ed(tmp_path, EVENTS)
-    with h5py.File(path, "r+") as file:
-        del file[f"prophesee/left/calib/{name}"]
-        file[f"prophesee/left/calib/{name}"] = value
-    with pytest.raises(InvalidField, match=why):
-        open_source(path)
-
-
-@pytest.mark.parametrize("mount", [np.ones((4, 4)), np.full((4, 4), np.nan), np.eye(3), "none"])
-def test_a_mount_that_is_no_rigid_motion_is_named(mount, tmp_path):
-    path = write_m3ed(tmp_path, EVENTS)
-    with h5py.File(path, "r+") as file:
-        del file["prophesee/left/calib/T_to_prophesee_left"]
-        file["prophesee/left/calib/T_to_prophesee_left"] = mount
-    with pytest.raises(BrokenRecording, match="T_to_prophesee_left: a rigid motion"):
-        open_source(path)
-
-
-def test_a_compressed_file_of_another_packing_is_read_too(tmp_path):
-    path = write_mvsec(tmp_path, LATE, compression=hdf5plugin.Zstd())
-    assert_same(read(open_source(path, SENSOR)), LATE)

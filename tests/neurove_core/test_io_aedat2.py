@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
-from neurove_core.io import Imu, UnknownSource, open_source
+from neurove_core.io import UnknownSource, open_source
 from protocol import Events, Sensor
 from protocol.errors import InvalidField
 from tests.builders import make_events
-from tests.neurove_core.test_io import assert_same, put, read, read_broken
-from tests.recordings import shared
+from tests.recordings import all_samples, assert_same, put, read, read_broken, shared
 
 SCALE = (
     b'#<entry key="ImuGyroScale" value="GyroFullScaleDegPerSec%d"/>\r\n'
@@ -32,10 +31,6 @@ def davis(events: Events, sensor: Sensor) -> np.ndarray:
 
 def imu_words(values: list[int]) -> np.ndarray:
     return np.array([1 << 31 | 3 << 10 | code << 28 | (value & 0xFFFF) << 12 for code, value in enumerate(values)])
-
-
-def all_samples(recording) -> Imu:
-    return Imu(*(np.concatenate(columns) for columns in zip(*recording.imu(), strict=True)))
 
 
 def test_the_real_recording_holds_its_known_events_and_samples():

@@ -1,23 +1,17 @@
-"""What AEDAT4 files hold beside their events: inertial samples, frames and triggers."""
+"""AEDAT4: inertial samples, frames and triggers, and what is wrong with its packets of events."""
 
 import struct
 
 import numpy as np
 import pytest
 
-from neurove_core.io import BrokenRecording, Imu, Recording, Triggers, open_source
+from neurove_core.io import BrokenRecording, MissingGeometry, UnknownSource, open_source
 from neurove_core.io.aedat4 import EXPOSURE, EXTERNAL, GENERATOR, READOUT
+from protocol import Events
 from tests.builders import SENSOR, make_events
-from tests.neurove_core.test_io import put
-from tests.recordings import aedat4, shared
+from tests.recordings import aedat4, all_samples, all_triggers, assert_same, put, read, read_broken, shared
 
-
-def all_samples(recording: Recording) -> Imu:
-    return Imu(*(np.concatenate(columns) for columns in zip(*recording.imu(), strict=True)))
-
-
-def all_triggers(recording: Recording) -> Triggers:
-    return Triggers(*(np.concatenate(columns) for columns in zip(*recording.triggers(), strict=True)))
+EVENTS = make_events(300, seed=1, start_us=16_700_000)
 
 
 @pytest.mark.parametrize(("name", "n", "rate_hz"), [("davis346", 2363, 1001), ("dvxplorer", 475, 805)])
@@ -112,3 +106,55 @@ def test_every_stream_of_a_cut_file_gives_what_is_whole_and_then_the_byte(part, 
             for a, b in zip(piece, want, strict=True):
                 np.testing.assert_array_equal(a, b)
     assert len(told) == 1  # all streams end at the same place
+
+
+# --- packets and streams of events -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("t", "x", "why"),
+    [
+        ((20, 30, 40), (1, 64, 3), "event 1 at x=64 y=2 lies outside the sensor 64x48"),
+        ((20, 19, 40), (1, 2, 3), "event 1 at t=19 us comes after t=20 us"),
+        ((9, 30, 40), (1, 2, 3), "event 0 at t=9 us comes after t=10 us"),
+        ((9, 30, 20), (1, 2, 3), "event 0 at t=9 us comes after t=10 us"),
+    ],
+)
+def test_a_packet_with_a_bad_event_ends_the_recording_before_that_event(t, x, why, tmp_path):
+    first = Events.from_columns([5, 10], [1, 2], [3, 4], [0, 1])
+    second = Events.from_columns(t, x, [2, 2, 2], [1, 1, 1])
+    file = aedat4([first, second, second], SENSOR)
+    events, error = read_broken(open_source(put(tmp_path, "a.aedat4", file.data)))
+    assert_same(events, Events.join([first, second.span(0, int(why[6]))]))
+    assert error is not None
+    assert error.details["where"] == f"byte {file.starts[1]}"
+    assert why in error.message
+
+
+def test_a_packet_without_events_is_no_chunk(tmp_path):
+    file = aedat4([Events.empty(), EVENTS, Events.empty()], SENSOR)
+    assert_same(read(open_source(put(tmp_path, "a.aedat4", file.data))), EVENTS)
+
+
+def test_an_aedat4_file_without_an_event_stream_or_a_size_says_so(tmp_path):
+    data = aedat4([EVENTS], SENSOR).data
+    with pytest.raises(UnknownSource, match="no event stream"):
+        open_source(put(tmp_path, "a.aedat4", data.replace(b">EVTS<", b">FRME<")))
+    nowhere = put(tmp_path, "a.aedat4", data.replace(b">64<", b">00<"))
+    with pytest.raises(MissingGeometry):
+        open_source(nowhere)
+    assert_same(read(open_source(nowhere, SENSOR)), EVENTS)
+    with pytest.raises(UnknownSource, match="does not begin as AEDAT4 does"):
+        open_source(put(tmp_path, "a.aedat4", b"#!AER-DAT3.1\r\n"))
+
+
+def test_of_several_event_streams_the_first_is_read_and_the_name_says_so(tmp_path):
+    data = aedat4([EVENTS], SENSOR).data
+    size = b'<attr key="sizeX" type="int">64</attr><attr key="sizeY" type="int">48</attr>'
+    both = data.replace(b">TRIG<", b">EVTS<").replace(b'1/info/"></node>', b'1/info/">' + size + b"</node>")
+    longer = len(both) - len(data)
+    header = bytearray(both)
+    for at, form in ((14, "<u4"), (46, "<i8"), (58, "<u4")):  # lengths of header and text, and where the packets end
+        header[at : at + int(form[2])] = (np.frombuffer(both, form, 1, at) + longer).astype(form).tobytes()
+    recording = open_source(put(tmp_path, "a.aedat4", bytes(header)))
+    assert recording.name == "a.aedat4 (stream 0, the first of 2 event streams)"

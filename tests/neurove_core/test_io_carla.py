@@ -15,7 +15,7 @@ from neurove_core.io.carla_server import record
 from protocol import Events
 from protocol.errors import InvalidField
 from tests.builders import SENSOR, make_events
-from tests.neurove_core.test_io import assert_same, put, read, read_broken
+from tests.recordings import assert_same, put, read, read_broken
 
 EVENTS = make_events(3000, seed=1)
 

@@ -1,4 +1,4 @@
-"""What the Event Camera Dataset has beside its events, in a folder and in the .zip that it comes as."""
+"""The Event Camera Dataset, as a folder and as the .zip that it comes as: lines of events and what lies beside."""
 
 import io
 import sys
@@ -11,9 +11,11 @@ from PIL import Image
 
 from neurove_core.extras import MissingExtra
 from neurove_core.io import BrokenRecording, UnknownSource, open_source
-from tests.builders import make_events
-from tests.neurove_core.test_io import assert_same, put, read, read_broken
-from tests.recordings import ecd_text, shared
+from neurove_core.io.recording import BLOCK_BYTES
+from protocol import Events
+from protocol.errors import InvalidField
+from tests.builders import SENSOR, make_events
+from tests.recordings import assert_same, ecd_text, put, read, read_broken, shared
 
 EVENTS = make_events(500, seed=1)
 IMU = b"# t ax ay az gx gy gz\n0.000001 0 -9.8 1 0.1 0.2 0.3\n0.5 1 2 3 4 5 6\n"
@@ -153,3 +155,98 @@ def test_a_list_whose_images_were_left_out_is_no_stream(tmp_path):
     recording = open_source(str(tmp_path))
     assert recording.streams == ("events",)
     assert list(recording.frames()) == []
+
+
+# --- lines of events, and the calibration ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("bad", "why"),
+    [
+        ("0.000003 1 2", "not `t[s] x y p`"),
+        ("0.000003 1 2 1 1", "not `t[s] x y p`"),
+        ("0.000003 -1 2 1", "not `t[s] x y p`"),
+        ("0.000003 1 2 2", "not `t[s] x y p`"),
+        ("nan 1 2 1", "not `t[s] x y p`"),
+        ("inf 1 2 1", "not `t[s] x y p`"),
+        ("one 1 2 1 " + 100 * "x", "not `t[s] x y p`"),
+        ("0.000003 240 2 1", "outside the sensor 240x180"),
+        ("0.000003 1 180 1", "outside the sensor 240x180"),
+        ("0.0000005 1 2 1", "time runs backwards"),
+    ],
+)
+def test_a_bad_line_ends_the_recording_with_its_number_and_its_text(bad, why, tmp_path):
+    path = put(tmp_path, "a.txt", f"0.000001 1 2 1\n\n0.000002 3 4 0\r\n{bad}\n0.000004 1 2 1\n".encode())
+    events, error = read_broken(open_source(path))
+    assert_same(events, Events.from_columns([1, 2], [1, 3], [2, 4], [1, 0]))
+    assert error is not None
+    assert error.details["where"] == "line 4"
+    assert why in error.message
+    assert bad[:60] in error.message
+    assert len(error.message) < len(path) + 200
+
+
+def test_of_several_bad_lines_the_first_is_told(tmp_path):
+    path = put(tmp_path, "a.txt", b"0.1 1 2 1\n0.2 999 2 1\n0.1 1 2 1\nno event\n")
+    _, error = read_broken(open_source(path))
+    assert error is not None
+    assert error.details["where"] == "line 2"
+    assert "outside the sensor" in error.message
+
+
+def test_a_line_is_counted_over_all_blocks_of_a_large_file(tmp_path):
+    lines = ecd_text(make_events(300_000, seed=3)).splitlines()
+    lines[250_000] = b"\xff\x00 no text"
+    events, error = read_broken(open_source(put(tmp_path, "a.txt", b"\n".join(lines))))
+    assert events.n == 250_000
+    assert error is not None
+    assert error.details["where"] == "line 250001"
+    assert repr("\\xff\x00 no text") in error.message
+
+
+def test_time_may_not_run_backwards_from_one_block_of_a_file_to_the_next_either(tmp_path):
+    block = ecd_text(make_events(150_000, seed=3, start_us=1000))
+    block += b"\n" * (BLOCK_BYTES - len(block))
+    events, error = read_broken(open_source(put(tmp_path, "a.txt", block + b"0.000999 1 2 1\n")))
+    assert events.n == 150_000
+    assert error is not None
+    assert error.details["where"] == f"line {len(block.splitlines()) + 1}"
+    assert "time runs backwards: '0.000999 1 2 1'" in error.message
+
+
+def test_a_file_that_is_no_text_is_broken_at_its_first_line(tmp_path):
+    events, error = read_broken(open_source(put(tmp_path, "a.txt", bytes(3 * BLOCK_BYTES))))
+    assert events.n == 0
+    assert error is not None
+    assert error.details["where"] == "line 1"
+
+
+def test_times_in_seconds_become_the_nearest_us(tmp_path):
+    path = put(tmp_path, "a.txt", b"0.0000014 1 1 1\n0.0000016 1 1 1\n1.0e1 1 1 0\n1506117902.290381 1 1 0\n")
+    assert read(open_source(path)).t.tolist() == [1, 2, 10_000_000, 1506117902290381]
+
+
+@pytest.mark.parametrize("empty", [b"", b"\n", b"\n \n\n"])
+def test_a_text_without_events_has_none(empty, tmp_path):
+    assert read(open_source(put(tmp_path, "a.txt", empty))).n == 0
+
+
+@pytest.mark.parametrize(
+    "calib", ["", "1 2 3 4", "1 2 3 4 5 6 7 8 9 10", "-1 2 3 4 0 0 0 0 0", "1 2 3 4 0 0 0 0 nan", "a b c d e f g h i"]
+)
+def test_a_wrong_calibration_is_named_when_the_recording_is_opened(calib, tmp_path):
+    put(tmp_path, "events.txt", ecd_text(EVENTS))
+    put(tmp_path, "calib.txt", calib.encode())
+    with pytest.raises(InvalidField, match=r"calib\.txt: calib=.* nine numbers") as caught:
+        open_source(str(tmp_path))
+    assert str(tmp_path / "calib.txt") in caught.value.message
+
+
+def test_a_folder_is_called_by_its_own_name_and_given_a_sensor_takes_it(tmp_path):
+    put(tmp_path, "events.txt", ecd_text(EVENTS))
+    put(tmp_path, "calib.txt", b"60 61 32 24 0 0 0 0 0\n")
+    recording = open_source(str(tmp_path), SENSOR)
+    assert recording.name == tmp_path.name
+    camera = recording.camera("cam0")
+    assert camera is not None
+    assert (camera.sensor, camera.fx, camera.fy) == (SENSOR, 60, 61)

@@ -6,8 +6,7 @@ import scipy.io
 
 from neurove_core.io import UnknownSource, open_source
 from protocol import Events, Sensor
-from tests.neurove_core.test_io import assert_same, put, read, read_broken
-from tests.recordings import shared
+from tests.recordings import assert_same, put, read, read_broken, shared
 
 TRUTH = b"Ground-truth: seq_0001,seq_0002\nrvec (rad/frame)\nrvec =  0.0071  0.1 0.1\nrvec = -0.0142 0 0\n"
 

@@ -11,8 +11,7 @@ from neurove_core.io import UnknownSource, open_source
 from neurove_core.io.eventstream import ATIS, DVS, es_decode, es_reference
 from protocol import Events, Sensor
 from tests.builders import SENSOR, make_events
-from tests.neurove_core.test_io import assert_same, put, read, read_broken
-from tests.recordings import shared
+from tests.recordings import assert_same, put, read, read_broken, shared
 
 
 def header(kind: int = DVS, version: bytes = b"\2\0\0", sensor: Sensor = SENSOR) -> bytes:

@@ -10,8 +10,8 @@ from protocol import Events, NeuroVEError, Sensor
 from protocol.events import check_events
 from tests.builders import SENSOR, make_events
 from tests.neurove_core import test_io_aedat2, test_io_carla, test_io_ecd, test_io_evbench, test_io_eventstream
-from tests.neurove_core.test_io import put
 from tests.neurove_core.test_io_prophesee import dat
+from tests.recordings import put
 
 EVENTS = make_events(200, seed=1)
 DAVIS = Sensor(240, 180)

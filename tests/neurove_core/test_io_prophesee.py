@@ -1,4 +1,4 @@
-"""Prophesee's DAT files, and the triggers of RAW and DAT."""
+"""Prophesee's RAW and DAT: headers, words, triggers, and a time that is sought."""
 
 import numpy as np
 import pytest
@@ -8,10 +8,21 @@ from neurove_core.io.dat import RECORD, SEEK_RECORDS
 from neurove_core.io.recording import BLOCK_BYTES
 from protocol import Events, Sensor
 from tests.builders import SENSOR, make_events
-from tests.builders_evt import ADDR_X, ADDR_Y, TIME_HIGH, TIME_LOW, TRIGGER, evt2, evt3
-from tests.neurove_core.test_io import HEADER_EVT2, HEADER_EVT3, assert_same, put, read, read_broken
-from tests.recordings import shared
+from tests.builders_evt import (
+    ADDR_X,
+    ADDR_Y,
+    HEADER_EVT2,
+    HEADER_EVT3,
+    TIME_HIGH,
+    TIME_LOW,
+    TRIGGER,
+    evt2,
+    evt3,
+    write_evt3,
+)
+from tests.recordings import all_triggers, assert_same, put, read, read_broken, shared
 
+EVENTS = make_events(300, seed=1, start_us=16_700_000)
 HEADER = b"% Data file containing CD events.\n% Version 2\n% Width 64\n% Height 48\n"
 
 
@@ -20,10 +31,6 @@ def dat(events: Events, header: bytes = HEADER + b"\x0c\x08") -> bytes:
     rows = np.empty(events.n, RECORD)
     rows["t"], rows["bits"] = t % (1 << 32), x | y << 14 | p << 28
     return header + rows.tobytes()
-
-
-def all_triggers(recording) -> Triggers:
-    return Triggers(*(np.concatenate(columns) for columns in zip(*recording.triggers(), strict=True)))
 
 
 def columns(triggers: Triggers) -> list[list[int]]:
@@ -135,3 +142,71 @@ def test_triggers_end_where_a_word_is_unknown_or_cut(tmp_path):
 def test_the_real_recordings_have_no_triggers():
     assert not list(open_source(str(shared("prophesee/evt3.raw"))).triggers())
     assert not list(open_source(str(shared("prophesee/evt2.raw")), Sensor(640, 480)).triggers())
+
+
+# --- headers and words of RAW ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        b"% evt 3.0\n% geometry 64x48\n",
+        b"% evt 3.0\r\n% geometry 64x48\r\n% end\r\n",
+        b"% format EVT3;height=48;width=64\n% evt 3.0\n% end\n",
+        b"% Format EVT3\n% Width 64\n% Height 48\n",
+    ],
+)
+def test_the_geometry_is_found_however_the_header_writes_it(header, tmp_path):
+    words = write_evt3(EVENTS).words
+    path = put(tmp_path, "A.RAW", header + words.tobytes())
+    assert open_source(path).sensor == SENSOR
+    assert_same(read(open_source(path)), EVENTS)
+    assert open_source(path, Sensor(640, 480)).sensor == Sensor(640, 480)
+
+
+def test_a_first_word_that_looks_like_a_percent_sign_is_no_header(tmp_path):
+    words = evt3((TIME_HIGH, 0x25), (ADDR_Y, 1), (ADDR_X, 1))
+    assert words.tobytes().startswith(b"%")
+    assert read(open_source(put(tmp_path, "a.raw", b"% evt 3.0\n% geometry 64x48\n" + words.tobytes()))).n == 1
+
+
+@pytest.mark.parametrize(
+    "header",
+    [b"% evt 3.0\n", b"% evt 3.0\n% geometry 0x0\n", b"% evt 3.0\n% geometry wide\n", b"% format EVT2;width=64\n"],
+)
+def test_a_header_without_a_geometry_asks_for_one(header, tmp_path):
+    path = put(tmp_path, "a.raw", header)
+    with pytest.raises(MissingGeometry, match=r"a\.raw.*--sensor WIDTHxHEIGHT"):
+        open_source(path)
+    assert open_source(path, SENSOR).sensor == SENSOR
+
+
+@pytest.mark.parametrize(
+    ("header", "why"),
+    [
+        (b"", "names no word format"),
+        (b"% geometry 64x48\n", "names no word format"),
+        (b"% evt 2.1\n", "its words are EVT21"),
+        (b"% format EVT4;width=64;height=48\n", "its words are EVT4"),
+    ],
+)
+def test_words_of_another_format_are_refused(header, why, tmp_path):
+    with pytest.raises(UnknownSource, match=why):
+        open_source(put(tmp_path, "a.raw", header + b"\0\0\0\0"), SENSOR)
+
+
+@pytest.mark.parametrize(
+    ("bad", "why"),
+    [
+        (0x9123, "0x9123 is of no known word type"),
+        (ADDR_X << 12 | 64, "x=64 y=7 lies outside the sensor 64x48"),
+    ],
+)
+def test_a_bad_word_ends_the_recording_at_its_byte(bad, why, tmp_path):
+    good = evt3((TIME_HIGH, 1), (ADDR_Y, 7), (ADDR_X, 63))
+    words = np.concatenate([good, np.array([bad], np.uint16), good])
+    events, error = read_broken(open_source(put(tmp_path, "a.raw", HEADER_EVT3 + words.tobytes())))
+    assert events.n == 1
+    assert error is not None
+    assert error.details["where"] == f"byte {len(HEADER_EVT3) + 6}"
+    assert why in error.message

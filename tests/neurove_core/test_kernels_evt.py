@@ -31,6 +31,7 @@ from tests.builders_evt import (
     write_evt2,
     write_evt3,
 )
+from tests.recordings import assert_same
 
 SENSOR = Sensor(1280, 720)
 
@@ -65,11 +66,6 @@ def decode(
         done += read
         if verdict != OK or done == words.size:
             return state, done, Events.join(parts), verdict
-
-
-def assert_same(got: Events, want: Events) -> None:
-    for name, a, b in zip("txyp", got, want, strict=True):
-        np.testing.assert_array_equal(a, b, err_msg=name)
 
 
 def rows(events: Events) -> list[tuple[int, ...]]:

@@ -11,8 +11,7 @@ from neurove_core.io.recording import EventsOnly, Frame, Imu, Triggers
 from protocol import CameraInfo, Events, NeuroVEError, Sensor
 from protocol.events import decode_packet, encode_packet
 from tests.builders import SENSOR, make_events, make_packet, make_packets
-from tests.neurove_core.test_io import assert_same, read, read_broken
-from tests.recordings import shared
+from tests.recordings import assert_same, read, read_broken, shared
 
 CAMERA = CameraInfo(stream="cam0", width=64, height=48, lens="equidistant", fx=50.0, fy=51.0, cx=31.0, cy=23.0)
 

@@ -11,8 +11,7 @@ from protocol import Events, Sensor
 from tests import ros_bags
 from tests.builders import SENSOR, make_events
 from tests.builders_evt import ADDR_X, ADDR_Y, TIME_HIGH, TRIGGER, evt3, write_evt3
-from tests.neurove_core.test_io import assert_same, read, read_broken
-from tests.recordings import shared
+from tests.recordings import assert_same, read, read_broken, shared
 
 TOPIC = "/cam/events"
 STAMP_NS = 1_700_000_000 * 10**9

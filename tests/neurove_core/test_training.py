@@ -293,8 +293,8 @@ def test_the_default_configuration_is_whole():
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("name = 'a b'", "name"),
-        ("[recipe]\nsteps = 0", "recipe.steps"),
+        ("name = 'a b'", "name='a b': String should match"),
+        ("[recipe]\nsteps = 0", "recipe.steps=0: Input should be greater than or equal to 1"),
         ("[recipe]\nsegment_windows = 30", "chunks of 8"),
         ("[data]\nseconds = 0.5", "a sequence has 10 windows"),
         ("[data]\nheight_m = [2.0, 1.0]", "least value comes first"),

@@ -1,0 +1,68 @@
+"""Files that are whole or what they were before."""
+
+import pytest
+
+from neurove_core.figures import blank_figure, save_figure
+from neurove_core.files import move_folder, write_whole, written_whole
+from protocol.errors import InvalidField
+
+
+def test_a_file_is_what_it_was_until_all_is_written(tmp_path):
+    file = tmp_path / "a.txt"
+    write_whole(file, b"before")
+    with written_whole(file) as part:
+        part.write_bytes(b"after")
+        assert file.read_bytes() == b"before"
+    assert file.read_bytes() == b"after"
+    assert list(tmp_path.iterdir()) == [file]
+
+
+@pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
+def test_writing_that_fails_leaves_what_was_there_and_nothing_beside_it(tmp_path, error):
+    file = tmp_path / "a.txt"
+    write_whole(file, b"before")
+
+    def stopped():
+        with written_whole(file) as part:
+            part.write_bytes(b"aft")
+            raise error
+
+    with pytest.raises(error):
+        stopped()
+    assert file.read_bytes() == b"before"
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_a_block_that_writes_nothing_is_told_and_the_file_stays(tmp_path):
+    file = tmp_path / "a.txt"
+    write_whole(file, b"before")
+    with pytest.raises(FileNotFoundError), written_whole(file):
+        pass
+    assert file.read_bytes() == b"before"
+
+
+def test_a_folder_moves_whole_and_not_onto_one_that_is_in_use(tmp_path):
+    for name in ("new", "used"):
+        (tmp_path / name).mkdir()
+        write_whole(tmp_path / name / "a.txt", name.encode())
+    with pytest.raises(OSError, match="not empty"):
+        move_folder(tmp_path / "new", tmp_path / "used")
+    assert (tmp_path / "used" / "a.txt").read_bytes() == b"used"
+    move_folder(tmp_path / "new", tmp_path / "free")
+    assert (tmp_path / "free" / "a.txt").read_bytes() == b"new"
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_figure_is_the_same_bytes_each_time_or_says_where_it_can_not_be_written(tmp_path):
+    pytest.importorskip("matplotlib")
+
+    def drawn():
+        figure = blank_figure(2, 1)
+        figure.add_subplot().plot([0, 1])
+        return figure
+
+    first = [file.read_bytes() for file in save_figure(drawn(), tmp_path / "a")]
+    assert [file.read_bytes() for file in save_figure(drawn(), tmp_path / "a")] == first
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["a.png", "a.svg"]
+    with pytest.raises(InvalidField, match="No such file"):
+        save_figure(drawn(), tmp_path / "no" / "a")
