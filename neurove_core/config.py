@@ -87,6 +87,12 @@ class ModelConfig(Config):
     network: NetworkConfig = NetworkConfig()
     settle_windows: int = Field(16, ge=0, le=256, description="Windows until a fresh state is settled.")
     low_activity_events: int = Field(200, ge=0, description="A window with fewer events is flagged low_activity.")
+    low_activity_per_pixel: float = Field(
+        0.05,
+        ge=0,
+        le=100,
+        description="So is one with fewer for each pixel that the model sees; resting sensors give 0.02 to 0.03 (noise).",
+    )
 
     @model_validator(mode="after")
     def _int8_is_neuroves(self) -> Self:

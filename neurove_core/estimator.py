@@ -31,6 +31,7 @@ class StreamState(NamedTuple):
     network: State
     age: int  # windows since the network state began
     end_us: int | None = None  # end of the newest window that the network has seen
+    low_activity_below: float = 0.0  # events that the model sees in a window
 
 
 class WindowEstimate(NamedTuple):
@@ -103,7 +104,10 @@ class Estimator:
             InvalidField: the camera info is of another sensor.
         """
         lut = lookup_table(self.config.canonical, sensor, camera)
-        return StreamState(sensor, camera, lut, WindowsState(), self.network.initial_state(), 0)
+        per_pixel = self.config.low_activity_per_pixel * np.count_nonzero(lut >= 0)
+        least = max(float(self.config.low_activity_events), float(per_pixel))
+        network = self.network.initial_state()
+        return StreamState(sensor, camera, lut, WindowsState(), network, 0, low_activity_below=least)
 
     def push(self, events: Events, state: StreamState, horizon_us: int) -> Answer:
         """Take a packet's events and answer every window that they complete.
@@ -172,7 +176,7 @@ class Estimator:
 
     def _take(self, course: _Course, window: Window, twists: NDArray[np.float64], network: State) -> None:
         state = course.state
-        course.estimates.append(self._estimate(window, twists, network, self._metres(state.camera), state.age))
+        course.estimates.append(self._estimate(window, twists, network, state))
         end_us = window.start_us + self.config.window.duration_us
         course.state = state._replace(network=network, age=state.age + 1, end_us=end_us)
 
@@ -226,13 +230,9 @@ class Estimator:
         return self.bundle.uncertainty.covariance(log_sigma[0].double().numpy(), self._scale * metres)
 
     def _estimate(
-        self,
-        window: Window,
-        twists: NDArray[np.float64],
-        network: State,
-        metres: NDArray[np.float64],
-        age: int,
+        self, window: Window, twists: NDArray[np.float64], network: State, before: StreamState
     ) -> WindowEstimate:
+        metres, age = self._metres(before.camera), before.age
         twists, covariance = twists * metres, self._covariance(network, metres)
         unsure = self.bundle.uncertainty
         return WindowEstimate(
@@ -242,7 +242,7 @@ class Estimator:
             events=window.events,
             first=age == 0,
             settled=age >= self.config.settle_windows,
-            low_activity=window.events - window.outside < self.config.low_activity_events,
+            low_activity=window.events - window.outside < before.low_activity_below,
             saturated=bool(window.counts.max() == 255),
             covariance=covariance,
             uncertain=covariance is not None and unsure is not None and unsure.is_uncertain(twists, covariance),

@@ -57,6 +57,7 @@ WRONG = [
     (ModelConfig, "settle_windows", -1, "greater than or equal to 0"),
     (ModelConfig, "settle_windows", 257, "less than or equal to 256"),
     (ModelConfig, "low_activity_events", -1, "greater than or equal to 0"),
+    (ModelConfig, "low_activity_per_pixel", -1, "greater than or equal to 0"),
 ]
 
 

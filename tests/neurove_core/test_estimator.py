@@ -204,7 +204,7 @@ def test_settled_is_true_once_a_stream_is_as_old_as_the_model_says_and_first_onl
 
 
 def test_low_activity_counts_only_events_that_the_model_sees():
-    estimator = Estimator(make_bundle(low_activity_events=LOW))
+    estimator = Estimator(make_bundle(low_activity_events=LOW, low_activity_per_pixel=0))
     state = estimator.initial_state(SENSOR, LENS)
     seen, unseen = ((int(x), int(y)) for y, x in (np.argwhere(state.lut >= 0)[0], np.argwhere(state.lut < 0)[0]))
 
@@ -216,6 +216,20 @@ def test_low_activity_counts_only_events_that_the_model_sees():
 
     assert [window(n, 10).low_activity for n in (LOW - 1, LOW)] == [True, False]
     assert window(LOW, 10).events == LOW + 10
+
+
+def test_a_large_sensor_needs_more_events_for_its_noise_is_no_motion():
+    estimator = Estimator(make_bundle(low_activity_events=LOW, low_activity_per_pixel=2.0))
+    state = estimator.initial_state(SENSOR, LENS)
+    rows, columns = np.nonzero(state.lut >= 0)
+
+    def window(per_pixel: int) -> WindowEstimate:
+        x, y = np.repeat(columns, per_pixel), np.repeat(rows, per_pixel)
+        events = Events.from_columns(np.zeros_like(x), x, y, np.ones_like(x))
+        (estimate,) = feed(estimator, [events, tick(1)], estimator.initial_state(SENSOR, LENS)).estimates
+        return estimate
+
+    assert [window(n).low_activity for n in (1, 2)] == [True, False]
 
 
 @pytest.mark.parametrize(("n", "saturated"), [(254, False), (255, True), (600, True)])
