@@ -212,7 +212,7 @@ class Kept:
         kind: list[Any] = [FORMAT, *item[:2], made.name, made.seed, made.duration_s, made.motion_px, made.lens.name]
         kind += [made.lens.info.model_dump(), made.lens.pitch_deg, made.pixels.model_dump()]
         kind += [self._config.window.model_dump(), self._config.canonical.model_dump()]
-        position_m, _ = made.trajectory.placed(np.linspace(0, made.duration_s, _KEY_POINTS))
+        position_m, _ = made.trajectory.pose(np.linspace(0, made.duration_s, _KEY_POINTS))
         kind += position_m.round(6).tolist()  # names do not tell how a way was made
         return hashlib.sha256(json.dumps(kind, sort_keys=True).encode()).hexdigest()[:16]
 
