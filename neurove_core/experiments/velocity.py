@@ -29,9 +29,6 @@ METHODS: Final[dict[str, dict[str, Any]]] = {
 }
 """What of the model's configuration each method changes; nothing else differs between them."""
 
-STEPS: Final = 1000
-"""Updates of each method, where nothing else is said."""
-
 Show = Callable[[str, int, int, str], None]
 """What is being done, how far, of how much, and a word on it."""
 
@@ -74,17 +71,14 @@ def base_config(source: str | None = None, steps: int | None = None, *, quick: b
     """The recipe of all methods.
 
     Args:
-        source: a configuration's file or name; by default that of the default model, in STEPS updates, so that its
-            sequences serve here too; or `velocity-quick`.
+        source: a configuration's file or name; by default `driving`, or `velocity-quick`.
         steps: so many updates, not those of the configuration.
         quick: see Plan.
 
     Raises:
         InvalidField: there is no such configuration, or it or `steps` is wrong.
     """
-    found = configs.load(source or ("velocity-quick" if quick else "default"))
-    if source is None and not quick:
-        found, steps = found.model_copy(update={"name": "velocity"}), STEPS if steps is None else steps
+    found = configs.load(source or ("velocity-quick" if quick else "driving"))
     if steps is None:
         return found
     if steps < 1:
