@@ -2,6 +2,8 @@
 
 import logging
 import os
+import signal
+from typing import NamedTuple
 
 import pytest
 import structlog
@@ -27,12 +29,25 @@ def logging_as_before():
 
 
 @pytest.fixture
-def run(capsys, logging_as_before):
+def signals_as_before():
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+class Ran(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def run(capsys, logging_as_before, signals_as_before):
     """Runs one command in this process: its exit code, output and errors."""
 
     def call(*arguments):
         code = cli.main([str(argument) for argument in arguments])
-        out, err = capsys.readouterr()
-        return code, out, err
+        return Ran(code, *capsys.readouterr())
 
     return call

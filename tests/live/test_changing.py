@@ -5,8 +5,17 @@ import json
 
 import pytest
 
-from protocol.control import ActivateReply, ActivateRequest, ModelInfo, PeerError, ProgressReply, StreamStatus
-from protocol.errors import Conflict, UnknownModel
+from protocol.control import (
+    ActivateReply,
+    ActivateRequest,
+    ModelInfo,
+    PeerError,
+    ProgressReply,
+    PushReply,
+    PushRequest,
+    StreamStatus,
+)
+from protocol.errors import Conflict, NoStore, UnknownModel
 from protocol.keys import Keys
 from service import ask
 from service.config import ClientConfig
@@ -23,20 +32,29 @@ OLD, NEW = (
 
 
 class Node:
-    """Answers activations as a node does, with what the test wants it to say."""
+    """Answers pushes and activations as a node does, with what the test wants it to say."""
 
     def __init__(self, name, answer):
         self.name, self.answer, self.asked = name, answer, []
 
     def activate(self, data, tell):
-        request = ActivateRequest.decode(data)
-        self.asked.append(request.model)
+        return self._told(ActivateRequest.decode(data).model, tell)
+
+    def push(self, data, tell):
+        return self._told(PushRequest.decode(data).name, tell)
+
+    def _told(self, wanted, tell):
+        self.asked.append(wanted)
         tell(ProgressReply(node=self.name, step="verified", text="it runs here").encode())
         return self.answer(self.name).encode()
 
 
 def done(name):
     return ActivateReply(node=name, active=NEW, previous=OLD, epoch=1)
+
+
+def has_it(name):
+    return PushReply(node=name, model=NEW, fetched=1234)
 
 
 def refuses(error):
@@ -58,6 +76,7 @@ def network():
             for node in nodes.values():
                 transport = stack.enter_context(client(endpoint))
                 transport.answer_streaming(keys.activate(node.name), node.activate)
+                transport.answer_streaming(keys.push(node.name), node.push)
                 transport.token(keys.alive(node.name))
             with client(endpoint) as asking:
                 wait_until(lambda: len(asking.tokens(keys.alive(), 1.0)) == len(nodes))
@@ -89,6 +108,17 @@ def test_what_one_node_refuses_is_not_tried_on_the_next_and_both_are_told(networ
     assert [json.loads(line)["node"] for line in out.splitlines()] == ["n1", "n1", "n2"]
     assert err == "neurove: n2: model='new': not on this node; available: old; not asked then: n3\n"
     assert [node.asked for node in nodes.values()] == [["new"], ["new"], []]
+
+
+def test_a_push_to_all_tells_people_where_the_bundle_is_and_where_it_is_refused(network, run, tmp_path):
+    endpoint, put = network
+    nodes = put(n1=has_it, n2=refuses(NoStore("it has no state_dir")))
+    (tmp_path / "new.safetensors").write_bytes(b"whatever it is")
+    code, out, err = run("push", tmp_path / "new.safetensors", "--connect", endpoint, "--all")
+    assert code == 1
+    assert out.splitlines()[1] == f"n1: new ({'b' * 12}) is there, 1,234 bytes moved"
+    assert err == "neurove: n2: this node keeps no pushed models: it has no state_dir\n"
+    assert [node.asked for node in nodes.values()] == [["new.safetensors"]] * 2
 
 
 def test_a_conflict_on_the_last_node_keeps_its_own_exit_code(network, run):
