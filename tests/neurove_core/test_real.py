@@ -30,8 +30,9 @@ def estimator():
     return Estimator(bundle.untrained(3, SMALL, "small"))
 
 
-def turning(seconds: float) -> Events:
-    source = f"sim://room?seed=2&camera=davis240c&pitch=0&seconds={seconds}&trajectory=rotation?wx=0.5%26wy=1.0"
+def turning(seconds: float, rad_s: float = 1.0) -> Events:
+    turn = f"rotation?wx={rad_s / 2}%26wy={rad_s}"
+    source = f"sim://room?seed=2&camera=davis240c&pitch=0&seconds={seconds}&trajectory={turn}"
     return Events.join(list(open_source(source).chunks()))
 
 
@@ -79,7 +80,7 @@ def test_what_lacks_its_truth_or_a_whole_window_is_skipped_with_the_reason(estim
 
 def test_profiles_and_cameras_at_rest_are_judged_over_their_windows(estimator, tmp_path):
     (tmp_path / "ecd").mkdir()
-    (tmp_path / "ecd" / "shapes_rotation_1.43s.txt").write_bytes(ecd_text(turning(0.75)))
+    (tmp_path / "ecd" / "shapes_rotation_1.43s.txt").write_bytes(ecd_text(turning(0.75, rad_s=0.2)))
     (tmp_path / "aedat4").mkdir()
     noise = make_events(3000, duration_us=600_000, sensor=Sensor(346, 260))
     (tmp_path / "aedat4" / "davis346.aedat4").write_bytes(aedat4([noise], Sensor(346, 260)).data)
