@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from neurove_core.neurons import (
+from neurove_core.layers import (
     drawn_weights,
     require,
     require_sequence,

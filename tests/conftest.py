@@ -1,11 +1,53 @@
-"""One thread and bounded property tests: a run depends neither on the machine's cores nor, in CI, on chance."""
+"""One thread and bounded property tests: a run depends neither on cores nor, in CI, on chance. How commands are run."""
 
+import logging
 import os
+import signal
+from typing import NamedTuple
 
+import pytest
+import structlog
 import torch
 from hypothesis import settings
+
+from service import cli
 
 torch.set_num_threads(1)
 settings.register_profile("dev", max_examples=25, deadline=None)
 settings.register_profile("ci", max_examples=50, deadline=None, derandomize=True, database=None)
 settings.load_profile("ci" if os.environ.get("CI") else "dev")
+
+
+@pytest.fixture
+def logging_as_before():
+    root = logging.getLogger()
+    handlers, level = root.handlers[:], root.level
+    yield
+    root.handlers[:] = handlers
+    root.setLevel(level)
+    structlog.reset_defaults()
+
+
+@pytest.fixture
+def signals_as_before():
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
+
+
+class Ran(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+
+@pytest.fixture
+def run(capsys, logging_as_before, signals_as_before):
+    """Runs one command in this process: its exit code, output and errors."""
+
+    def call(*arguments):
+        code = cli.main([str(argument) for argument in arguments])
+        return Ran(code, *capsys.readouterr())
+
+    return call

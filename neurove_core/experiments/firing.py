@@ -18,6 +18,7 @@ from torch import Tensor
 
 from neurove_core.experiments import save_text
 from neurove_core.figures import blank_figure, save_figure
+from neurove_core.layers import require
 from neurove_core.neurons import (
     LIF,
     ALIFParams,
@@ -30,7 +31,6 @@ from neurove_core.neurons import (
     diffuse,
     fire,
     ltc_step,
-    require,
 )
 
 if TYPE_CHECKING:

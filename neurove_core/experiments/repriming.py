@@ -21,7 +21,7 @@ from neurove_core.bundle import Bundle, from_bytes
 from neurove_core.estimator import Estimator, StreamState
 from neurove_core.experiments import save_text
 from neurove_core.figures import blank_figure, save_figure
-from neurove_core.neurons import require
+from neurove_core.layers import require
 from neurove_core.sim.simulate import Simulation
 from neurove_core.sim.source import simulation_of
 from neurove_core.windows import Window, WindowsState, push

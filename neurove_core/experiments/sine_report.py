@@ -13,7 +13,8 @@ import safetensors.numpy
 from pydantic import ValidationError
 
 from neurove_core.experiments import save_text
-from neurove_core.experiments.sine import LENGTH, SKIP, VALIDATION, Recipe, Trained, evaluate, train, waves
+from neurove_core.experiments.sine import LENGTH, SKIP, VALIDATION, Recipe, evaluate, waves
+from neurove_core.experiments.sine_training import Trained, train
 from neurove_core.extras import MissingExtra
 from neurove_core.figures import blank_figure, save_figure
 from neurove_core.recurrence import Array

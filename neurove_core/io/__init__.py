@@ -115,4 +115,7 @@ def _is_bag(path: Path) -> bool:
         return path.suffix.lower() in (".bag", ".db3", ".mcap")
     if (path / "events.txt").is_file():
         return False
-    return any(one.name == "metadata.yaml" or one.suffix in (".db3", ".mcap") for one in path.iterdir())
+    return any(
+        one.name == "metadata.yaml" or one.name.endswith((".db3", ".mcap", ".db3.zstd", ".mcap.zstd"))
+        for one in path.iterdir()
+    )

@@ -120,7 +120,7 @@ def unpack_frame(data: bytes) -> Frame:
     if not all(type(number) is int for number in numbers) or not isinstance(image, bytes):
         raise BadColumns("it is no image")
     t_us, height, width, channels = (int(number or 0) for number in numbers)
-    if channels not in (1, 3) or len(image) != height * width * channels:
+    if channels not in (1, 3) or min(height, width) < 0 or len(image) != height * width * channels:
         raise BadColumns(f"its {len(image)} bytes are no image of {width}x{height}x{channels}")
     shape = (height, width) if channels == 1 else (height, width, channels)
     return Frame(t_us, np.frombuffer(image, np.uint8).reshape(shape))

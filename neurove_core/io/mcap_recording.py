@@ -60,8 +60,8 @@ class McapRecording(EventsOnly):
         streams = _streams(file)
         wanted = topic.removesuffix("/events") if topic is not None else None
         if not streams or wanted not in (None, *streams):
-            known = ", ".join(streams) or "none"
-            raise UnknownSource(path, SUPPORTED, f"no stream {wanted!r}; its streams are {known}")
+            why = f"no stream {wanted!r}; its streams are {', '.join(streams)}" if streams else "it holds no stream"
+            raise UnknownSource(path, SUPPORTED, why)
         name = path.name if wanted is None else f"{path.name} ({wanted})"
         if wanted is None and len(streams) > 1:
             name = f"{path.name} ({streams[0]}, the first of {len(streams)} streams)"

@@ -8,7 +8,8 @@ import pytest
 from neurove_core import bundle
 from neurove_core.io import open_source
 from neurove_core.io.packets import slices
-from tests.live.conftest import Process, free_endpoint, neurove, running, service, wait_until
+from tests.live.conftest import Process, client, free_endpoint, neurove, running, service, wait_until
+from tests.live.test_feed import start_router
 from tests.recordings import shared
 
 pytestmark = pytest.mark.live
@@ -23,31 +24,31 @@ def node(tmp_path_factory):
         yield config.connect[0]
 
 
-def test_drive_watch_health_models_and_activate_work_together(node):
+def test_drive_watch_health_models_and_activate_work_together(node, run):
     with running("drive", "pattern://", "--connect", node, "--stream", "cam1", "--wait", "20") as driver:
-        watched = neurove("watch", "--connect", node, "--json", "--count", "5")
-        lines = [json.loads(line) for line in watched.stdout.splitlines()]
+        watched = run("watch", "--connect", node, "--json", "--count", "5")
+        lines = [json.loads(line) for line in watched.out.splitlines()]
         assert len(lines) == 5
         assert all(len(line["twists"]) == 5 and len(line["twists"][0]) == 6 for line in lines)
         assert not any("untrained" in line["flags"] for line in lines)
-        people = neurove("watch", "--connect", node, "--count", "1").stdout
+        people = run("watch", "--connect", node, "--count", "1").out
         assert people.startswith("cam1 ")
         assert "model=default" in people
 
-        (health,) = json.loads(neurove("health", "--connect", node, "--json").stdout)
+        (health,) = json.loads(run("health", "--connect", node, "--json").out)
         assert health["streams"][0]["stream"] == "cam1"
-        assert "cam1" in neurove("health", "--connect", node).stdout
+        assert "cam1" in run("health", "--connect", node).out
 
-        activated = neurove("activate", "other", "--connect", node)
-        assert (activated.returncode, activated.stderr) == (0, "")
-        assert "other" in activated.stdout
-        (line,) = neurove("watch", "--connect", node, "--json", "--count", "1").stdout.splitlines()
+        activated = run("activate", "other", "--connect", node)
+        assert (activated.code, activated.err) == (0, "")
+        assert "other" in activated.out
+        (line,) = run("watch", "--connect", node, "--json", "--count", "1").out.splitlines()
         assert (json.loads(line)["model"], json.loads(line)["epoch"]) == ("other", 1)
 
-        models = neurove("models", "--connect", node).stdout
+        models = run("models", "--connect", node).out
         assert "active" in models
         assert "foreign.safetensors" in models
-        (told,) = json.loads(neurove("models", "--connect", node, "--json").stdout)
+        (told,) = json.loads(run("models", "--connect", node, "--json").out)
         assert told["previous"]["name"] == "default"
 
         code, out, _ = driver.end(signal.SIGINT)
@@ -55,12 +56,12 @@ def test_drive_watch_health_models_and_activate_work_together(node):
         assert "packets" in out
 
 
-def test_activating_what_is_not_there_is_refused_by_the_node(node):
-    refused = neurove("activate", "../foreign", "--connect", node)
-    assert refused.returncode == 1
-    assert refused.stderr.count("\n") == 1
-    assert "model='../foreign': not on this node; available: default, untrained, other" in refused.stderr
-    assert "not a safetensors file" in neurove("activate", "foreign", "--connect", node).stderr
+def test_activating_what_is_not_there_is_refused_by_the_node(node, run):
+    refused = run("activate", "../foreign", "--connect", node)
+    assert refused.code == 1
+    assert refused.err.count("\n") == 1
+    assert "model='../foreign': not on this node; available: default, untrained, other" in refused.err
+    assert "not a safetensors file" in run("activate", "foreign", "--connect", node).err
 
 
 def test_a_taken_port_is_one_clear_line(node):
@@ -71,27 +72,23 @@ def test_a_taken_port_is_one_clear_line(node):
 
 
 @pytest.mark.parametrize("command", [("health",), ("watch",), ("models",), ("activate", "other")])
-def test_without_a_service_a_client_says_so(command):
-    told = neurove(*command, "--connect", free_endpoint())
-    assert told.returncode == 1
-    assert told.stderr.startswith("neurove: no service")
-    assert told.stderr.count("\n") == 1
+def test_without_a_service_a_client_says_so(command, run):
+    told = run(*command, "--connect", free_endpoint())
+    assert told.code == 1
+    assert told.err.startswith("neurove: no service")
+    assert told.err.count("\n") == 1
 
 
-def test_a_router_without_a_service_is_no_service_either():
-    from tests.live.test_feed import start_router
-
+def test_a_router_without_a_service_is_no_service_either(run):
     endpoint = free_endpoint()
     router = start_router(endpoint)
     try:
-        from tests.live.conftest import client
-
         with client(endpoint):
             pass
-        assert neurove("watch", "--connect", endpoint).returncode == 1
-        assert "is `neurove serve` running there" in neurove("health", "--connect", endpoint).stderr
-        nobody = neurove("drive", "pattern://", "--connect", endpoint, "--wait", "0.5")
-        assert (nobody.returncode, "no service took up stream cam0" in nobody.stderr) == (1, True)
+        assert run("watch", "--connect", endpoint).code == 1
+        assert "is `neurove serve` running there" in run("health", "--connect", endpoint).err
+        nobody = run("drive", "pattern://", "--connect", endpoint, "--wait", "0.5")
+        assert (nobody.code, "no service took up stream cam0" in nobody.err) == (1, True)
     finally:
         router.kill()
         router.wait()

@@ -11,7 +11,7 @@ from service import ask
 from service.push_source import PushSource
 from service.transport import open_transport
 from tests.builders import make_packets
-from tests.live.conftest import Heard, Source, client, free_endpoint, neurove, running, service, wait_until
+from tests.live.conftest import Heard, Source, client, free_endpoint, service, wait_until
 from tests.live.killing import CONFIG, Node, slowly
 
 pytestmark = pytest.mark.live
@@ -39,7 +39,7 @@ def steps(text):
     return [json.loads(line)["step"] for line in text.splitlines() if "step" in json.loads(line)]
 
 
-def test_an_operator_pushes_activates_and_rolls_back_while_events_flow_without_a_hole(node, files):
+def test_an_operator_pushes_activates_and_rolls_back_while_events_flow_without_a_hole(node, files, run):
     _, config, _ = node
     at = ("--connect", config.connect[0])
     stop = threading.Event()
@@ -49,9 +49,9 @@ def test_an_operator_pushes_activates_and_rolls_back_while_events_flow_without_a
         thread.start()
         try:
             wait_until(lambda: heard.of("cam0"))
-            pushed = neurove("push", str(files / "one.safetensors"), *at, "--activate", "--json")
-            assert (pushed.returncode, pushed.stderr) == (0, "")
-            told = steps(pushed.stdout)
+            pushed = run("push", str(files / "one.safetensors"), *at, "--activate", "--json")
+            assert (pushed.code, pushed.err) == (0, "")
+            told = steps(pushed.out)
             assert told[0] == "fetching"
             assert [step for step in told if step in ("staged", "verified", "active", "done")] == [
                 "staged",
@@ -60,17 +60,17 @@ def test_an_operator_pushes_activates_and_rolls_back_while_events_flow_without_a
                 "active",
                 "done",
             ]
-            digest = json.loads(pushed.stdout.splitlines()[-1])["active"]["digest"]
+            digest = json.loads(pushed.out.splitlines()[-1])["active"]["digest"]
             wait_until(lambda: heard.of("cam0")[-1].digest == digest)
 
-            (models,) = json.loads(neurove("models", *at, "--json").stdout)
+            (models,) = json.loads(run("models", *at, "--json").out)
             assert (models["active"]["digest"], models["previous"]["name"]) == (digest, "default")
-            late = neurove("activate", "default", *at, "--expect", "00000000")
-            assert (late.returncode, "n1: conflict: 00000000 is expected to be active" in late.stderr) == (3, True)
-            back = neurove("rollback", *at, "--expect", digest[:8])
-            assert (back.returncode, "n1: rolled_back: to default" in back.stdout) == (0, True)
-            nothing = neurove("rollback", *at)
-            assert (nothing.returncode, "nothing to roll back to" in nothing.stderr) == (1, True)
+            late = run("activate", "default", *at, "--expect", "00000000")
+            assert (late.code, "n1: conflict: 00000000 is expected to be active" in late.err) == (3, True)
+            back = run("rollback", *at, "--expect", digest[:8])
+            assert (back.code, "n1: rolled_back: to default" in back.out) == (0, True)
+            nothing = run("rollback", *at)
+            assert (nothing.code, "nothing to roll back to" in nothing.err) == (1, True)
             wait_until(lambda: heard.of("cam0")[-1].model == "default")
         finally:
             stop.set()
@@ -89,15 +89,15 @@ def keep_driving(transport, config, stop):
             return
 
 
-def test_what_is_no_model_is_refused_by_the_node_and_leaves_nothing(node, files):
+def test_what_is_no_model_is_refused_by_the_node_and_leaves_nothing(node, files, run):
     _, config, folder = node
     at = ("--connect", config.connect[0], "--node", "n1")
-    foreign = neurove("push", str(files / "foreign.safetensors"), *at)
-    assert (foreign.returncode, foreign.stderr.count("\n")) == (1, 1)
-    assert "n1: model foreign.safetensors: " in foreign.stderr
-    empty = neurove("push", str(files / "empty.safetensors"), *at)
-    assert "model empty.safetensors: " in empty.stderr
-    assert "No such file" in neurove("push", "nowhere.safetensors", *at).stderr
+    foreign = run("push", str(files / "foreign.safetensors"), *at)
+    assert (foreign.code, foreign.err.count("\n")) == (1, 1)
+    assert "n1: model foreign.safetensors: " in foreign.err
+    empty = run("push", str(files / "empty.safetensors"), *at)
+    assert "model empty.safetensors: " in empty.err
+    assert "No such file" in run("push", "nowhere.safetensors", *at).err
     assert list((folder / "staging").iterdir()) == []
 
 
@@ -219,19 +219,6 @@ def answers(transport):
         return [one.payload for one in transport.ask("t/work", b"again", 30)] == [b"again"]
     except PeerError:  # busy: the first one is about to end
         return False
-
-
-def test_of_several_nodes_a_change_wants_to_know_which(node, files):
-    _, config, _ = node
-    at = ("--connect", config.connect[0])
-    with running("serve", "--mode", "client", *at, "--node", "n2", "--log-level", "warning"):
-        with client(config.connect[0]) as transport:
-            wait_until(lambda: len(transport.tokens(config.keys.alive(), 1.0)) == 2, timeout_s=90)
-        told = neurove("activate", "untrained", *at)
-        assert (told.returncode, "n1, n2; name one with --node, or say --all" in told.stderr) == (2, True)
-        both = neurove("push", str(files / "one.safetensors"), *at, "--all")
-        assert (both.returncode, "n2: this node keeps no pushed models" in both.stderr) == (1, True)
-        assert "n1: one" in both.stdout
 
 
 @pytest.mark.parametrize("at_step", ["fetching", "loaded", "done"])

@@ -10,7 +10,7 @@ from protocol.events import decode_packet, encode_packet
 from protocol.keys import Keys
 from service.recorder import Recorder
 from tests.builders import make_packets
-from tests.live.conftest import client, free_endpoint, neurove, running, wait_until
+from tests.live.conftest import client, free_endpoint, running, wait_until
 from tests.live.test_feed import start_router
 
 pytestmark = pytest.mark.live
@@ -41,16 +41,16 @@ class Listener:
         )
 
 
-def test_what_was_driven_is_recorded_bit_for_bit_and_replayed_bit_for_bit(router, tmp_path):
+def test_what_was_driven_is_recorded_bit_for_bit_and_replayed_bit_for_bit(router, tmp_path, run):
     file = tmp_path / "traffic.mcap"
     with client(router) as transport:
         heard = Listener(transport)
         with running("record", "--connect", router, "--out", str(file), "--json") as recorder:
             wait_until(lambda: file.with_name("traffic.mcap.part").exists())
-            driven = neurove(
+            driven = run(
                 "drive", "pattern://?seed=4", "--connect", router, "--duration", "0.6", "--wait", "20", "--json"
             )
-            sent = json.loads(driven.stdout)
+            sent = json.loads(driven.out)
             assert sent["packets"] == 150
             wait_until(lambda: len(heard.payloads) == 150)
             code, out, err = recorder.end(signal.SIGINT)
@@ -65,8 +65,8 @@ def test_what_was_driven_is_recorded_bit_for_bit_and_replayed_bit_for_bit(router
         assert sum(chunk.n for chunk in recording.chunks()) == sent["events"]
 
         before, heard.payloads = heard.payloads, []
-        replayed = neurove("drive", str(file), "--connect", router, "--wait", "20")
-        assert replayed.stdout.startswith("cam0: 150 packets")
+        replayed = run("drive", str(file), "--connect", router, "--wait", "20")
+        assert replayed.out.startswith("cam0: 150 packets")
         wait_until(lambda: len(heard.payloads) == 150)
         assert heard.payloads == before
 
@@ -82,30 +82,30 @@ def two_streams(path):
     return packets
 
 
-def test_a_replay_keeps_all_streams_or_the_one_picked_and_encodes_anew_under_another_name(router, tmp_path):
+def test_a_replay_keeps_all_streams_or_the_one_picked_and_encodes_anew_under_another_name(router, tmp_path, run):
     packets = two_streams(tmp_path / "two.mcap")
     file = str(tmp_path / "two.mcap")
     with client(router) as transport:
         heard = Listener(transport)
-        assert neurove("drive", file, "--connect", router, "--wait", "20").returncode == 0
+        assert run("drive", file, "--connect", router, "--wait", "20").code == 0
         wait_until(lambda: len(heard.payloads) == 51)
         assert [one for one in heard.payloads if one[0] == "left"] == [one for one in packets if one[0] == "left"]
         assert [one for one in heard.payloads if one[0] == "right"] == [one for one in packets if one[0] == "right"]
         assert heard.cameras == {"left": CAMERA.encode()}
 
         heard.payloads = []
-        neurove("drive", file, "--topic", "right", "--connect", router, "--wait", "20")
+        run("drive", file, "--topic", "right", "--connect", router, "--wait", "20")
         wait_until(lambda: len(heard.payloads) == 25)
         assert heard.payloads == [one for one in packets if one[0] == "right"]
 
         heard.payloads = []
-        neurove("drive", file, "--topic", "right", "--stream", "front", "--connect", router, "--wait", "20")
+        run("drive", file, "--topic", "right", "--stream", "front", "--connect", router, "--wait", "20")
         wait_until(lambda: len(heard.payloads) > 24)
         assert {stream for stream, _ in heard.payloads} == {"front"}
         assert sum(decode_packet(payload).events.n for _, payload in heard.payloads) == 25 * 60
-    looped = neurove("drive", file, "--loop", "--connect", router)
-    assert looped.returncode == 2
-    assert "give --stream NAME" in looped.stderr
+    looped = run("drive", file, "--loop", "--connect", router)
+    assert looped.code == 2
+    assert "give --stream NAME" in looped.err
 
 
 def test_a_recorder_counts_what_is_missing_and_keeps_what_can_not_be_read(router, tmp_path):
@@ -132,6 +132,48 @@ def test_a_recorder_counts_what_is_missing_and_keeps_what_can_not_be_read(router
     assert McapRecording.open(file).cameras() == {"left": CAMERA.encode()}
 
 
+def test_people_are_told_what_was_recorded_and_what_was_not(router, tmp_path, run):
+    with client(router) as transport:
+        publisher = transport.publisher(Keys().events("left"), "application/msgpack")
+
+        def drive():
+            wait_until(lambda: publisher.matching)
+            for packet in make_packets(5, stream="left", n=100):
+                if packet.seq != 2:
+                    publisher.put(encode_packet(packet))
+
+        driver = threading.Thread(target=drive)
+        driver.start()
+        code, out, err = run("record", "--connect", router, "--out", tmp_path / "a.mcap", "--duration", "1")
+        driver.join()
+    assert (code, out) == (1, "left: 4 packets, 400 events, 1 missing\n")
+    assert err.startswith(f"wrote {tmp_path / 'a.mcap'}, ")
+
+
+def test_a_recording_that_was_cut_is_replayed_as_far_as_it_is_whole_and_is_bad_news(router, tmp_path, run):
+    payloads = [encode_packet(packet) for packet in make_packets(300, n=4000)]
+    with PacketWriter(tmp_path / "whole.mcap") as writer:
+        for payload in payloads:
+            writer.write("cam0", payload, 10**18)
+    data = (tmp_path / "whole.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(data[: len(data) // 2])
+    with client(router) as transport:
+        heard = Listener(transport)
+        code, out, err = run("drive", tmp_path / "cut.mcap", "--connect", router, "--wait", "20")
+        wait_until(lambda: out.startswith(f"cam0: {len(heard.payloads)} packets"))
+    assert code == 1
+    assert "cut.mcap: broken at byte" in err
+    assert 0 < len(heard.payloads) < 300
+    assert [payload for _, payload in heard.payloads] == payloads[: len(heard.payloads)]
+
+
+def test_a_replay_that_nobody_listens_to_says_so(router, tmp_path, run):
+    two_streams(tmp_path / "two.mcap")
+    code, out, err = run("drive", tmp_path / "two.mcap", "--connect", router, "--wait", "0.2")
+    assert (code, out) == (1, "")
+    assert "no service took up stream left, right within 0.2 s" in err
+
+
 def test_what_the_queue_can_not_hold_is_dropped_and_counted(router, tmp_path):
     packets = make_packets(20, stream="left", n=100)
     payloads = [encode_packet(packet) for packet in packets]
@@ -151,11 +193,11 @@ def test_what_the_queue_can_not_hold_is_dropped_and_counted(router, tmp_path):
     assert [payload for _, payload, _ in McapRecording.open(tmp_path / "a.mcap").packets()] == payloads[:5]
 
 
-def test_a_recording_is_not_written_over_and_silence_leaves_no_file(router, tmp_path):
+def test_a_recording_is_not_written_over_and_silence_leaves_no_file(router, tmp_path, run):
     (tmp_path / "old.mcap").write_bytes(b"dear")
-    refused = neurove("record", "--connect", router, "--out", str(tmp_path / "old.mcap"))
-    assert (refused.returncode, "not written over" in refused.stderr) == (2, True)
-    silent = neurove("record", "--connect", router, "--out", str(tmp_path / "new.mcap"), "--duration", "0.3")
-    assert (silent.returncode, silent.stderr.count("\n")) == (1, 1)
-    assert "nothing was recorded" in silent.stderr
+    refused = run("record", "--connect", router, "--out", str(tmp_path / "old.mcap"))
+    assert (refused.code, "not written over" in refused.err) == (2, True)
+    silent = run("record", "--connect", router, "--out", str(tmp_path / "new.mcap"), "--duration", "0.3")
+    assert (silent.code, silent.err.count("\n")) == (1, 1)
+    assert "nothing was recorded" in silent.err
     assert [one.name for one in tmp_path.iterdir()] == ["old.mcap"]

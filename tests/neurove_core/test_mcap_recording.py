@@ -135,6 +135,13 @@ def test_of_several_streams_one_is_picked_by_name(tmp_path):
         open_source(path, topic="up")
 
 
+def test_a_recording_that_was_cut_before_its_first_packet_holds_no_stream(tmp_path):
+    packets = [("cam0", encode_packet(make_packet()))]
+    (tmp_path / "cut.mcap").write_bytes(write(tmp_path / "a.mcap", packets).read_bytes()[:200])
+    with pytest.raises(UnknownSource, match="it holds no stream"):
+        open_source(str(tmp_path / "cut.mcap"))
+
+
 def test_nothing_stands_under_the_name_until_the_recording_is_whole(tmp_path):
     path = tmp_path / "a.mcap"
     with PacketWriter(path) as writer:

@@ -30,8 +30,9 @@ def estimator():
     return Estimator(bundle.untrained(3, SMALL, "small"))
 
 
-def turning(seconds: float) -> Events:
-    source = f"sim://room?seed=2&camera=davis240c&pitch=0&seconds={seconds}&trajectory=rotation?wx=0.5%26wy=1.0"
+def turning(seconds: float, rad_s: float = 1.0) -> Events:
+    turn = f"rotation?wx={rad_s / 2}%26wy={rad_s}"
+    source = f"sim://room?seed=2&camera=davis240c&pitch=0&seconds={seconds}&trajectory={turn}"
     return Events.join(list(open_source(source).chunks()))
 
 
@@ -79,17 +80,18 @@ def test_what_lacks_its_truth_or_a_whole_window_is_skipped_with_the_reason(estim
 
 def test_profiles_and_cameras_at_rest_are_judged_over_their_windows(estimator, tmp_path):
     (tmp_path / "ecd").mkdir()
-    (tmp_path / "ecd" / "shapes_rotation_1.43s.txt").write_bytes(ecd_text(turning(0.75)))
+    (tmp_path / "ecd" / "shapes_rotation_1.43s.txt").write_bytes(ecd_text(turning(0.75, rad_s=0.2)))
     (tmp_path / "aedat4").mkdir()
     noise = make_events(3000, duration_us=600_000, sensor=Sensor(346, 260))
     (tmp_path / "aedat4" / "davis346.aedat4").write_bytes(aedat4([noise], Sensor(346, 260)).data)
-    rows = by_name(real.run(estimator, tmp_path))
+    judged = list(real.run(estimator, tmp_path))
+    rows = by_name(judged)
     assert rows["ecd", "yaw"]["made_of"]["windows"] == 3  # whole ones, 0.5 s after the first of them
     assert -1 <= rows["ecd", "yaw"]["value"] <= 1
     assert (
         rows["ecd", "turning at rest [rad/s]"]["value"] >= rows["ecd", "turning at rest [rad/s]"]["made_of"]["median"]
     )
-    rest = {row["what"]: row for row in real.run(estimator, tmp_path) if row["recording"].endswith("davis346.aedat4")}
+    rest = {row["what"]: row for row in judged if row["recording"].endswith("davis346.aedat4")}
     flagged = rest["share of windows flagged low activity"]
     assert flagged["made_of"]["events in a window"] == pytest.approx(250, abs=40)
     assert 0 <= flagged["value"] <= 1

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from neurove_core.experiments import sine, sine_report
-from neurove_core.experiments.sine import LENGTH, Network, Recipe, evaluate, train, waves
+from neurove_core.experiments.sine import LENGTH, Network, Recipe, evaluate, waves
+from neurove_core.experiments.sine_training import train
 from protocol.errors import InvalidField
 
 pytest.importorskip("scipy", reason="scipy is not installed: pip install 'neurove[experiments]'")

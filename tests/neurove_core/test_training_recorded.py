@@ -122,7 +122,7 @@ def test_what_can_not_be_learned_from_is_refused_with_its_field(ours, tmp_path):
     with pytest.raises(ValueError, match="nothing to learn from"):
         DataConfig(sequences=0)
     (tmp_path / "run.toml").write_text("[data]\nrecordings = ['a', {source = 'b', height_m = -1}]\n")
-    with pytest.raises(InvalidField, match=r"data.recordings.1.height_m='-1'"):
+    with pytest.raises(InvalidField, match=r"data.recordings.1.height_m=-1"):
         configs.load(str(tmp_path / "run.toml"))
 
 

@@ -1,34 +1,12 @@
 """Commands that need no network: what they print, where, and with which exit code."""
 
 import json
-import logging
 
 import pytest
-import structlog
 
 from neurove_core import bundle
 from neurove_core.experiments import firing
 from service import cli, commands_running
-
-
-@pytest.fixture
-def logging_as_before():
-    root = logging.getLogger()
-    handlers, level = root.handlers[:], root.level
-    yield
-    root.handlers[:] = handlers
-    root.setLevel(level)
-    structlog.reset_defaults()
-
-
-@pytest.fixture
-def run(capsys, logging_as_before):
-    def call(*arguments):
-        code = cli.main(arguments)
-        out, err = capsys.readouterr()
-        return code, out, err
-
-    return call
 
 
 def test_config_show_is_toml_that_serve_reads_back(run, tmp_path, monkeypatch):

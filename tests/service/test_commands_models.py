@@ -24,15 +24,9 @@ TOLD = About(
 
 
 @pytest.fixture
-def run(capsys, tmp_path, monkeypatch):
+def run(run, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-
-    def call(*arguments):
-        code = cli.main(["model", *arguments])
-        out, err = capsys.readouterr()
-        return code, out, err
-
-    return call
+    return lambda *arguments: run("model", *arguments)
 
 
 @pytest.fixture(scope="session")

@@ -6,19 +6,8 @@ import pytest
 
 from neurove_core.io import open_source
 from protocol import Sensor
-from service import cli
 from tests.builders import make_events
 from tests.recordings import ecd_text, shared
-
-
-@pytest.fixture
-def run(capsys):
-    def call(*arguments):
-        code = cli.main([str(argument) for argument in arguments])
-        out, err = capsys.readouterr()
-        return code, out, err
-
-    return call
 
 
 def test_convert_writes_a_recording_of_ours(run, tmp_path):

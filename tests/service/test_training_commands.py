@@ -41,16 +41,6 @@ def trained(tmp_path_factory):
     return folder
 
 
-@pytest.fixture
-def run(capsys):
-    def call(*arguments):
-        code = cli.main(arguments)
-        out, err = capsys.readouterr()
-        return code, out, err
-
-    return call
-
-
 def test_training_leaves_a_bundle_a_checkpoint_and_its_account(trained):
     out = trained / "out"
     model = bundle.load(out / "tiny.safetensors")

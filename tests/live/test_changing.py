@@ -1,0 +1,154 @@
+"""What the commands that change a node make of several nodes, of refusals and of faults, over real sessions."""
+
+import contextlib
+import json
+
+import pytest
+
+from protocol.control import (
+    ActivateReply,
+    ActivateRequest,
+    ModelInfo,
+    PeerError,
+    ProgressReply,
+    PushReply,
+    PushRequest,
+    StreamStatus,
+)
+from protocol.errors import Conflict, NoStore, UnknownModel
+from protocol.keys import Keys
+from service import ask
+from service.config import ClientConfig
+from service.transport import open_transport
+from tests.live.conftest import client, free_endpoint, is_alive, wait_until
+from tests.protocol.messages import STATUS
+
+pytestmark = pytest.mark.live
+
+OLD, NEW = (
+    ModelInfo(name=name, digest=digit * 64, trained=True, provenance="here", parameters=7)
+    for name, digit in (("old", "a"), ("new", "b"))
+)
+
+
+class Node:
+    """Answers pushes and activations as a node does, with what the test wants it to say."""
+
+    def __init__(self, name, answer):
+        self.name, self.answer, self.asked = name, answer, []
+
+    def activate(self, data, tell):
+        return self._told(ActivateRequest.decode(data).model, tell)
+
+    def push(self, data, tell):
+        return self._told(PushRequest.decode(data).name, tell)
+
+    def _told(self, wanted, tell):
+        self.asked.append(wanted)
+        tell(ProgressReply(node=self.name, step="verified", text="it runs here").encode())
+        return self.answer(self.name).encode()
+
+
+def done(name):
+    return ActivateReply(node=name, active=NEW, previous=OLD, epoch=1)
+
+
+def has_it(name):
+    return PushReply(node=name, model=NEW, fetched=1234)
+
+
+def refuses(error):
+    def answer(_):
+        raise error
+
+    return answer
+
+
+@pytest.fixture
+def network():
+    """An endpoint of a router, and a way to put nodes behind it."""
+    endpoint, keys = free_endpoint(), Keys()
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(open_transport("router", listen=(endpoint,)))
+
+        def put(**answers):
+            nodes = {name: Node(name, answer) for name, answer in answers.items()}
+            for node in nodes.values():
+                transport = stack.enter_context(client(endpoint))
+                transport.answer_streaming(keys.activate(node.name), node.activate)
+                transport.answer_streaming(keys.push(node.name), node.push)
+                transport.token(keys.alive(node.name))
+            with client(endpoint) as asking:
+                wait_until(lambda: len(asking.tokens(keys.alive(), 1.0)) == len(nodes))
+            return nodes
+
+        yield endpoint, put
+
+
+def test_one_of_several_nodes_must_be_named_before_anything_changes(network, run):
+    endpoint, put = network
+    nodes = put(n1=done, n2=done)
+    code, out, err = run("activate", "new", "--connect", endpoint)
+    assert (code, out) == (2, "")
+    assert "several nodes are alive: n1, n2; name one with --node, or say --all" in err
+    assert [node.asked for node in nodes.values()] == [[], []]
+    code, out, _ = run("activate", "new", "--connect", endpoint, "--node", "n2")
+    assert (code, out.splitlines()) == (
+        0,
+        ["n2: verified: it runs here", f"n2: new ({'b' * 12}) now serves, was old ({'a' * 12})"],
+    )
+    assert [node.asked for node in nodes.values()] == [[], ["new"]]
+
+
+def test_what_one_node_refuses_is_not_tried_on_the_next_and_both_are_told(network, run):
+    endpoint, put = network
+    nodes = put(n1=done, n2=refuses(UnknownModel("new", ("old",))), n3=done)
+    code, out, err = run("activate", "new", "--connect", endpoint, "--all", "--json")
+    assert code == 1
+    assert [json.loads(line)["node"] for line in out.splitlines()] == ["n1", "n1", "n2"]
+    assert err == "neurove: n2: model='new': not on this node; available: old; not asked then: n3\n"
+    assert [node.asked for node in nodes.values()] == [["new"], ["new"], []]
+
+
+def test_a_push_to_all_tells_people_where_the_bundle_is_and_where_it_is_refused(network, run, tmp_path):
+    endpoint, put = network
+    nodes = put(n1=has_it, n2=refuses(NoStore("it has no state_dir")))
+    (tmp_path / "new.safetensors").write_bytes(b"whatever it is")
+    code, out, err = run("push", tmp_path / "new.safetensors", "--connect", endpoint, "--all")
+    assert code == 1
+    assert out.splitlines()[1] == f"n1: new ({'b' * 12}) is there, 1,234 bytes moved"
+    assert err == "neurove: n2: this node keeps no pushed models: it has no state_dir\n"
+    assert [node.asked for node in nodes.values()] == [["new.safetensors"]] * 2
+
+
+def test_a_conflict_on_the_last_node_keeps_its_own_exit_code(network, run):
+    endpoint, put = network
+    put(n1=done, n2=refuses(Conflict("somebody was first")))
+    code, _, err = run("activate", "new", "--connect", endpoint, "--all")
+    assert (code, err) == (3, "neurove: n2: conflict: somebody was first\n")
+
+
+def test_a_fault_of_a_node_is_told_to_its_caller_and_the_node_answers_on(network):
+    endpoint, put = network
+    nodes = put(n1=refuses(ZeroDivisionError("a bug")))
+    config = ClientConfig(connect=(endpoint,))
+    with client(endpoint) as transport:
+        assert is_alive(transport, config)
+        with pytest.raises(PeerError, match="n1: internal error: see the log of the node") as caught:
+            ask.activate(transport, config, "new", "n1")
+        assert caught.value.code == "internal"
+        nodes["n1"].answer = done
+        assert ask.activate(transport, config, "new", "n1").active == NEW
+
+
+def test_a_message_that_can_not_be_read_costs_a_listener_nothing_but_itself(network):
+    endpoint, _ = network
+    config, heard, status = ClientConfig(connect=(endpoint,)), [], StreamStatus.model_validate(STATUS)
+    with client(endpoint) as transport, client(endpoint) as node:
+        ask.listen(transport, config, heard.append, heard.append)
+        publisher = node.publisher(config.keys.status("cam0"), "application/msgpack")
+        wait_until(lambda: publisher.matching)
+        publisher.put(b"no status")
+        publisher.put(status.encode())
+        wait_until(lambda: heard)
+    assert heard == [status]
