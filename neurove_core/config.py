@@ -91,7 +91,7 @@ class ModelConfig(Config):
         0.05,
         ge=0,
         le=100,
-        description="So is one with fewer for each pixel that the model sees; resting sensors give 0.02 to 0.03 (noise).",
+        description="So is one with fewer per pixel that the model sees; a resting sensor has 0.02 to 0.12.",
     )
 
     @model_validator(mode="after")
