@@ -128,6 +128,11 @@ class Stream:
         return [self._estimate(window, pushing.serving, arrival) for window in pushing.estimates]
 
     @property
+    def flowing(self) -> bool:
+        """Whether packets come."""
+        return self._now_ns() - self.last_packet_ns < IDLE_NS
+
+    @property
     def owes(self) -> bool:
         """Whether a model that runs beside the one that answers has something to catch up on."""
         return self.lanes.owes
