@@ -20,8 +20,8 @@ MOST_OWED_WINDOWS, MOST_OWED_PACKETS, MOST_OWED_EVENTS = 128, 4096, 4_000_000
 
 
 PRIME_WINDOWS = 64
-"""Windows that are replayed where the bundle does not say: more leave less of the change, and none of those tried leaves
-nothing (decision 29)."""
+"""Windows that are replayed where the bundle does not say: more leave less of the change, none of those tried nothing
+(decision 29)."""
 
 Pace = Callable[[float], object]
 

@@ -1,5 +1,6 @@
 """Pulling a bundle in chunks: the node asks, so it goes at the node's pace and on from where it was cut."""
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -18,9 +19,9 @@ PATIENCE_S = 15.0
 
 _RETRY_S = 0.25
 _TELL_S = 0.5
-_LEAST_BYTES = 64 << 10
-_LONG_S = 0.05
-"""A chunk that takes longer is halved the next time: what it keeps waiting on the link is other streams' events."""
+LEAST_BYTES = 8 << 10
+_LONG_S = 0.002
+"""A chunk may take longer by so much, or by half, than the quickest did: others' events wait for it on the link."""
 
 
 def pull_into(
@@ -63,7 +64,7 @@ def _pull_rest(
     on_progress: OnProgress,
     patience_s: float,
 ) -> None:
-    have, length = file.seek(0, 2), _LEAST_BYTES
+    have, length, quickest_s = file.seek(0, 2), LEAST_BYTES, math.inf
     heard = told = time.monotonic()
     on_progress(Progress("fetching", _so_far(have, wanted.size)))
     while have < wanted.size:
@@ -78,11 +79,19 @@ def _pull_rest(
         file.write(chunk)
         file.flush()  # to where a killed process leaves it
         have += len(chunk)
-        length = max(length // 2, _LEAST_BYTES) if now - began > _LONG_S else min(length * 2, MAX_CHUNK_BYTES)
+        quickest_s = min(quickest_s, now - began)
+        length = _next_length(length, now - began - quickest_s, max(_LONG_S, quickest_s / 2))
         heard = now
         if now - told > _TELL_S:
             told = now
             on_progress(Progress("fetching", _so_far(have, wanted.size)))
+
+
+def _next_length(length: int, more_s: float, long_s: float) -> int:
+    """Length of the next chunk, by how much longer than the quickest the last one took, and what is long [s]."""
+    if more_s > long_s:
+        return max(length // 2, LEAST_BYTES)
+    return min(length * 2, MAX_CHUNK_BYTES) if more_s < long_s / 4 else length
 
 
 def _chunk(digest: str, request: ChunkRequest, pull: Pull) -> tuple[bytes | None, str]:

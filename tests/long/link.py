@@ -99,7 +99,7 @@ def inside(endpoint: str, file: Path, quiet_s: float) -> dict[str, Any]:
     """What is measured, from the namespace of driver and operator: time from the put to the node, of windows' ends."""
     config = ClientConfig(connect=(endpoint,))
     payloads: list[bytes] = []
-    with client(endpoint) as transport, client(endpoint) as ours:
+    with client(endpoint, START_S) as transport, client(endpoint) as ours:
         wait_until(lambda: is_alive(transport, config), START_S)
         transport.subscribe(config.keys.velocity(), lambda _, payload, __: payloads.append(payload))
         driver = Driver(Source(ours, config, "cam0"))
@@ -116,11 +116,12 @@ def inside(endpoint: str, file: Path, quiet_s: float) -> dict[str, Any]:
     spans = {"without": (quiet, began), "with": (began, ended)}
     took: dict[str, list[float]] = {name: [] for name in spans}
     for estimate in map(TwistEstimate.decode, payloads):
-        sent_ns = driver.sent_ns[estimate.end_us // STEP_US]  # the packet that begins where the window ends completes it
+        sent_ns = driver.sent_ns[estimate.end_us // STEP_US]  # the packet that begins at its end completes a window
         for name, (a, b) in spans.items():
             if a <= sent_ns < b:
                 took[name].append((estimate.trace.received_ns - sent_ns) / 1e6)
-    tell = {name: {f"p{p}": round(float(np.percentile(ms, p)), 2) for p in (50, 95, 99, 100)} for name, ms in took.items()}
+    shown = (50, 95, 99, 100)
+    tell = {name: {f"p{p}": round(float(np.percentile(ms, p)), 2) for p in shown} for name, ms in took.items()}
     seconds = (ended - began) / 1e9
     return {
         "events_ms": tell,

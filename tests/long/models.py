@@ -108,7 +108,7 @@ def _slow() -> Bundle:
     )
     zeros, ones = torch.zeros(6), torch.ones(6)
     about = About(release=_RELEASE)
-    return Bundle("too-slow", False, "a test", config, NeuroVE(config).eval(), zeros, ones, about=about)  # noqa: FBT003  # trained
+    return Bundle("too-slow", False, "a test", config, NeuroVE(config).eval(), zeros, ones, about=about)  # trained
 
 
 _SPOILT: dict[str, Callable[[bytes], bytes]] = {

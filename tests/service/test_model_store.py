@@ -14,6 +14,7 @@ from service import model_store
 from service.library import Library
 from service.model_slot import ModelSlot
 from service.model_store import ModelStore
+from service.pull import LEAST_BYTES
 from service.signatures import Signed
 from tests.service.conftest import SMALL
 
@@ -225,17 +226,29 @@ def test_chunks_that_take_long_become_small_and_quick_ones_large(tmp_path):
     asked = []
     with pytest.raises(BadModel):
         fetch(ModelStore(tmp_path), wanted(big), source(big, asked=asked))
-    assert asked[0].length == 64 << 10
-    assert max(one.length for one in asked) == 1 << 20
+    assert asked[0].length == LEAST_BYTES
+    assert max(one.length for one in asked) >= 1 << 18
 
     def slow(digest, request):
-        threading.Event().wait(0.06)
+        threading.Event().wait(request.length / 2e6)  # 16 Mbit/s
         return source(big, asked=slowly)(digest, request)
 
     slowly = []
     with pytest.raises(BadModel):
-        fetch(ModelStore(tmp_path), wanted(big[: 1 << 20]), slow)
-    assert {one.length for one in slowly} == {64 << 10}
+        fetch(ModelStore(tmp_path), wanted(big[: 1 << 18]), slow)
+    assert max(one.length for one in slowly) <= 4 * LEAST_BYTES
+
+
+def test_a_link_that_takes_its_time_for_any_chunk_gets_large_ones(tmp_path):
+    big, asked = b"x" * (3 << 20), []
+
+    def far(digest, request):
+        threading.Event().wait(0.1)
+        return source(big, asked=asked)(digest, request)
+
+    with pytest.raises(BadModel):
+        fetch(ModelStore(tmp_path), wanted(big), far)
+    assert max(one.length for one in asked) >= 1 << 18
 
 
 def test_a_model_that_rotted_on_the_disk_is_listed_with_its_reason_and_can_be_pushed_again(store, tmp_path, data):

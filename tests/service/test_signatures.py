@@ -87,7 +87,9 @@ def test_a_signature_is_read_once_until_it_or_its_bundle_changes(folder, key_fil
         return check(data, signature)
 
     store = ModelStore(folder / "state", folder, verify=counted)
-    digests = {name: hashlib.sha256((folder / f"{name}.safetensors").read_bytes()).hexdigest() for name in ("one", "two")}
+    digests = {
+        name: hashlib.sha256((folder / f"{name}.safetensors").read_bytes()).hexdigest() for name in ("one", "two")
+    }
     for _ in range(3):
         assert store.signed(digests["one"]).release == 3
         with pytest.raises(Untrusted, match="only models that are signed"):
