@@ -154,7 +154,7 @@ def measure(mbit: float, mib: float, quiet_s: float) -> dict[str, Any]:
                 )
             finally:
                 service.terminate()
-    return {"mbit_s": mbit, **json.loads(measured.stdout)}
+    return {"mbit_s": mbit, **json.loads(measured.stdout.splitlines()[-1])}  # after the log
 
 
 def main() -> int:

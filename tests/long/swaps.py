@@ -137,24 +137,25 @@ def run(swaps: int, bad: int, streams: int, quiet_s: float = 5.0) -> dict[str, A
         refused: dict[str, tuple[str, str]] = {}
         unrefused, resident, active = [], [memory.kib()], GOOD[0]
         is_bad = set(np.linspace(1, swaps - 1, bad, dtype=int).tolist()) if bad else set()
-        for number in range(swaps):
-            is_next_bad = number in is_bad
-            if is_next_bad:
-                model = made.bad[sorted(is_bad).index(number) % len(made.bad)]
-            else:
-                model = active = GOOD[active == GOOD[0]]
-            marks.set(f"{model}: asked")
-            try:
-                ask.activate(
-                    transport, config, model, "n1", on_progress=lambda said, m=model: marks.set(f"{m}: {said.step}")
-                )
-                unrefused += [model] * is_next_bad
-            except PeerError as error:
-                refused[model] = error.code, error.message
-            marks.set(f"{model}: answered")
-            time.sleep(PAUSE_S)  # the answer comes before the memory goes
-            resident.append(memory.kib())
-            print(f"change {number + 1} of {swaps}, {model}: {resident[-1] >> 10} MiB", file=sys.stderr)
+        with contextlib.suppress(KeyboardInterrupt):  # an impatient caller hears of what was done
+            for number in range(swaps):
+                is_next_bad = number in is_bad
+                if is_next_bad:
+                    model = made.bad[sorted(is_bad).index(number) % len(made.bad)]
+                else:
+                    model = active = GOOD[active == GOOD[0]]
+                marks.set(f"{model}: asked")
+                try:
+                    ask.activate(
+                        transport, config, model, "n1", on_progress=lambda said, m=model: marks.set(f"{m}: {said.step}")
+                    )
+                    unrefused += [model] * is_next_bad
+                except PeerError as error:
+                    refused[model] = error.code, error.message
+                marks.set(f"{model}: answered")
+                time.sleep(PAUSE_S)  # the answer comes before the memory goes
+                resident.append(memory.kib())
+                print(f"change {number + 1} of {swaps}, {model}: {resident[-1] >> 10} MiB", file=sys.stderr)
         time.sleep(1.0)
         memory.end()
         health = ask.health(transport, config)[0]
@@ -166,7 +167,7 @@ def run(swaps: int, bad: int, streams: int, quiet_s: float = 5.0) -> dict[str, A
     model_kib = made.model_bytes >> 10
     quarter = resident[-max(2, len(resident) // 4) :]
     return {
-        "swaps": swaps,
+        "swaps": len(resident) - 1,
         "epochs": sorted({one.epoch for all_of in of.values() for one in all_of})[-1],
         "estimates": {name: len(one) for name, one in of.items()},
         "lost_or_doubled": sum(b.start_us != a.end_us for one in of.values() for a, b in pairwise(one)),
