@@ -19,9 +19,31 @@ PATIENCE_S = 15.0
 
 _RETRY_S = 0.25
 _TELL_S = 0.5
-LEAST_BYTES = 8 << 10
-_LONG_S = 0.002
-"""A chunk may take longer by so much, or by half, than the quickest did: others' events wait for it on the link."""
+LEAST_BYTES = 4 << 10
+LONG_S = 0.001
+QUICK_ONES = 8
+
+
+class ChunkLength:
+    """How long the next chunk is to be: others' events wait on the link while it passes.
+
+    It is halved where one took longer than the quickest did by over LONG_S, or by half where the link takes its time for
+    anything, and doubled after QUICK_ONES in a row that took about as long as the quickest.
+    """
+
+    def __init__(self) -> None:
+        self.bytes = LEAST_BYTES
+        self._quickest_s, self._quick = math.inf, 0
+
+    def took(self, seconds: float) -> None:
+        """Learn how long the last one took [s]."""
+        self._quickest_s = min(self._quickest_s, seconds)
+        more_s, long_s = seconds - self._quickest_s, max(LONG_S, self._quickest_s / 2)
+        self._quick = self._quick + 1 if more_s < long_s / 2 else 0
+        if more_s > long_s:
+            self.bytes = max(self.bytes // 2, LEAST_BYTES)
+        elif self._quick >= QUICK_ONES:
+            self.bytes, self._quick = min(self.bytes * 2, MAX_CHUNK_BYTES), 0
 
 
 def pull_into(
@@ -64,12 +86,12 @@ def _pull_rest(
     on_progress: OnProgress,
     patience_s: float,
 ) -> None:
-    have, length, quickest_s = file.seek(0, 2), LEAST_BYTES, math.inf
+    have, length = file.seek(0, 2), ChunkLength()
     heard = told = time.monotonic()
     on_progress(Progress("fetching", _so_far(have, wanted.size)))
     while have < wanted.size:
         began = time.monotonic()
-        request = ChunkRequest(offset=have, length=min(length, wanted.size - have))
+        request = ChunkRequest(offset=have, length=min(length.bytes, wanted.size - have))
         chunk, why = _chunk(wanted.digest, request, pull)
         now = time.monotonic()
         if chunk is None:
@@ -79,19 +101,11 @@ def _pull_rest(
         file.write(chunk)
         file.flush()  # to where a killed process leaves it
         have += len(chunk)
-        quickest_s = min(quickest_s, now - began)
-        length = _next_length(length, now - began - quickest_s, max(_LONG_S, quickest_s / 2))
+        length.took(now - began)
         heard = now
         if now - told > _TELL_S:
             told = now
             on_progress(Progress("fetching", _so_far(have, wanted.size)))
-
-
-def _next_length(length: int, more_s: float, long_s: float) -> int:
-    """Length of the next chunk, by how much longer than the quickest the last one took, and what is long [s]."""
-    if more_s > long_s:
-        return max(length // 2, LEAST_BYTES)
-    return min(length * 2, MAX_CHUNK_BYTES) if more_s < long_s / 4 else length
 
 
 def _chunk(digest: str, request: ChunkRequest, pull: Pull) -> tuple[bytes | None, str]:

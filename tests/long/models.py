@@ -1,4 +1,4 @@
-"""Bundles for the long runs: good ones, signed, and every kind of bad one that a node must refuse with its own reason."""
+"""Bundles for the long runs: good ones, signed, and each kind of bad one that a node must refuse, and why."""
 
 import json
 import struct
