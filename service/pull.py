@@ -27,8 +27,8 @@ QUICK_ONES = 8
 class ChunkLength:
     """How long the next chunk is to be: others' events wait on the link while it passes.
 
-    It is halved where one took longer than the quickest did by over LONG_S, or by half where the link takes its time for
-    anything, and doubled after QUICK_ONES in a row that took about as long as the quickest.
+    It is halved where one took longer than the quickest did by over LONG_S, or by half where the link takes its time
+    for anything, and doubled after QUICK_ONES in a row that took about as long as the quickest.
     """
 
     def __init__(self) -> None:
