@@ -1,5 +1,6 @@
 """What a network carries from window to window: tensors in named tuples, nested in whatever way."""
 
+import math
 from collections.abc import Iterator
 from typing import Any, TypeVar
 
@@ -25,6 +26,8 @@ def tensors_of(state: Any) -> Iterator[Tensor]:
 
 def finite(state: Any) -> bool:
     """Whether no number of a state is nan or infinite."""
+    if all(math.isfinite(tensor.sum().item()) for tensor in tensors_of(state)):
+        return True  # one of either makes any sum so, and a sum costs a third of a look at each number
     return all(bool(torch.isfinite(tensor).all()) for tensor in tensors_of(state))
 
 

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv2d
 
+from neurove_core import carried
 from neurove_core.cells import ASLSTM, ASLSTMState, readout_step
 from neurove_core.config import ModelConfig
 from neurove_core.int8 import rounded, rounded_input
@@ -22,8 +23,7 @@ class NetworkState(NamedTuple):
 
     def finite(self) -> bool:
         """Whether no number of it is nan or infinite."""
-        tensors = (*itertools.chain(*self.membranes, *self.cells), self.readout)
-        return all(bool(torch.isfinite(tensor).all()) for tensor in tensors)
+        return carried.finite(self)
 
 
 class SpikingBlock(nn.Module):

@@ -1,5 +1,6 @@
 """Composition root: build, start, stop; the only file that knows everything."""
 
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -9,7 +10,7 @@ from protocol import CameraInfo
 from protocol.control import STATUS_SCHEMA, ChunkRequest, StreamStatus
 from protocol.errors import NeuroVEError
 from protocol.velocity import SCHEMA as VELOCITY_SCHEMA
-from service import logs
+from service import logs, memory
 from service.active_file import Active, ActiveFile
 from service.comparison import Limits
 from service.config import ServiceConfig
@@ -38,6 +39,7 @@ _ROUTER_PATIENCE_S = 365 * 86_400.0
 def _rules(config: ServiceConfig) -> Rules:
     return Rules(
         probation_s=config.probation_s,
+        prime_s=config.prime_s,
         shadow=Limits(config.shadow_divergence),
         probation=Limits(config.probation_divergence),
     )
@@ -70,6 +72,7 @@ class Service:
             kept=self._kept(),
         )
         self._workers: dict[str, StreamWorker] = {}
+        self._spare = threading.Semaphore(max(1, (os.cpu_count() or 1) // 2))  # the rest is for those that answer
         self._changing = threading.Lock()  # of the dict; a worker's stream is the worker's alone
         self._refused: dict[str, float] = {}  # stream -> when it was last heard of
         self._handlers = Handlers(
@@ -124,13 +127,17 @@ class Service:
 
     def _declare(self, transport: Transport) -> None:
         keys, node = self._keys, self._config.node
-        transport.answer(keys.health(node), self._handlers.health)
-        transport.answer(keys.models(node), self._handlers.models)
-        transport.answer_streaming(keys.activate(node), self._handlers.activate)
-        transport.answer_streaming(keys.rollback(node), self._handlers.rollback)
-        transport.answer_streaming(keys.push(node), self._pushes(transport))
+        # first what takes packets, then what says that the node is ready for them
         transport.subscribe(keys.camera(), self._route(transport, StreamWorker.put_camera))
         transport.subscribe(keys.events(), self._route(transport, StreamWorker.put_packet))
+        transport.answer(keys.health(node), self._handlers.health)
+        transport.answer(keys.models(node), self._handlers.models)
+        for key, handle in (
+            (keys.activate(node), self._handlers.activate),
+            (keys.rollback(node), self._handlers.rollback),
+            (keys.push(node), self._pushes(transport)),
+        ):
+            transport.answer_streaming(key, handle, after=memory.give_back)
         transport.token(keys.alive(node))
 
     def _pushes(self, transport: Transport) -> Callable[[bytes, Tell], bytes]:
@@ -199,6 +206,7 @@ class Service:
             lambda: self._outlet(name, transport),
             Inbox(self._config.queue_s, self._config.queue_mib << 20),
             self._config.limits,
+            self._spare,
         )
         self._workers[name] = worker
         return worker

@@ -29,7 +29,10 @@ def reproduce_repriming(args: argparse.Namespace) -> int:
 
     told = sys.stderr.isatty()
     report = repriming.run(
-        args.model, args.streets, progress=lambda name: print(name, file=sys.stderr) if told else None
+        args.model,
+        args.streets,
+        args.primed or repriming.PRIMED,
+        progress=lambda name: print(name, file=sys.stderr) if told else None,
     )
     files = repriming.save(report, args.out) if args.out else []
     print(repriming.to_json(report) if args.json else repriming.to_markdown(report), end="")
@@ -134,6 +137,13 @@ def _made_by() -> dict[str, str]:
     return {"command": shlex.join(["neurove", *sys.argv[1:]]), "commit": commit()}
 
 
+def _numbers(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r}: whole numbers joined by commas") from None
+
+
 def _assignment(text: str) -> tuple[str, str]:
     field, separator, value = text.partition("=")
     if not separator:
@@ -150,6 +160,9 @@ def add(commands: Any) -> None:
     repriming = command(parser, "repriming", reproduce_repriming)
     repriming.add_argument("--model", default="default", help="name of a built-in model, or a bundle's file")
     repriming.add_argument("--streets", type=int, default=6, metavar="N", help="so many held-out streets; default 6")
+    repriming.add_argument(
+        "--primed", type=_numbers, metavar="N,...", help="numbers of windows to replay; default 8,16,32,64"
+    )
     repriming.add_argument("--out", type=Path, metavar="DIR", help="write table, figures and picture into this folder")
     sine = command(parser, "sine", reproduce_sine)
     sine.add_argument("--models", default="aslstm,aslstm-spiking,aslstm-wo,slstm,ltc", help="which, joined by commas")

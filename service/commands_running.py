@@ -40,8 +40,11 @@ def serve(args: argparse.Namespace) -> int:
 
     torch.set_num_threads(1)
     sys.setswitchinterval(0.0005)  # Zenoh's threads wait for ours: 5 ms, the default, is a packet's period
-    Service(config, stop).run()
-    gc.freeze()  # else Python collects all of torch once more on the way out: up to 2 s on a busy machine
+    service = Service(config, stop)
+    gc.collect()
+    gc.freeze()  # what is here stays: Python would look through all of torch again and again, with all threads stopped
+    service.run()
+    gc.freeze()  # and once more on the way out: up to 2 s on a busy machine
     return 0
 
 

@@ -6,6 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from neurove_core import about
+from neurove_core.bundle import Bundle
+
 FLOOR_M_S, FLOOR_RAD_S = 0.1, 0.05
 """At rest every difference is large beside the motion: below these, it is measured against these."""
 
@@ -23,6 +26,11 @@ class Limits(NamedTuple):
     divergence: float = 1.0  # RMS difference of the estimates, in RMS of the proven model's
     rate_ratio: float = 8.0  # share of cells that fire, in that of the proven model, either way
     latency_share: float = 0.5  # median time for a window, in the window's duration
+    own: about.Limits = about.Limits()  # what the model's bundle says of it besides, where it does
+
+    def and_of(self, bundle: Bundle) -> "Limits":
+        """These, and those that a bundle sets itself: it may be stricter than the node, never laxer."""
+        return self._replace(own=bundle.limits)
 
 
 class Pair(NamedTuple):
@@ -54,6 +62,7 @@ class Measured(NamedTuple):
     tried_ms: list[float]  # time of the newest windows [ms]
     window_ms: float
     fault: str  # what went wrong; empty where nothing did
+    proven_ms: list[float] = []  # noqa: RUF012  # as tried_ms, of the proven model; never changed
 
     @property
     def divergence(self) -> float:
@@ -66,6 +75,17 @@ class Measured(NamedTuple):
             for part, floor in ((slice(0, 3), FLOOR_M_S), (slice(3, 6), FLOOR_RAD_S))
         )
 
+    def mean_difference(self, part: slice) -> float:
+        """Mean length of the difference of both models [m/s or rad/s]: of the linear part 0:3, the angular part 3:6."""
+        apart = [np.linalg.norm(pair.tried[part] - pair.proven[part]) for pair in self.pairs]
+        return float(np.mean(apart)) if apart else 0.0
+
+    @property
+    def latency_ratio(self) -> float:
+        """Median time for a window, as a multiple of the proven model's; 0 where one of both took none."""
+        proven, tried = _newest_median(self.proven_ms), self.latency_ms
+        return tried / proven if proven > 0 else 0.0
+
     @property
     def rate_ratio(self) -> float:
         """How many times more, or fewer, cells fire in the tried model."""
@@ -76,7 +96,7 @@ class Measured(NamedTuple):
     @property
     def latency_ms(self) -> float:
         """Median time that the tried model takes for a window [ms]."""
-        return float(np.median(self.tried_ms[-_SLOW_WINDOWS:])) if self.tried_ms else 0.0
+        return _newest_median(self.tried_ms)
 
     def __str__(self) -> str:
         share = f"latency {self.latency_ms:.1f} of {self.window_ms:.0f} ms"
@@ -97,6 +117,9 @@ def finding(measured: Measured, limits: Limits, newest: int = NEWEST_WINDOWS) ->
         bound_ms = limits.latency_share * measured.window_ms
         if measured.latency_ms > bound_ms:
             return Finding("latency_ms", measured.latency_ms, bound_ms)
+        ratio = limits.own.latency_ratio
+        if ratio is not None and len(measured.proven_ms) >= LEAST_WINDOWS and measured.latency_ratio > ratio:
+            return Finding("latency_ratio", measured.latency_ratio, ratio)
     if len(measured.pairs) < LEAST_WINDOWS:
         return None
     judged = measured._replace(pairs=measured.pairs[-newest:])
@@ -104,6 +127,10 @@ def finding(measured: Measured, limits: Limits, newest: int = NEWEST_WINDOWS) ->
         return Finding("divergence", judged.divergence, limits.divergence)
     if judged.rate_ratio > limits.rate_ratio:
         return Finding("rate_ratio", judged.rate_ratio, limits.rate_ratio)
+    for field, part in (("mean_dv_m_s", slice(0, 3)), ("mean_dw_rad_s", slice(3, 6))):
+        bound = getattr(limits.own, field)
+        if bound is not None and judged.mean_difference(part) > bound:
+            return Finding(field, judged.mean_difference(part), bound)
     return None
 
 
@@ -131,18 +158,17 @@ class Comparison:
         self._front: deque[Answered] = deque(maxlen=NEWEST_WINDOWS)
         self._pairs: deque[Pair] = deque(maxlen=NEWEST_WINDOWS)
         self._tried_ms: deque[float] = deque(maxlen=NEWEST_WINDOWS)
+        self._proven_ms: deque[float] = deque(maxlen=NEWEST_WINDOWS)
         self.fault = ""
 
     def front(self, answered: Answered, took_ms: float) -> None:
         """An answer of the model that answers the stream."""
         self._front.append(answered)
-        if self.front_is_tried:
-            self._tried_ms.append(took_ms)
+        (self._tried_ms if self.front_is_tried else self._proven_ms).append(took_ms)
 
     def beside(self, answered: Answered, took_ms: float) -> None:
         """An answer of the model that runs beside it, which comes after that of the other."""
-        if not self.front_is_tried:
-            self._tried_ms.append(took_ms)
+        (self._proven_ms if self.front_is_tried else self._tried_ms).append(took_ms)
         other = min(self._front, key=lambda one: abs(one.end_us - answered.end_us), default=None)
         if other is None or abs(other.end_us - answered.end_us) > self._reach_us:
             return
@@ -151,7 +177,12 @@ class Comparison:
 
     def measured(self) -> Measured:
         """What it has come to so far."""
-        return Measured(list(self._pairs), list(self._tried_ms), self._window_ms, self.fault)
+        times = list(self._tried_ms), list(self._proven_ms)
+        return Measured(list(self._pairs), times[0], self._window_ms, self.fault, times[1])
+
+
+def _newest_median(times_ms: list[float]) -> float:
+    return float(np.median(times_ms[-_SLOW_WINDOWS:])) if times_ms else 0.0
 
 
 def _rms(values: NDArray[np.float64]) -> float:

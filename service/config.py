@@ -102,6 +102,9 @@ class ServiceConfig(_Settings):
     status_period_s: float = Field(1.0, gt=0, le=60, description="Period of the status messages [s].")
     ring_windows: int = Field(64, ge=1, le=1024, description="Newest windows kept per stream, to prime a new model.")
     ring_mib: int = Field(4, ge=1, le=1024, description="Most bytes that these windows take per stream [MiB].")
+    prime_s: float = Field(
+        15.0, ge=0, le=600, description="Longest that a new model waits for more windows than are kept [s]."
+    )
     probation_s: float = Field(
         10.0, ge=0, le=3600, description="A new model may be taken back exactly for so long [s]."
     )

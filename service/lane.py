@@ -2,7 +2,7 @@
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +20,8 @@ MOST_OWED_WINDOWS, MOST_OWED_PACKETS, MOST_OWED_EVENTS = 128, 4096, 4_000_000
 
 
 PRIME_WINDOWS = 64
-"""Windows that are replayed: more leave less of the change, and none of those tried leaves nothing (decision 29)."""
+"""Windows that are replayed where the bundle does not say: more leave less of the change, none of those tried nothing
+(decision 29)."""
 
 Pace = Callable[[float], object]
 
@@ -124,8 +125,9 @@ class Primed(NamedTuple):
 
 
 def windows_to_prime(estimator: Estimator) -> int:
-    """Windows that a model replays before it answers a stream."""
-    return max(estimator.config.settle_windows, PRIME_WINDOWS)
+    """Windows that a model should have seen before it answers a stream: as its bundle says, where it does."""
+    told = estimator.bundle.about.prime_windows
+    return max(estimator.config.settle_windows, PRIME_WINDOWS) if told is None else told
 
 
 def replay(lane: Lane, entries: list[Packed], pace: Pace | None = None) -> Lane:
@@ -151,12 +153,15 @@ class Beside:
     Args:
         lane: the model.
         alike: whether it takes the windows of the lane that answers; else it cuts the packets itself.
+        replayed: windows of the past that it is primed with first.
     """
 
-    def __init__(self, lane: Lane, *, alike: bool) -> None:
+    def __init__(self, lane: Lane, *, alike: bool, replayed: Sequence[Packed] = ()) -> None:
         self.lane, self.alike = lane, alike
-        self._owed: deque[Packed | EventPacket] = deque()
+        self._owed: deque[Packed | EventPacket] = deque(replayed)
+        self._most_windows = MOST_OWED_WINDOWS + len(replayed)
         self._owed_events = 0  # of packets, which are kept as they came
+        self.fault = ""  # what it failed with; empty where it did not
         self.lost = False  # it owed too much and stands still since
 
     @property
@@ -164,13 +169,18 @@ class Beside:
         """Whether there is something to catch up on."""
         return bool(self._owed)
 
+    @property
+    def behind(self) -> int:
+        """How many windows, or packets, it is behind."""
+        return len(self._owed)
+
     def owe(self, packet: EventPacket, windows: list[Packed]) -> None:
         """Note what is to be done for it."""
         if self.lost:
             return
         self._owed.extend(windows if self.alike else [packet])
         self._owed_events += 0 if self.alike else packet.events.n
-        most = MOST_OWED_WINDOWS if self.alike else MOST_OWED_PACKETS
+        most = self._most_windows if self.alike else MOST_OWED_PACKETS
         if len(self._owed) > most or self._owed_events > MOST_OWED_EVENTS:
             self.give_up()
 

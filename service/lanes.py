@@ -164,7 +164,8 @@ class Lanes:
         try:
             answers = beside.step()
         except Exception as error:  # noqa: BLE001  # whatever a model on trial does, the one that answers goes on
-            self._lose(beside, f"{type(error).__name__}: {error}")
+            beside.fault = f"{type(error).__name__}: {error}"
+            self._lose(beside, beside.fault)
             return
         for answer in answers:
             comparison.beside(answer.compared, answer.took_ms)
@@ -199,7 +200,7 @@ class Lanes:
 
     def _lane(self, serving: Serving, packet: EventPacket) -> Lane:
         """The lane of a model, as far along as the front: the one beside, one that was offered, or a new one."""
-        beside, offered, about = self.beside, self._offered, self._about
+        beside, about = self.beside, self._about
         assert about is not None
         assert self.front is not None
         if beside is not None and beside.lane.estimator is serving.estimator and not beside.lost:
@@ -209,9 +210,9 @@ class Lanes:
                 return beside.lane
         if not self.front.estimator.cuts_like(serving.estimator):
             return _from_here(serving, packet, about) if self.front.next_us is not None else _at_rest(serving, about)
-        if offered is not None and offered.lane.estimator is serving.estimator and offered.ring is self._ring:
-            self._offered = None
-            return replay(offered.lane, self._ring.after(offered.lane.state.end_us))
+        offered = self._taken(serving)
+        if offered is not None:
+            return replay(offered, self._ring.after(offered.state.end_us))
         return replay(_at_rest(serving, about), self._ring.newest(windows_to_prime(serving.estimator)))
 
     def _place_beside(self, old: Lane, roles: Roles, packet: EventPacket) -> None:
@@ -221,11 +222,7 @@ class Lanes:
             return
         assert self.front is not None
         if self.beside is None or self.beside.lane.estimator is not wanted.estimator:
-            lane = old if old.estimator is wanted.estimator else self._lane(wanted, packet)
-            alike = lane.estimator.cuts_like(self.front.estimator)
-            if alike:
-                lane.state = lane.state._replace(windows=WindowsState())
-            self.beside = Beside(lane, alike=alike)
+            self.beside = self._beside(old, wanted, packet)
             self.comparison = None
         self.beside.lane.serving = wanted
         tried = roles.answers if roles.probation else wanted
@@ -234,6 +231,34 @@ class Lanes:
             reach_us = max(windows) // 2 if not self.beside.alike else 0
             window_ms = tried.estimator.config.window.duration_us / 1e3
             self.comparison = Comparison(front_is_tried=roles.probation, window_ms=window_ms, reach_us=reach_us)
+
+    def _beside(self, old: Lane, wanted: Serving, packet: EventPacket) -> Beside:
+        """A lane that runs beside; what it has to replay it owes, for the feed does not wait for it."""
+        assert self.front is not None
+        assert self._about is not None
+        if old.estimator is wanted.estimator:
+            lane, replayed = old, list[Packed]()
+        elif not self.front.estimator.cuts_like(wanted.estimator):
+            return Beside(self._lane(wanted, packet), alike=False)
+        elif (offered := self._taken(wanted)) is not None:
+            lane, replayed = offered, self._ring.after(offered.state.end_us)
+        else:
+            lane, replayed = (
+                _at_rest(wanted, self._about),
+                self._ring.newest(windows_to_prime(wanted.estimator)),
+            )
+        alike = lane.estimator.cuts_like(self.front.estimator)
+        if alike:
+            lane.state = lane.state._replace(windows=WindowsState())
+        return Beside(lane, alike=alike, replayed=replayed)
+
+    def _taken(self, serving: Serving) -> Lane | None:
+        """The lane that was offered, where it is of this model and of what the stream sees now."""
+        offered = self._offered
+        if offered is None or offered.lane.estimator is not serving.estimator or offered.ring is not self._ring:
+            return None
+        self._offered = None
+        return offered.lane
 
 
 def _at_rest(serving: Serving, about: About) -> Lane:

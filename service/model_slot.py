@@ -29,6 +29,7 @@ class Rules(NamedTuple):
     probation_s: float = 10.0
     shadow: Limits = Limits()
     probation: Limits = Limits(divergence=3.0)  # it acts by itself: only on what can not be meant
+    prime_s: float = 15.0  # longest that a new model waits for windows that its bundle wants beyond those that are kept
     warm_up_share: float = 1.0  # 99th percentile of the time for a window, in the window's duration
 
 
@@ -150,9 +151,7 @@ class ModelSlot:
                     candidate = self._tried(found, canary, shadow_s, tell)
                 before = self._switch(candidate, canary, tell)
             except BaseException:
-                with self._turn:
-                    if self._plan.phase == "shadow":
-                        self._set(Plan(self._plan.active), self.last_change)
+                self._end_trial()
                 raise
             self._watch(candidate, on_progress)
             return before.estimator.bundle, candidate
@@ -187,7 +186,11 @@ class ModelSlot:
                 estimator = self._fit(self.previous, tell)
                 self._epoch += 1
                 serving = Serving(estimator, self._epoch)
-                self._prime(serving, frozenset(), tell)
+                try:
+                    self._prime(serving, frozenset(), tell)
+                except BaseException:
+                    self._end_trial()
+                    raise
                 self._set(Plan(serving), f"{taken.name} was rolled back")
                 self.previous = None
                 tell("rolled_back", f"to {serving.estimator.bundle.name}; primed, not kept fed")
@@ -280,18 +283,37 @@ class ModelSlot:
         tell("warmed", f"p99 {p99_ms:.1f} ms of a window of {estimator.config.window.duration_us / 1e3:g} ms")
         return estimator
 
+    def _end_trial(self) -> None:
+        """Leave nothing running beside of a change that is refused; a canary goes on as it was."""
+        with self._turn:
+            plan = self._plan
+            if plan.phase in ("priming", "shadow"):
+                self._set(Plan(plan.active), self.last_change)
+            elif plan.promoting:
+                self._set(plan._replace(promoting=False), self.last_change)
+
     def _accept_trial(self) -> None:
         with self._turn:
             if self._plan.phase == "probation":
                 self._set(Plan(self._plan.active), self.last_change)
 
     def _prime(self, candidate: Serving, canary: frozenset[str], tell: Callable[[Step, str], None]) -> None:
-        streams = self._streams(canary)
-        tell("priming", f"{len(streams)} streams")
+        tell("priming", f"{len(self._streams(canary))} streams")
         plan = self._plan
-        primed, left = swap.prime(candidate, streams)
-        if plan.active.estimator.cuts_like(candidate.estimator) or plan.phase != "steady":
+        promoted = plan.phase == "canary"
+        if plan.active.estimator.cuts_like(candidate.estimator):
+            with self._turn:
+                beside = Plan(plan.active, candidate, canary, "priming")
+                self._set(plan._replace(promoting=True) if promoted else beside, self.last_change)
+            served = plan.only if promoted else frozenset[str]()
+
+            def streams() -> list[Subject]:
+                return [one for one in self._streams(canary) if one.name not in served]
+
+            primed, left = swap.prime(candidate, streams, self._rules.prime_s, self._closing.wait)
             tell("priming", f"{primed} streams replayed their newest windows, {left} had none")
+            return
+        if promoted:
             return
         tell("priming", "it cuts or sees otherwise than the active model: nothing to replay, it starts cold beside it")
         self._set(Plan(plan.active, candidate, canary, "shadow"), self.last_change)
@@ -305,7 +327,7 @@ class ModelSlot:
     ) -> None:
         tell("shadow", f"for {seconds:g} s beside {self.active.estimator.bundle.name}")
         self._set(Plan(self._plan.active, candidate, canary, "shadow"), self.last_change)
-        limits, wait = self._rules.shadow, self._closing.wait
+        limits, wait = self._rules.shadow.and_of(candidate.estimator.bundle), self._closing.wait
         found = swap.shadow(candidate, lambda: self._streams(canary), seconds, limits, wait)
         tell("shadow", "; ".join(f"{name}: {one}" for name, one in found.items()))
 
@@ -332,6 +354,7 @@ class ModelSlot:
     def _probation(self, candidate: Serving, on_progress: OnProgress) -> None:
         """Until a trial has ended: look at streams, take the model back where it broke a limit."""
         phase, deadline = self._plan.phase, time.monotonic() + self._rules.probation_s
+        limits = self._rules.probation.and_of(candidate.estimator.bundle)
         while True:
             with self._turn:
                 plan = self._plan
@@ -341,7 +364,7 @@ class ModelSlot:
                     self._set(Plan(candidate), f"{candidate.estimator.bundle.name} is active, its probation ended well")
                     break
             found = swap.measured(candidate, self._streams(plan.only), front_is_tried=True)
-            wrong = swap.worst(found, self._rules.probation, swap.JUDGED_WINDOWS)
+            wrong = swap.worst(found, limits, swap.JUDGED_WINDOWS)
             if wrong is not None:
                 self.fault(candidate, f"stream {wrong[0]}: {wrong[1]}")
                 continue

@@ -37,6 +37,8 @@ SPARE_BYTES = 16 << 20
 Admit = Callable[[ModelInfo, Signed], None]
 """Raises NeuroVEError where a node must not have a model that is sound."""
 
+_Stamp = tuple[int, int] | None
+
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
@@ -67,7 +69,8 @@ class ModelStore:
         self._patience_s = patience_s
         self._fetching: dict[str, int] = {}  # digest -> size that it may grow to
         self._changed = threading.Condition()
-        self._digests: dict[tuple[Path, int, int], str] = {}  # file, size, time of change -> sha256
+        self._digests: dict[Path, tuple[_Stamp, str]] = {}  # sha256 of files
+        self._verdicts: dict[Path, tuple[tuple[_Stamp, _Stamp], Signed | NeuroVEError]] = {}  # on them
 
     def files(self) -> dict[str, Path]:
         """Digest and file of every pushed model."""
@@ -89,9 +92,24 @@ class ModelStore:
         """
         for path in self._files():
             if self._digest_of(path) == digest:
-                signature = path.with_name(path.name + SIGNATURE)
-                return self._verify(path.read_bytes(), signature.read_bytes() if signature.exists() else None)
+                return self._signed(path)
         return Signed("unsigned")
+
+    def _signed(self, path: Path) -> Signed:
+        """What the signature beside a file says; found out once, until one of both changes."""
+        signature = path.with_name(path.name + SIGNATURE)
+        key = (_stamp(path), _stamp(signature))
+        known = self._verdicts.get(path)
+        if known is None or known[0] != key:
+            verdict: Signed | NeuroVEError
+            try:
+                verdict = self._verify(path.read_bytes(), signature.read_bytes() if signature.exists() else None)
+            except NeuroVEError as error:
+                verdict = error.with_traceback(None)
+            known = self._verdicts[path] = key, verdict
+        if isinstance(known[1], NeuroVEError):
+            raise known[1]
+        return known[1]
 
     def fetch(
         self, wanted: PushRequest, pull: Pull, stop: threading.Event, on_progress: OnProgress, admit: Admit = _anything
@@ -227,20 +245,29 @@ class ModelStore:
         return [*(folder / FILE for folder in self._entries("pushed")), *own]
 
     def _digest_of(self, path: Path) -> str | None:
-        try:
-            about = path.stat()
-            if about.st_size > bundle.MAX_BYTES:
-                return None
-            key = (path, about.st_size, about.st_mtime_ns)
-            if key not in self._digests:
-                self._digests[key] = hashlib.sha256(path.read_bytes()).hexdigest()
-            return self._digests[key]
-        except OSError:
+        stamp = _stamp(path)
+        if stamp is None or stamp[0] > bundle.MAX_BYTES:
             return None
+        known = self._digests.get(path)
+        if known is None or known[0] != stamp:
+            try:
+                known = self._digests[path] = stamp, hashlib.sha256(path.read_bytes()).hexdigest()
+            except OSError:
+                return None
+        return known[1]
 
 
 def _about(model: Bundle, signed: Signed) -> str:
     return f"{model.name}, release {model.info.release}, {signed.state}"
+
+
+def _stamp(path: Path) -> _Stamp:
+    """Size and time of change of a file [bytes, ns]; None where there is none."""
+    try:
+        about = path.stat()
+    except OSError:
+        return None
+    return about.st_size, about.st_mtime_ns
 
 
 def _size(path: Path) -> int:

@@ -1,5 +1,6 @@
 """Pulling a bundle in chunks: the node asks, so it goes at the node's pace and on from where it was cut."""
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -18,9 +19,31 @@ PATIENCE_S = 15.0
 
 _RETRY_S = 0.25
 _TELL_S = 0.5
-_LEAST_BYTES = 64 << 10
-_LONG_S = 0.05
-"""A chunk that takes longer is halved the next time: what it keeps waiting on the link is other streams' events."""
+LEAST_BYTES = 4 << 10
+LONG_S = 0.001
+QUICK_ONES = 8
+
+
+class ChunkLength:
+    """How long the next chunk is to be: others' events wait on the link while it passes.
+
+    It is halved where one took longer than the quickest did by over LONG_S, or by half where the link takes its time
+    for anything, and doubled after QUICK_ONES in a row that took about as long as the quickest.
+    """
+
+    def __init__(self) -> None:
+        self.bytes = LEAST_BYTES
+        self._quickest_s, self._quick = math.inf, 0
+
+    def took(self, seconds: float) -> None:
+        """Learn how long the last one took [s]."""
+        self._quickest_s = min(self._quickest_s, seconds)
+        more_s, long_s = seconds - self._quickest_s, max(LONG_S, self._quickest_s / 2)
+        self._quick = self._quick + 1 if more_s < long_s / 2 else 0
+        if more_s > long_s:
+            self.bytes = max(self.bytes // 2, LEAST_BYTES)
+        elif self._quick >= QUICK_ONES:
+            self.bytes, self._quick = min(self.bytes * 2, MAX_CHUNK_BYTES), 0
 
 
 def pull_into(
@@ -63,12 +86,12 @@ def _pull_rest(
     on_progress: OnProgress,
     patience_s: float,
 ) -> None:
-    have, length = file.seek(0, 2), _LEAST_BYTES
+    have, length = file.seek(0, 2), ChunkLength()
     heard = told = time.monotonic()
     on_progress(Progress("fetching", _so_far(have, wanted.size)))
     while have < wanted.size:
         began = time.monotonic()
-        request = ChunkRequest(offset=have, length=min(length, wanted.size - have))
+        request = ChunkRequest(offset=have, length=min(length.bytes, wanted.size - have))
         chunk, why = _chunk(wanted.digest, request, pull)
         now = time.monotonic()
         if chunk is None:
@@ -78,7 +101,7 @@ def _pull_rest(
         file.write(chunk)
         file.flush()  # to where a killed process leaves it
         have += len(chunk)
-        length = max(length // 2, _LEAST_BYTES) if now - began > _LONG_S else min(length * 2, MAX_CHUNK_BYTES)
+        length.took(now - began)
         heard = now
         if now - told > _TELL_S:
             told = now

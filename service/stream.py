@@ -100,6 +100,7 @@ class Stream:
         self.latencies_ms: deque[float] = deque(maxlen=_LATENCIES)
         self.last_packet_ns = self.last_estimate_ns = self.flow_began_ns = now_ns()
         self.last_loss_ns: int | None = None
+        self._taken_ns = 0  # when the newest packet was taken out of the queue
         self._slot, self._now_ns = slot, now_ns
         self.lanes = Lanes(name, ring)
         self._sequence = _Sequence()
@@ -118,6 +119,7 @@ class Stream:
         self.counters.packets_received += 1
         self.counters.events_received += packet.events.n
         self._heard(arrival.received_ns)
+        self._taken_ns = arrival.queued_ns
         if not self._in_sequence(packet):
             return []
         self._look_at(packet)
@@ -126,6 +128,11 @@ class Stream:
         self._count("late_events", pushing.late_events)
         self._count("skipped_windows", pushing.skipped_windows)
         return [self._estimate(window, pushing.serving, arrival) for window in pushing.estimates]
+
+    @property
+    def flowing(self) -> bool:
+        """Whether packets are worked on, however late they may be."""
+        return self._now_ns() - self._taken_ns < IDLE_NS
 
     @property
     def owes(self) -> bool:

@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple, Protocol
 
 from protocol.errors import Diverged
 from service.comparison import LEAST_WINDOWS, Finding, Limits, Measured, finding
-from service.lane import Primed, Serving
+from service.lane import Primed, Serving, windows_to_prime
 from service.lanes import Lanes, Roles
 
 POLL_S = 0.05
@@ -17,9 +17,10 @@ JUDGED_WINDOWS = 16
 
 _MOST_PAUSE_S = 0.02
 _ROUNDS = 3
+_MOST_BEHIND = 1  # windows that are left to do at the switch
 _MOST_SETTLING_S = 30.0
 
-Phase = Literal["steady", "shadow", "canary", "probation"]
+Phase = Literal["steady", "priming", "shadow", "canary", "probation"]
 
 
 class Subject(Protocol):
@@ -28,14 +29,19 @@ class Subject(Protocol):
     name: str
     lanes: Lanes
 
+    @property
+    def flowing(self) -> bool:
+        """Whether packets come."""
+
 
 class Plan(NamedTuple):
     """Which models are at work; streams read it once per packet."""
 
     active: Serving
-    other: Serving | None = None  # shadow, canary: the candidate; probation: the proven one
+    other: Serving | None = None  # priming, shadow, canary: the candidate; probation: the proven one
     only: frozenset[str] = frozenset()  # streams that are concerned; empty: all
     phase: Phase = "steady"
+    promoting: bool = False  # a canary: all other streams prime its model
 
     def concerns(self, stream: str) -> bool:
         """Whether the other model is at work on this stream."""
@@ -43,8 +49,10 @@ class Plan(NamedTuple):
 
     def roles(self, stream: str) -> Roles:
         """What a stream answers with, and what runs beside."""
-        if self.other is None or not self.concerns(stream):
+        if self.other is None:
             return Roles(self.active)
+        if not self.concerns(stream):
+            return Roles(self.active, self.other if self.promoting else None)
         if self.phase == "canary":
             return Roles(self.other, self.active, probation=True)
         return Roles(self.active, self.other, probation=self.phase == "probation")
@@ -65,20 +73,60 @@ def gently(took_s: float) -> None:
     time.sleep(min(took_s, _MOST_PAUSE_S))
 
 
-def prime(serving: Serving, streams: Iterable[Subject]) -> tuple[int, int]:
+def prime(
+    serving: Serving, streams: Callable[[], list[Subject]], most_s: float, wait: Callable[[float], bool]
+) -> tuple[int, int]:
     """Bring a model to where it would be had it always served, for each stream that can be replayed.
+
+    On a stream with packets its own worker does it, in the time that these leave: the plan has the model run beside,
+    and this waits. A stream where none come is replayed here.
+
+    Args:
+        serving: the model; it runs beside all streams that it is for.
+        streams: those of them that are to be primed.
+        most_s: how long a model waits for windows that its bundle wants it to have seen beyond those that are kept.
+        wait: sleeps, and says whether to give up.
 
     Returns:
         how many streams are primed, and how many are not: they are at rest, or cut otherwise than the model.
+
+    Raises:
+        Diverged: the model failed on a window.
     """
+    began, deadline = time.monotonic(), time.monotonic() + most_s + _MOST_SETTLING_S
+    while time.monotonic() < deadline:
+        late = time.monotonic() - began > most_s
+        if all(_at_its_end(serving, stream, late=late) for stream in streams() if _worker_primes(serving, stream)):
+            break
+        if wait(POLL_S):
+            break
     done = left = 0
-    for stream in streams:
+    for stream in streams():
         lane: Primed | None = None
-        for _ in range(_ROUNDS):  # while it replayed, windows came: each round leaves fewer of them
-            lane = stream.lanes.prime(serving, gently, lane)
-        stream.lanes.offer(lane)
-        done, left = done + (lane is not None), left + (lane is None)
+        beside = _worker_primes(serving, stream)
+        if not beside:
+            for _ in range(_ROUNDS):  # while it replayed, windows came: each round leaves fewer of them
+                lane = stream.lanes.prime(serving, gently, lane)
+            stream.lanes.offer(lane)
+        primed = beside or lane is not None
+        done, left = done + primed, left + (not primed)
     return done, left
+
+
+def _worker_primes(serving: Serving, stream: Subject) -> bool:
+    front = stream.lanes.front
+    return stream.flowing and front is not None and front.estimator.cuts_like(serving.estimator)
+
+
+def _at_its_end(serving: Serving, stream: Subject, *, late: bool) -> bool:
+    """Whether a model beside has seen what it should, or all that there is, and the stream's newest window."""
+    front, beside = stream.lanes.front, stream.lanes.beside
+    if front is None or beside is None or beside.lane.estimator is not serving.estimator:
+        return front is not None and front.estimator is serving.estimator
+    if beside.fault:
+        raise Diverged(serving.estimator.bundle.name, f"fault on stream {stream.name}", beside.fault, "none")
+    wanted = min(windows_to_prime(serving.estimator), front.state.age)
+    return beside.lost or (beside.behind <= _MOST_BEHIND and (late or beside.lane.state.age + _MOST_BEHIND >= wanted))
 
 
 def settled(serving: Serving, streams: Iterable[Subject]) -> bool:

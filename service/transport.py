@@ -144,7 +144,13 @@ class Transport:
 
         self._answer(key, work)
 
-    def answer_streaming(self, key: str, handle: Callable[[bytes, Tell], bytes], at_once: int = 4) -> None:
+    def answer_streaming(
+        self,
+        key: str,
+        handle: Callable[[bytes, Tell], bytes],
+        at_once: int = 4,
+        after: Callable[[], None] = lambda: None,
+    ) -> None:
         """Answer queries whose work takes time: each on its own thread, with replies on the way to the last one.
 
         A caller that leaves does not stop the work.
@@ -153,6 +159,7 @@ class Transport:
             key: concrete key.
             handle: request payload and a way to tell progress, to the last reply's payload; raises as in `answer`.
             at_once: with so many under way further queries are refused as busy.
+            after: called when the last reply has gone, and nothing refers to what the work has made any more.
         """
         free = threading.BoundedSemaphore(at_once)
 
@@ -172,6 +179,7 @@ class Transport:
                     _reply(query, key, lambda request: handle(request, tell), CONTROL_SCHEMA)
                 finally:
                     free.release()
+            after()
 
         self._answer(key, work)
 

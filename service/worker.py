@@ -16,6 +16,8 @@ from service.stream import Arrival, Stream
 log = logs.get(__name__)
 
 _IDLE_BEAT_S = 0.5
+_NO_SPARE_S = 0.002
+_MOST_PAUSE_S = 0.02
 _SAMPLE_BYTES = 256
 
 
@@ -94,13 +96,22 @@ class StreamWorker:
         open_outlet: called first on the thread.
         inbox: its queue.
         limits: caps on packets.
+        spare: so many workers of the node at once may run a model beside the one that answers; without one, any.
     """
 
-    def __init__(self, stream: Stream, open_outlet: Callable[[], Outlet], inbox: Inbox, limits: Limits) -> None:
+    def __init__(
+        self,
+        stream: Stream,
+        open_outlet: Callable[[], Outlet],
+        inbox: Inbox,
+        limits: Limits,
+        spare: threading.Semaphore | None = None,
+    ) -> None:
         self.stream = stream
         self.beat_ns = time.monotonic_ns()
         self._inbox = inbox
         self._open_outlet, self._limits = open_outlet, limits
+        self._spare = spare or threading.Semaphore()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"stream {stream.name}", daemon=True)
         self._thread.start()
@@ -126,17 +137,29 @@ class StreamWorker:
         outlet = self._open_outlet()
         try:
             self._see_through(outlet.ask_camera)
+            pause_s = 0.0
             while not self._stopping.is_set():
                 self.beat_ns = time.monotonic_ns()
-                sample, dropped = self._inbox.take(0.0 if self.stream.owes else _IDLE_BEAT_S)
+                sample, dropped = self._inbox.take(pause_s if self.stream.owes else _IDLE_BEAT_S)
                 if dropped:
                     self.stream.overloaded(dropped)
                 if sample is not None:
                     self._work(sample, outlet)
-                else:  # a model beside the one that answers has what time is left
-                    self.stream.attend()
+                elif self.stream.owes:
+                    pause_s = self._attend()
         finally:
             outlet.close()
+
+    def _attend(self) -> float:
+        """Give a model beside the one that answers what time is left; how long to wait for a packet then [s]."""
+        if not self._spare.acquire(blocking=False):
+            return _NO_SPARE_S
+        began = time.monotonic()
+        try:
+            self.stream.attend()
+        finally:
+            self._spare.release()
+        return min(_MOST_PAUSE_S, time.monotonic() - began)  # half of the time is others'
 
     def _work(self, sample: Sample, outlet: Outlet) -> None:
         if sample.is_camera:

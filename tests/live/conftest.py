@@ -78,8 +78,8 @@ def neurove(*arguments, timeout_s=60.0):
     )
 
 
-def client(endpoint):
-    return open_transport("client", connect=(endpoint,), patience_s=20)
+def client(endpoint, patience_s=20):
+    return open_transport("client", connect=(endpoint,), patience_s=patience_s)
 
 
 def is_alive(transport, config):

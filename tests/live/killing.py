@@ -22,7 +22,7 @@ CONFIG = ModelConfig(
 )
 """Small to run, and some chunks to move."""
 
-CHUNK_S = 0.08
+CHUNK_S = 0.015
 """What each chunk is made to take, so that a kill can come in between."""
 
 

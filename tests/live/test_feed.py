@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from protocol import CameraInfo, Flag
+from protocol.control import HealthReply, HealthRequest
 from protocol.errors import NeuroVEError
 from protocol.events import decode_packet, encode_packet
 from service import ask
@@ -40,6 +41,27 @@ def driver(node):
     _, _, config = node
     with client(config.connect[0]) as transport:
         yield transport
+
+
+def test_a_node_that_says_it_is_ready_answers_the_very_next_packets():
+    endpoint = free_endpoint()
+    config, packets = ClientConfig(connect=(endpoint,)), [encode_packet(one) for one in make_packets(40, stream="next")]
+    with running("serve", "--listen", endpoint, "--node", "n1") as process, client(endpoint, START_S) as transport:
+        heard = Heard(transport, config)
+        publisher = transport.publisher(config.keys.events("next"), "application/msgpack")
+
+        def ready():
+            assert process.child.poll() is None
+            answers = transport.ask(config.keys.health("n1"), HealthRequest().encode(), 2.0)
+            return bool(answers) and HealthReply.decode(answers[0].payload).ready
+
+        wait_until(ready, START_S)
+        for packet in packets:
+            publisher.put(packet)
+        wait_until(lambda: len(heard.of("next")) == 3)
+        first = heard.of("next")[0]
+        assert (first.seq, first.start_us, "gap" in first.flags) == (0, 0, False)
+        assert ask.health(transport, config)[0].streams[0].lost.nonzero() == {}
 
 
 def test_packets_in_estimates_out_and_the_counts_are_exact(node, heard, driver):

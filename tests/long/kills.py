@@ -13,7 +13,7 @@ from pathlib import Path
 
 from tests.live.killing import Node
 
-SPAN_S = 4.0
+SPAN_S = 2.0
 """A push and its activation take about so long here, chunks slowed down."""
 
 

@@ -1,6 +1,6 @@
 import pytest
 
-from protocol.errors import NoMemory
+from protocol.errors import NoMemory, TooSlow
 from service import admission
 
 MEMINFO = "MemTotal:       16000000 kB\nMemFree:         1000000 kB\nMemAvailable:    4000000 kB\n"
@@ -46,3 +46,10 @@ def test_the_time_for_a_window_is_measured(slot):
     assert all(one >= 0 for one in times_ms)
     assert admission.check_speed(estimator, share=1e6) >= 0
     assert admission.weight_bytes(estimator.bundle) >= 4 * estimator.bundle.info.parameters
+
+
+def test_a_model_that_is_plainly_too_slow_is_not_timed_to_the_end(slot):
+    estimator = slot.active.estimator
+    assert len(admission.window_times_ms(estimator, 50, bound_ms=-1.0, most_above=4)) == 5
+    with pytest.raises(TooSlow, match="p99_ms="):
+        admission.check_speed(estimator, share=1e-9)

@@ -105,6 +105,13 @@ def test_reproduce_firing_refuses_a_negative_seed(run):
     assert (code, out, err) == (2, "", "neurove: reproduce firing: seed=-4: must be at least 0\n")
 
 
+def test_reproduce_repriming_wants_whole_numbers(run, capsys):
+    with pytest.raises(SystemExit) as ended:
+        run("reproduce", "repriming", "--primed", "8,many")
+    assert ended.value.code == 2
+    assert "'8,many': whole numbers joined by commas" in capsys.readouterr().err
+
+
 def test_reproduce_sine_prints_both_tables_and_keeps_what_is_done(run, tmp_path):
     pytest.importorskip("scipy")
     pytest.importorskip("matplotlib")

@@ -1,7 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from neurove_core import about
 from service.comparison import Answered, Comparison, Limits, finding
+from tests.bundles import make_bundle
 
 
 def trial(proven, tried, *, rates=(0.2, 0.2), ms=1.0, front_is_tried=False, windows=20, reach_us=0, late_us=0):
@@ -51,6 +55,25 @@ def test_a_model_that_falls_silent_or_fires_without_end_is_found():
 def test_a_slow_model_is_found_with_its_figure_and_bound():
     wrong = finding(trial(DRIVING, DRIVING, ms=30.0).measured(), Limits(latency_share=0.5))
     assert str(wrong) == "latency_ms 30, the bound is 25"
+
+
+@pytest.mark.parametrize("front_is_tried", [False, True])
+@pytest.mark.parametrize(
+    ("own", "words"),
+    [
+        (about.Limits(mean_dv_m_s=0.4), "mean_dv_m_s 0.5, the bound is 0.4"),
+        (about.Limits(mean_dw_rad_s=0.1), "mean_dw_rad_s 0.2, the bound is 0.1"),
+        (about.Limits(latency_ratio=0.9), "latency_ratio 1, the bound is 0.9"),
+    ],
+)
+def test_a_bundle_may_be_stricter_about_itself_than_the_node(own, words, front_is_tried):
+    measured = trial(DRIVING, (0.3, 0.4, 2, 0, 0.5, 0.2), front_is_tried=front_is_tried).measured()
+    assert finding(measured, Limits()) is None
+    strict = Limits().and_of(replace(make_bundle(), about=about.About(limits=own)))
+    assert str(finding(measured, strict)) == words
+    lax = about.Limits(mean_dv_m_s=0.6, mean_dw_rad_s=0.3, latency_ratio=1.1)
+    lax_too = Limits(divergence=0.1).and_of(replace(make_bundle(), about=about.About(limits=lax)))
+    assert finding(measured, lax_too).field == "divergence"  # what the node says holds all the same
 
 
 def test_too_few_windows_say_nothing():

@@ -4,6 +4,7 @@ import shutil
 import threading
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from neurove_core import bundle
@@ -14,6 +15,7 @@ from service import model_store
 from service.library import Library
 from service.model_slot import ModelSlot
 from service.model_store import ModelStore
+from service.pull import LEAST_BYTES, ChunkLength
 from service.signatures import Signed
 from tests.service.conftest import SMALL
 
@@ -220,22 +222,25 @@ def test_a_node_that_stops_does_not_wait_for_chunks(tmp_path, data):
         fetch(ModelStore(tmp_path, patience_s=600), wanted(data), source(data, until=0), stop=stopping)
 
 
-def test_chunks_that_take_long_become_small_and_quick_ones_large(tmp_path):
-    big = b"x" * (5 << 20)
-    asked = []
-    with pytest.raises(BadModel):
-        fetch(ModelStore(tmp_path), wanted(big), source(big, asked=asked))
-    assert asked[0].length == 64 << 10
-    assert max(one.length for one in asked) == 1 << 20
+def lengths_over(chunks, *, seconds_per_byte, seconds=0.0):
+    """Lengths of so many chunks over a link."""
+    length, found = ChunkLength(), []
+    for _ in range(chunks):
+        found.append(length.bytes)
+        length.took(seconds + seconds_per_byte * length.bytes)
+    return found
 
-    def slow(digest, request):
-        threading.Event().wait(0.06)
-        return source(big, asked=slowly)(digest, request)
 
-    slowly = []
-    with pytest.raises(BadModel):
-        fetch(ModelStore(tmp_path), wanted(big[: 1 << 20]), slow)
-    assert {one.length for one in slowly} == {64 << 10}
+def test_chunks_grow_as_far_as_they_hold_the_link_for_a_millisecond_or_two():
+    slow = lengths_over(500, seconds_per_byte=8 / 20e6)  # 20 Mbit/s
+    assert (slow[0], max(slow)) == (LEAST_BYTES, 2 * LEAST_BYTES)
+    assert np.mean(slow) < 1.2 * LEAST_BYTES
+    assert max(lengths_over(500, seconds_per_byte=8 / 1e9)) == 1 << 17
+    assert max(lengths_over(500, seconds_per_byte=0)) == 1 << 20
+
+
+def test_a_link_that_takes_its_time_for_any_chunk_gets_larger_ones():
+    assert max(lengths_over(500, seconds_per_byte=8 / 20e6, seconds=0.1)) == 1 << 17
 
 
 def test_a_model_that_rotted_on_the_disk_is_listed_with_its_reason_and_can_be_pushed_again(store, tmp_path, data):

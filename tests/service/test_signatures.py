@@ -78,6 +78,33 @@ def test_a_push_without_a_trusted_signature_leaves_nothing_on_the_node(folder, k
     assert not list((folder / "state").rglob("*.safetensors"))
 
 
+def test_a_signature_is_read_once_until_it_or_its_bundle_changes(folder, key_file):
+    read = []
+    check = verifier((key_file,))
+
+    def counted(data, signature):
+        read.append(len(data))
+        return check(data, signature)
+
+    store = ModelStore(folder / "state", folder, verify=counted)
+    digests = {
+        name: hashlib.sha256((folder / f"{name}.safetensors").read_bytes()).hexdigest() for name in ("one", "two")
+    }
+    for _ in range(3):
+        assert store.signed(digests["one"]).release == 3
+        with pytest.raises(Untrusted, match="only models that are signed"):
+            store.signed(digests["two"])
+    assert len(read) == 2
+    data = (folder / "one.safetensors").read_bytes()
+    (folder / "one.safetensors.sig").write_bytes(manifest.sign(data, OTHER, release=77))
+    with pytest.raises(Untrusted):
+        store.signed(digests["one"])
+    (folder / "one.safetensors.sig").unlink()
+    with pytest.raises(Untrusted, match="only models that are signed"):
+        store.signed(digests["one"])
+    assert len(read) == 4
+
+
 def test_a_key_that_can_not_be_read_stops_the_start(tmp_path):
     with pytest.raises(InvalidField, match=r"trusted_keys=.*none\.pub.*No such file"):
         verifier((tmp_path / "none.pub",))
