@@ -11,7 +11,7 @@ import torch
 from neurove_core.estimator import Estimator, StreamState, WindowEstimate
 from neurove_core.network import NetworkState
 from neurove_core.windows import Window
-from protocol import EventPacket
+from protocol.events import Packet
 from service.comparison import Answered
 from service.ring import Packed, Ring
 
@@ -155,7 +155,7 @@ class Beside:
 
     def __init__(self, lane: Lane, *, alike: bool) -> None:
         self.lane, self.alike = lane, alike
-        self._owed: deque[Packed | EventPacket] = deque()
+        self._owed: deque[Packed | Packet] = deque()
         self._owed_events = 0  # of packets, which are kept as they came
         self.lost = False  # it owed too much and stands still since
 
@@ -164,7 +164,7 @@ class Beside:
         """Whether there is something to catch up on."""
         return bool(self._owed)
 
-    def owe(self, packet: EventPacket, windows: list[Packed]) -> None:
+    def owe(self, packet: Packet, windows: list[Packed]) -> None:
         """Note what is to be done for it."""
         if self.lost:
             return
