@@ -1,8 +1,8 @@
 """A long replay at a high rate: `python -m tests.long.replay --rate 10e6 --seconds 60`; not part of `make test`.
 
-`neurove drive --loop` plays an EVT3 file to `neurove serve`, real processes with Zenoh on loopback. Prints the rate that
-was reached, what was lost, latencies, CPU time, and the resident size of the service in each quarter. Exit code 1 where
-events were lost, or where resident size grew by more than a twentieth after the first quarter.
+`neurove drive --loop` plays an EVT3 file to `neurove serve`, real processes with Zenoh on loopback. Prints the rate
+that was reached, what was lost, latencies, CPU time, and the resident size of the service in each quarter. Exit code 1
+where events were lost, or where resident size grew by more than a twentieth after the first quarter.
 """
 
 import argparse
@@ -12,6 +12,7 @@ import os
 import sys
 import tempfile
 import time
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
 
@@ -96,7 +97,7 @@ def run(rate_hz: float, seconds: float, sensor: Sensor) -> dict[str, Any]:
         "packets_received": status.packets_received,
         "lost": status.lost.nonzero(),
         "estimates": len(estimates),
-        "holes": sum(b.start_us != a.end_us for a, b in zip(estimates, estimates[1:], strict=False)),
+        "holes": sum(b.start_us != a.end_us for a, b in pairwise(estimates)),
         "latency_ms": {f"p{q}": round(float(np.percentile(latencies_ms, q)), 1) for q in (50, 99, 100)},
         "cpu_of_a_core": {"service": round(spent_s / took_s, 2), "driver": round((driven_s - start_s) / took_s, 2)},
         "resident_mib": [[round(float(q.min()), 1), round(float(q.max()), 1)] for q in quarters],
