@@ -17,8 +17,10 @@ from neurove_core.geometry import lookup_table
 from neurove_core.network import NetworkState, NeuroVE
 from neurove_core.networks import State
 from neurove_core.windows import Pushed, Window, WindowsState
+from neurove_core.wire import read_packet
 from protocol import CameraInfo, Events, Sensor
 from protocol.errors import BadModel
+from protocol.events import EventPacket, Limits, WireEvents, encode_packet
 
 
 class StreamState(NamedTuple):
@@ -62,7 +64,7 @@ class Answer(NamedTuple):
 class Push(NamedTuple):
     """A packet of one stream; see Estimator.push for its parts."""
 
-    events: Events
+    events: Events | WireEvents
     state: StreamState
     horizon_us: int
 
@@ -109,7 +111,7 @@ class Estimator:
         network = self.network.initial_state()
         return StreamState(sensor, camera, lut, WindowsState(), network, 0, low_activity_below=least)
 
-    def push(self, events: Events, state: StreamState, horizon_us: int) -> Answer:
+    def push(self, events: Events | WireEvents, state: StreamState, horizon_us: int) -> Answer:
         """Take a packet's events and answer every window that they complete.
 
         A model whose linear part is per metre of camera height is told in m/s by the height of the stream's camera;
@@ -135,7 +137,7 @@ class Estimator:
         self._answer(courses)
         return [Answer(course.estimates, course.state, *course.lost) for course in courses]
 
-    def cut(self, events: Events, state: StreamState, horizon_us: int) -> Pushed:
+    def cut(self, events: Events | WireEvents, state: StreamState, horizon_us: int) -> Pushed:
         """The first half of push: the windows that some events complete; the network has not seen them yet."""
         return windows.push(events, horizon_us, state.windows, state.lut, self.config.window, self.config.canonical)
 
@@ -192,10 +194,11 @@ class Estimator:
         rng = np.random.default_rng(0)
         x, y, p = (rng.integers(0, high, t.size) for high in (sensor.width, sensor.height, 2))
         events = Events.from_columns(t, x, y, p)
-        from_wire = Events(events.t, np.frombuffer(events.x.tobytes(), np.uint16), events.y, events.p)  # x read-only
+        packet = EventPacket("warm", 0, sensor, 0, events)
+        from_wire = read_packet(encode_packet(packet), Limits(max_side_px=max(sensor.width, sensor.height))).events
         state = self.initial_state(sensor)
-        for half in (events, from_wire):
-            answer = self.push(half, state._replace(windows=WindowsState()), 0)
+        for given in (events, from_wire):
+            answer = self.push(given, state._replace(windows=WindowsState()), 0)
             state = answer.state
             finite = all(np.isfinite(estimate.twists).all() for estimate in answer.estimates)
             if not (finite and state.network.finite()):  # a membrane of nan never fires: the answer would not show it

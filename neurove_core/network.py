@@ -128,7 +128,7 @@ class NeuroVE(nn.Module):
         """Every membrane and memory of `batch` streams at rest."""
         zeros = self.readout.weight.new_zeros
         membranes = tuple(
-            LIFState(zeros(batch, channels, rows, columns))
+            LIFState(zeros(batch, channels, rows, columns).contiguous(memory_format=torch.channels_last))
             for channels, (rows, columns) in zip(self.config.network.channels, self.map_sizes(), strict=True)
         )
         cells = tuple(cell.initial_state(batch) for cell in self._layers())

@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from neurove_core.config import CanonicalConfig, WindowConfig
 from neurove_core.kernels import count_events
+from neurove_core.wire import count_wire
 from protocol import Events
+from protocol.events import WireEvents
 
 
 class Window(NamedTuple):
@@ -44,7 +46,7 @@ class Pushed(NamedTuple):
 
 
 def push(
-    events: Events,
+    events: Events | WireEvents,
     horizon_us: int,
     state: WindowsState,
     lut: NDArray[np.int32],
@@ -54,7 +56,7 @@ def push(
     """Add events to a stream's open window and close every window that is complete.
 
     Args:
-        events: ordered by time, on the sensor of `lut`.
+        events: ordered by time, on the sensor of `lut`; columns, or as they lie in a packet, which is the same.
         horizon_us: sensor time that the driver has reached even if nothing happened, such as the packet's t0_us.
         state: of the stream; used up by this call.
         lut: (sensor.height, sensor.width) from geometry.lookup_table.
@@ -67,23 +69,23 @@ def push(
     duration = config.duration_us
     first_us, newest_us = horizon_us, horizon_us
     if events.n:
-        first_us, newest_us = min(first_us, int(events.t[0])), max(newest_us, int(events.t[-1]))
+        first_us, newest_us = min(first_us, events.first_us), max(newest_us, events.last_us)
     if state.start_us is None:
         start_us = first_us // duration * duration
     else:
         start_us, newest_us = state.start_us, max(newest_us, state.horizon_us)
-    late = int(np.searchsorted(events.t, start_us))
-    events = events.span(late, events.n)
+    late = events.before(start_us) if first_us < start_us else 0
+    events = events.span(late, events.n) if late else events
     windows: list[Window] = []
     skipped = 0
     open_window = _Open(start_us, state, config, canonical)
     while newest_us >= open_window.start_us + duration:
         end_us = open_window.start_us + duration
-        inside = int(np.searchsorted(events.t, end_us))
+        inside = events.before(end_us)
         open_window.add(events.span(0, inside), lut)
         events = events.span(inside, events.n)
         windows.append(open_window.close())
-        next_us = int(events.t[0]) // duration * duration if events.n else newest_us // duration * duration
+        next_us = (events.first_us if events.n else newest_us) // duration * duration
         hole = (next_us - end_us) // duration
         if hole > config.max_hole_windows:
             skipped += hole
@@ -101,10 +103,12 @@ class _Open:
         self._bin_us = config.bin_us
         self._shape = (2 * config.bins, canonical.height, canonical.width)
 
-    def add(self, events: Events, lut: NDArray[np.int32]) -> None:
-        if events.n:
-            self.outside += count_events(events, self.start_us, self._bin_us, lut, self._grid())
-            self.events += events.n
+    def add(self, events: Events | WireEvents, lut: NDArray[np.int32]) -> None:
+        if not events.n:
+            return
+        where = self.start_us, self._bin_us, lut, self._grid()
+        self.outside += count_wire(events, *where) if isinstance(events, WireEvents) else count_events(events, *where)
+        self.events += events.n
 
     def _grid(self) -> NDArray[np.uint8]:
         if self.counts is None:

@@ -1,4 +1,7 @@
-"""Events and the packet that carries them: EVENT_DTYPE, Sensor, Events, EventPacket, encode_packet, decode_packet."""
+"""Events and the packet that carries them: EVENT_DTYPE, Sensor, Events, EventPacket, encode_packet, decode_packet.
+
+`open_packet` leaves the events as they lie in the packet, for a reader that goes over them itself.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -56,6 +59,20 @@ class Events(NamedTuple):
         """How many events these are."""
         return int(self.t.size)
 
+    @property
+    def first_us(self) -> int:
+        """Time of the first one; there must be one [us]."""
+        return int(self.t[0])
+
+    @property
+    def last_us(self) -> int:
+        """Time of the last one; there must be one [us]."""
+        return int(self.t[-1])
+
+    def before(self, t_us: int) -> int:
+        """How many of these are earlier than that."""
+        return int(np.searchsorted(self.t, t_us))
+
     def span(self, first: int, stop: int) -> "Events":
         """Events number `first` up to but without `stop`, as views."""
         return Events(self.t[first:stop], self.x[first:stop], self.y[first:stop], self.p[first:stop])
@@ -88,6 +105,61 @@ class Events(NamedTuple):
         if len(parts) == 1:
             return parts[0]
         return cls(*(np.concatenate(columns) for columns in zip(*parts, strict=True))) if parts else cls.empty()
+
+
+class WireEvents(NamedTuple):
+    """Events as they lie in a packet: what `Events` of this length says, in 6 or 8 bytes each."""
+
+    t0_us: int  # sensor clock
+    blob: NDArray[np.uint8]  # a packet's, read-only; at any address
+    wide: bool  # soa8, else soa6
+    first: int  # of the blob's events these are number `first` up to but without `stop`
+    stop: int
+
+    @property
+    def n(self) -> int:
+        """How many events these are."""
+        return self.stop - self.first
+
+    @property
+    def first_us(self) -> int:
+        """Time of the first one; there must be one [us]."""
+        return self.t0_us + int(self._column(0)[0])
+
+    @property
+    def last_us(self) -> int:
+        """Time of the last one; there must be one [us]."""
+        return self.t0_us + int(self._column(0)[-1])
+
+    def before(self, t_us: int) -> int:
+        """How many of these are earlier than that."""
+        offset, after_us = self._column(0), t_us - self.t0_us
+        if after_us <= 0:
+            return 0
+        kind = offset.dtype.type  # another type would have the whole column converted
+        return self.n if after_us > np.iinfo(kind).max else int(np.searchsorted(offset, kind(after_us)))
+
+    def span(self, first: int, stop: int) -> "WireEvents":
+        """Events number `first` up to but without `stop`, as views."""
+        first, stop, _ = slice(first, stop).indices(self.n)
+        return self._replace(first=self.first + first, stop=self.first + max(first, stop))
+
+    def columns(self) -> Events:
+        """The same as columns; x stays a view, the others are computed."""
+        offset, x, y_and_p = (self._column(index) for index in range(3))
+        p = (y_and_p >> np.uint16(15)).astype(np.uint8)
+        return Events(offset.astype(np.int64) + self.t0_us, x, y_and_p & _Y_MASK, p)
+
+    def _column(self, index: int) -> NDArray[Any]:
+        """Offsets from t0_us [us], x, or y with the polarity in bit 15."""
+        bytes_each = 4 if self.wide else 2
+        events = self.blob.size // (bytes_each + 4)
+        if index == 0:
+            whole = self.blob[: bytes_each * events].view("<u4" if self.wide else "<u2")
+        else:
+            begin = (bytes_each + 2 * (index - 1)) * events
+            whole = self.blob[begin : begin + 2 * events].view("<u2")
+        return whole[self.first : self.stop]
 
 
 def check_events(events: Events, sensor: Sensor, not_before_us: int | None = None) -> None:
@@ -128,6 +200,16 @@ class EventPacket:
     events: Events
 
 
+class WirePacket(NamedTuple):
+    """An event packet whose events are as they came; otherwise what an EventPacket is."""
+
+    stream: str
+    seq: int
+    sensor: Sensor
+    t0_us: int
+    events: WireEvents
+
+
 @dataclass(frozen=True, slots=True)
 class Limits:
     """Caps on what a packet may claim; beyond them it is refused."""
@@ -142,6 +224,8 @@ class Limits:
 
 
 DEFAULT_LIMITS = Limits()
+
+Packet = EventPacket | WirePacket
 
 
 class _Header(Message):
@@ -205,6 +289,18 @@ def decode_packet(data: bytes, limits: Limits = DEFAULT_LIMITS) -> EventPacket:
         NeuroVEError: Malformed, UnsupportedVersion, InvalidField, UnknownFormat, BlobLength, EventOutsideSensor or
             TimeBackwards; never any other exception.
     """
+    packet = open_packet(data, limits)
+    events = packet.events.columns()
+    check_events(events, packet.sensor)
+    return EventPacket(packet.stream, packet.seq, packet.sensor, packet.t0_us, events)
+
+
+def open_packet(data: bytes, limits: Limits = DEFAULT_LIMITS) -> WirePacket:
+    """Read an event packet and check all but its events, which may lie outside the sensor or run backwards.
+
+    Raises:
+        NeuroVEError: as decode_packet, but for EventOutsideSensor and TimeBackwards.
+    """
     header = validate(_Header, unpack(data, _Header.what, limits.max_bytes))
     for name, value, bound in (
         ("n", header.n, limits.max_events),
@@ -215,18 +311,9 @@ def decode_packet(data: bytes, limits: Limits = DEFAULT_LIMITS) -> EventPacket:
             raise InvalidField(_Header.what, name, value, f"the configured cap is {bound}")
     if header.format not in FORMATS:
         raise UnknownFormat(header.format, FORMATS)
-    record_bytes = 6 if header.format == "soa6" else 8
+    wide = header.format == "soa8"
+    record_bytes = 8 if wide else 6
     if len(header.data) != header.n * record_bytes:
         raise BlobLength(len(header.data), header.n, record_bytes)
-    events = _columns(header.data, header.n, "<u2" if header.format == "soa6" else "<u4", header.t0_us)
-    sensor = Sensor(header.width, header.height)
-    check_events(events, sensor)
-    return EventPacket(header.stream, header.seq, sensor, header.t0_us, events)
-
-
-def _columns(blob: bytes, n: int, offset_type: str, t0_us: int) -> Events:
-    offset = np.frombuffer(blob, offset_type, n)
-    x = np.frombuffer(blob, "<u2", n, offset.nbytes)
-    y_and_p = np.frombuffer(blob, "<u2", n, offset.nbytes + x.nbytes)
-    p = (y_and_p >> np.uint16(15)).astype(np.uint8)
-    return Events(offset.astype(np.int64) + t0_us, x, y_and_p & _Y_MASK, p)
+    events = WireEvents(header.t0_us, np.frombuffer(header.data, np.uint8), wide, 0, header.n)
+    return WirePacket(header.stream, header.seq, Sensor(header.width, header.height), header.t0_us, events)

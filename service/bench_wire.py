@@ -21,7 +21,8 @@ from neurove_core.bench.ingest import DURATION_US, SENSOR, draw
 from neurove_core.config import ModelConfig
 from neurove_core.geometry import lookup_table
 from neurove_core.kernels import count_events_reference
-from protocol.events import SCHEMA, EventPacket, Events, decode_packet, encode_packet
+from neurove_core.wire import read_packet
+from protocol.events import SCHEMA, EventPacket, Events, encode_packet
 from service.transport import Transport, open_transport
 
 PACKET_US: Final = 1_000
@@ -62,7 +63,7 @@ def wire(rounds: int, *, quick: bool) -> list[Row]:
 
     def ours(payload: bytes) -> None:
         nonlocal state
-        packet = decode_packet(payload)
+        packet = read_packet(payload)
         pushed = windows.push(packet.events, packet.t0_us, state, lut, config.window, config.canonical)
         state = pushed.state
         closed.extend(pushed.windows)

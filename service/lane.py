@@ -11,7 +11,7 @@ import torch
 from neurove_core.estimator import Estimator, StreamState, WindowEstimate
 from neurove_core.network import NetworkState
 from neurove_core.windows import Window
-from protocol import EventPacket
+from protocol.events import Packet
 from service.comparison import Answered
 from service.ring import Packed, Ring
 
@@ -158,7 +158,7 @@ class Beside:
 
     def __init__(self, lane: Lane, *, alike: bool, replayed: Sequence[Packed] = ()) -> None:
         self.lane, self.alike = lane, alike
-        self._owed: deque[Packed | EventPacket] = deque(replayed)
+        self._owed: deque[Packed | Packet] = deque(replayed)
         self._most_windows = MOST_OWED_WINDOWS + len(replayed)
         self._owed_events = 0  # of packets, which are kept as they came
         self.fault = ""  # what it failed with; empty where it did not
@@ -174,7 +174,7 @@ class Beside:
         """How many windows, or packets, it is behind."""
         return len(self._owed)
 
-    def owe(self, packet: EventPacket, windows: list[Packed]) -> None:
+    def owe(self, packet: Packet, windows: list[Packed]) -> None:
         """Note what is to be done for it."""
         if self.lost:
             return

@@ -4,7 +4,8 @@ from typing import NamedTuple
 
 from neurove_core.estimator import WindowEstimate
 from neurove_core.windows import Pushed, WindowsState
-from protocol import CameraInfo, EventPacket, Sensor
+from protocol import CameraInfo, Sensor
+from protocol.events import Packet
 from service import logs
 from service.comparison import Comparison
 from service.lane import Answer, Beside, Lane, Pace, Primed, Serving, replay, windows_to_prime
@@ -109,7 +110,7 @@ class Lanes:
 
     # --- the stream's worker
 
-    def arrange(self, roles: Roles, about: About, packet: EventPacket) -> int:
+    def arrange(self, roles: Roles, about: About, packet: Packet) -> int:
         """Put the models to work that are to be from this packet on.
 
         Returns:
@@ -129,7 +130,7 @@ class Lanes:
         self._roles = roles
         return skipped
 
-    def push(self, packet: EventPacket) -> Pushing:
+    def push(self, packet: Packet) -> Pushing:
         """Answer every window that a packet completes; after Unfit, the same packet by the model that took over.
 
         Raises:
@@ -170,7 +171,7 @@ class Lanes:
         for answer in answers:
             comparison.beside(answer.compared, answer.took_ms)
 
-    def _note(self, answers: list[Answer], beside: Beside, packet: EventPacket, entries: list[Packed]) -> None:
+    def _note(self, answers: list[Answer], beside: Beside, packet: Packet, entries: list[Packed]) -> None:
         if self.comparison is not None:
             for answer in answers:
                 self.comparison.front(answer.compared, answer.took_ms)
@@ -185,7 +186,7 @@ class Lanes:
             self.comparison.fault = why
         log.warning("model beside given up", stream=self._stream, model=beside.lane.estimator.bundle.name, why=why)
 
-    def _hand_over(self, old: Lane, roles: Roles, packet: EventPacket) -> int:
+    def _hand_over(self, old: Lane, roles: Roles, packet: Packet) -> int:
         """Another model answers from here on: windows up to here are the old one's, all later ones the new one's."""
         new = self._lane(roles.answers, packet)
         self.front = new
@@ -198,7 +199,7 @@ class Lanes:
         self._cut = None
         return int(open_us is not None and new.next_us != open_us)
 
-    def _lane(self, serving: Serving, packet: EventPacket) -> Lane:
+    def _lane(self, serving: Serving, packet: Packet) -> Lane:
         """The lane of a model, as far along as the front: the one beside, one that was offered, or a new one."""
         beside, about = self.beside, self._about
         assert about is not None
@@ -215,7 +216,7 @@ class Lanes:
             return replay(offered, self._ring.after(offered.state.end_us))
         return replay(_at_rest(serving, about), self._ring.newest(windows_to_prime(serving.estimator)))
 
-    def _place_beside(self, old: Lane, roles: Roles, packet: EventPacket) -> None:
+    def _place_beside(self, old: Lane, roles: Roles, packet: Packet) -> None:
         wanted = roles.beside
         if wanted is None:
             self.beside = self.comparison = None
@@ -232,7 +233,7 @@ class Lanes:
             window_ms = tried.estimator.config.window.duration_us / 1e3
             self.comparison = Comparison(front_is_tried=roles.probation, window_ms=window_ms, reach_us=reach_us)
 
-    def _beside(self, old: Lane, wanted: Serving, packet: EventPacket) -> Beside:
+    def _beside(self, old: Lane, wanted: Serving, packet: Packet) -> Beside:
         """A lane that runs beside; what it has to replay it owes, for the feed does not wait for it."""
         assert self.front is not None
         assert self._about is not None
@@ -265,7 +266,7 @@ def _at_rest(serving: Serving, about: About) -> Lane:
     return Lane(serving, serving.estimator.initial_state(*about))
 
 
-def _from_here(serving: Serving, packet: EventPacket, about: About) -> Lane:
+def _from_here(serving: Serving, packet: Packet, about: About) -> Lane:
     """A lane at rest that cuts from this packet on: the window that is open now is not whole for it."""
     duration_us = serving.estimator.config.window.duration_us
     return Lane(serving, serving.estimator.initial_state(*about), -(-packet.t0_us // duration_us) * duration_us)

@@ -7,9 +7,10 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from neurove_core.estimator import WindowEstimate
-from protocol import CameraInfo, EventPacket, Flag, Sensor, Trace, Twist, TwistEstimate
+from protocol import CameraInfo, Flag, Sensor, Trace, Twist, TwistEstimate
 from protocol.control import Losses
 from protocol.errors import InvalidField
+from protocol.events import Packet
 from service import logs
 from service.lane import Serving
 from service.lanes import Lanes, Pushing, RingSize, Unfit
@@ -108,7 +109,7 @@ class Stream:
         self._pending: set[Flag] = set()
         slot.join(self)
 
-    def accept(self, packet: EventPacket, arrival: Arrival) -> list[TwistEstimate]:
+    def accept(self, packet: Packet, arrival: Arrival) -> list[TwistEstimate]:
         """Take one packet; answer every window that it completes.
 
         Raises:
@@ -186,7 +187,7 @@ class Stream:
             setattr(self.counters, name, getattr(self.counters, name) + number)
             self.last_loss_ns = self._now_ns()
 
-    def _in_sequence(self, packet: EventPacket) -> bool:
+    def _in_sequence(self, packet: Packet) -> bool:
         """Whether the packet is the next one, after counting what is missing before it."""
         sequence = self._sequence
         if sequence.expected is None:
@@ -210,10 +211,10 @@ class Stream:
         sequence.rewind.clear()
         return True
 
-    def _begin(self, packet: EventPacket) -> None:
+    def _begin(self, packet: Packet) -> None:
         self._sequence = _Sequence(packet.seq + 1, packet.t0_us)
 
-    def _driver_restarted(self, packet: EventPacket) -> bool:
+    def _driver_restarted(self, packet: Packet) -> bool:
         sequence = self._sequence
         if packet.seq == 0 and packet.t0_us != sequence.first_t0_us:
             return True
@@ -241,7 +242,7 @@ class Stream:
         self._holes.clear()
         self.counters.resets += 1
 
-    def _look_at(self, packet: EventPacket) -> None:
+    def _look_at(self, packet: Packet) -> None:
         """Begin anew where the packet is of another sensor or another clock than those before."""
         if self.sensor != packet.sensor:
             if self.sensor is not None:
@@ -254,7 +255,7 @@ class Stream:
             log.warning("sensor clock went back", stream=self.name, by_us=horizon_us - packet.t0_us)
             self._restart()
 
-    def _push(self, packet: EventPacket) -> Pushing:
+    def _push(self, packet: Packet) -> Pushing:
         self._arrange(packet)
         try:
             return self.lanes.push(packet)
@@ -264,7 +265,7 @@ class Stream:
             self._arrange(packet)
             return self.lanes.push(packet)
 
-    def _arrange(self, packet: EventPacket) -> None:
+    def _arrange(self, packet: Packet) -> None:
         about = packet.sensor, self._camera_of(packet.sensor)
         self._count("skipped_windows", self.lanes.arrange(self._slot.roles(self.name), about, packet))
 

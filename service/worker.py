@@ -6,9 +6,10 @@ from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
+from neurove_core.wire import read_packet
 from protocol import CameraInfo
 from protocol.errors import NeuroVEError
-from protocol.events import Limits, decode_packet
+from protocol.events import Limits
 from protocol.velocity import TwistEstimate
 from service import logs
 from service.stream import Arrival, Stream
@@ -167,7 +168,7 @@ class StreamWorker:
             return
         try:
             arrival = Arrival(sample.received_ns, time.monotonic_ns())
-            packet = decode_packet(sample.payload, self._limits)
+            packet = read_packet(sample.payload, self._limits)
             for estimate in self.stream.accept(packet, arrival):
                 self._publish(estimate, outlet)
         except NeuroVEError as error:

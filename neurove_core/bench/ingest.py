@@ -77,7 +77,9 @@ def end_to_end(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: 
         estimator = Estimator(bundle.untrained(0, config))
         network = cast("NeuroVE", estimator.network)
         others = peers.networks(network, missing) if with_peers else {}
+        narrow = Estimator(bundle.untrained(0, window.with_precision(config, "int8")))
         runs: dict[str, Callable[[], Any]] = {"ours": _estimated(estimator, events)}
+        runs["ours, int8"] = _estimated(narrow, events)
         for peer, theirs in {"PyTorch, plain": network, **others}.items():
             runs[f"numpy and {peer}"] = _in_steps(_numpy_counts(config, events), theirs)
         if tonic is not None and "snnTorch" in others:
@@ -88,9 +90,12 @@ def end_to_end(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: 
             if any(name in peer for name in peers.ELSEWISE)
             else bool(np.allclose(run(), expected, rtol=1e-3, atol=1e-4))
             for peer, run in runs.items()
-            if peer != "ours"
+            if not peer.startswith("ours")
         }
-        found += rows(f"events to estimate, {events.n:.0e} events, {name}", interleaved(runs, rounds), equal)
+        times, title = interleaved(runs, rounds), f"events to estimate, {events.n:.0e} events, {name}"
+        found += rows(title, times, equal)
+        in_int8 = {**times, "ours": times.pop("ours, int8"), "ours, float32": times["ours"]}
+        found += rows(f"{title}, int8", in_int8, dict.fromkeys([*equal, "ours, float32"]))
     return found
 
 

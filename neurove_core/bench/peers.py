@@ -169,6 +169,9 @@ def _sinabs(missing: Missing) -> Neurons | None:
             spikes: Tensor = layer(currents.transpose(0, 1))  # (B, T, ...), as it wants them
             return spikes.transpose(0, 1)
 
-        return fire, layer.reset_states
+        return (
+            fire,
+            lambda: layer.reset_states(),
+        )  # a bound method would be copied with the network, and its layer with it
 
     return neurons

@@ -176,7 +176,10 @@ def _network(config: TrainingConfig, ranks: Ranks) -> tuple[Network, torch.optim
     if ranks.count > 1:
         share_norms(network, ranks)
     network = network.to(ranks.device).train()
-    return network, torch.optim.Adam(network.parameters(), lr=config.recipe.learning_rate)
+    fused = (
+        torch.device(ranks.device).type == "cpu"
+    )  # one pass over the weights: a quarter of the time; steps count there
+    return network, torch.optim.Adam(network.parameters(), lr=config.recipe.learning_rate, fused=fused)
 
 
 def _restore_optimiser(optimiser: torch.optim.Adam, parameters: list[Any], tensors: dict[str, Tensor]) -> None:

@@ -187,7 +187,7 @@ def test_a_state_is_finite_only_if_every_number_of_it_is(value):
     for number in range(len(tensors_of(network.initial_state(2)))):
         state = network.initial_state(2)
         broken = [tensor.clone() for tensor in tensors_of(state)]
-        broken[number].view(-1)[-1] = value
+        broken[number][(-1,) * broken[number].dim()] = value
         membranes = tuple(type(m)(broken[i]) for i, m in enumerate(state.membranes))
         cells = tuple(type(c)(*broken[2 + 3 * i : 5 + 3 * i]) for i, c in enumerate(state.cells))
         assert not NetworkState(membranes, cells, broken[-1]).finite()
