@@ -76,6 +76,12 @@ class Recorded:
         return [TwistEstimate.decode(payload) for payload in self._payloads[stream]]
 
 
+def resident_kib(pid: int) -> int:
+    """Resident size of a process."""
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS:"))
+
+
 class Resident:
     """Looks at a process's resident size, also between the changes."""
 
@@ -87,8 +93,7 @@ class Resident:
         self._thread.start()
 
     def kib(self) -> int:
-        lines = Path(f"/proc/{self._pid}/status").read_text().splitlines()
-        return next(int(line.split()[1]) for line in lines if line.startswith("VmRSS:"))
+        return resident_kib(self._pid)
 
     def _run(self) -> None:
         while not self._stop.wait(self._period_s):
