@@ -67,11 +67,12 @@ def draw_errors(told: dict[str, Any]) -> "Figure":
             at = [place + number * wide for place, values in enumerate(found) if values]
             means = [statistics.mean(values) for values in found if values]
             spreads = [statistics.stdev(values) if len(values) > 1 else 0.0 for values in found if values]
-            panel.bar(at, means, wide, yerr=spreads, label=method, capsize=2)
+            panel.bar(at, means, wide, yerr=spreads, label=method, color=f"C{number}", capsize=2)
         panel.set_ylabel(label)
+        panel.set_yscale("log")
         panel.grid(visible=True, axis="y", alpha=0.3)
     panels[1].set_xticks([place + 0.4 - wide / 2 for place in range(len(groups))], groups)
-    panels[0].legend(fontsize=8, ncols=len(methods))
+    panels[1].legend(fontsize=8, ncols=len(methods), loc="upper center", bbox_to_anchor=(0.5, -0.12))
     return figure
 
 
