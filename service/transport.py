@@ -27,6 +27,7 @@ _SETTINGS = {
     "transport/shared_memory/enabled": False,  # leaks 17 MiB per publisher restart in this version
     "transport/link/rx/max_message_size": 32 << 20,
     "transport/link/tx/queue/size/data": 16,  # batches of 64 KiB: a burst of packets fits
+    "transport/link/tx/queue/size/data_high": 16,  # 2 by default, and an estimate, being express, fills one alone
     "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 20_000,  # us: ride out a stall of the receiver
 }
 _RETRY_S = 0.5

@@ -129,3 +129,9 @@ class Source:
 
     def put(self, payload):
         self._publisher.put(payload)
+
+    def play(self, payloads, pause_s=0.002):
+        """Publish one after the other, as a camera does: what bursts may be dropped on the way, by contract."""
+        for payload in payloads:
+            self.put(payload)
+            threading.Event().wait(pause_s)

@@ -68,15 +68,14 @@ def test_packets_in_estimates_out_and_the_counts_are_exact(node, heard, driver):
     _, transport, config = node
     packets = make_packets(500, stream="exact")
     source = Source(driver, config, "exact")
-    for packet in packets:
-        source.put(encode_packet(packet))
+    source.play(encode_packet(packet) for packet in packets)
     windows = 499 * 4000 // WINDOW_US
 
     def status():
         return next(one for one in ask.health(transport, config)[0].streams if one.stream == "exact")
 
+    wait_until(lambda: status().packets_received >= 500)
     wait_until(lambda: len(heard.of("exact")) >= windows)
-    wait_until(lambda: status().packets_received >= 500)  # the last ones complete no window
     status = status()
     assert (status.packets_received, status.events_received) == (500, 500 * 100)
     assert (status.windows, status.estimates, status.lost.nonzero()) == (windows, windows, {})
@@ -104,10 +103,10 @@ def test_ten_thousand_fuzzed_packets_leave_another_stream_undisturbed(node, hear
     good = [encode_packet(packet) for packet in make_packets(1000, stream="good", n=20)]
     fuzzed = list(fuzz([encode_packet(packet) for packet in make_packets(50, stream="bad", n=20)], 10_000))
     to_good, to_bad = Source(driver, config, "good"), Source(driver, config, "bad")
-    for number, payload in enumerate(fuzzed):
-        to_bad.put(payload)
-        if number % 10 == 0:
-            to_good.put(good[number // 10])
+    for number, packet in enumerate(good):
+        for payload in fuzzed[10 * number : 10 * number + 10]:
+            to_bad.put(payload)
+        to_good.play([packet])
     windows = 999 * 4000 // WINDOW_US
     wait_until(lambda: len(heard.of("good")) >= windows, timeout_s=60)
     assert [one.start_us for one in heard.of("good")] == [i * WINDOW_US for i in range(windows)]
