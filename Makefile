@@ -1,8 +1,10 @@
 # Two commands do all the set-up: `make run` (the main job) and `make test` (everything that must hold).
 # PYTHON: 3.11 or newer. TORCH_ARGS: extra pip arguments for torch, such as the index of PyTorch's CPU builds.
+# JOBS: processes that test side by side.
 PYTHON ?= python3
 VENV ?= .venv
 TORCH_ARGS ?=
+JOBS ?= 2
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
@@ -16,7 +18,7 @@ test: $(VENV)/installed-dev
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/python tests/wheel.py
-	$(BIN)/pytest --cov --cov-report=term
+	$(BIN)/pytest --numprocesses $(JOBS) --dist loadgroup --no-loadscope-reorder --cov --cov-report=term
 
 format: $(VENV)/installed-dev
 	$(BIN)/ruff format .

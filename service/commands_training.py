@@ -20,12 +20,13 @@ def train(args: argparse.Namespace) -> int:
     """Train a model on simulated sequences and recordings, from a configuration and its seed."""
     import torch
 
-    from neurove_core import bundle
+    from neurove_core import bundle, models
     from neurove_core.training import config as configs
     from neurove_core.training import data, loop, ranks, recorded
 
     torch.set_num_threads(args.threads)
     config = configs.load(args.config)
+    start = models.find(args.start) if args.start else None
     ranks.device_of(args.device, devices=args.devices)  # told before anything is simulated
     out: Path = args.out or Path("runs") / config.name
     folder: Path = args.data or out / "data"
@@ -43,7 +44,7 @@ def train(args: argparse.Namespace) -> int:
             errors = f"{at.linear_m_s:.3f} m/s {at.angular_rad_s:.4f} rad/s"
             show("learned", at.step, at.steps, errors)
 
-        how: dict[str, Any] = {"resume": args.resume, "devices": args.devices, "device": args.device}
+        how: dict[str, Any] = {"resume": args.resume, "devices": args.devices, "device": args.device, "start": start}
         path = loop.train(config, out, folder, **how, on_progress=learned)
     if args.calibration and config.model.kind == "neurove":  # a baseline has no spread to fit
         _calibrate(bundle.load(path), config, folder, args.calibration, args.workers, path)
@@ -175,6 +176,7 @@ def add(commands: Any) -> None:
     )
     parser.add_argument("--data", type=Path, metavar="DIR", help="sequences are kept there; default OUT/data")
     parser.add_argument("--resume", action="store_true", help="go on from the checkpoint in OUT, if there is one")
+    parser.add_argument("--start", metavar="BUNDLE", help="begin from this model, a file or `default`, not from chance")
     parser.add_argument("--devices", type=int, default=1, metavar="N", help="share each batch over so many; default 1")
     parser.add_argument("--device", default="auto", metavar="KIND", help="auto, cpu or cuda; default auto: GPUs if any")
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes that simulate; default 1")

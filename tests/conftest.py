@@ -13,6 +13,19 @@ from hypothesis import settings
 from service import cli
 
 torch.set_num_threads(1)
+
+
+def pytest_collection_modifyitems(items):
+    """For `--dist loadgroup`: a file stays together, for its fixtures; live tests stay in one process, one by one.
+
+    They come first, because they take longest and mostly wait.
+    """
+    for item in items:
+        group = "live" if item.get_closest_marker("live") else str(item.path)
+        item.add_marker(pytest.mark.xdist_group(group))
+    items.sort(key=lambda item: item.get_closest_marker("live") is None)
+
+
 settings.register_profile("dev", max_examples=25, deadline=None)
 settings.register_profile("ci", max_examples=50, deadline=None, derandomize=True, database=None)
 settings.load_profile("ci" if os.environ.get("CI") else "dev")

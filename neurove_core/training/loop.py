@@ -16,6 +16,7 @@ from torch import Tensor
 
 from neurove_core import bundle, golden
 from neurove_core.about import About, MadeBy
+from neurove_core.bundle import Bundle
 from neurove_core.carried import detached
 from neurove_core.encoding import to_spikes
 from neurove_core.estimator import Estimator
@@ -78,6 +79,7 @@ def train(
     *,
     more: Sequence[Path] = (),
     resume: bool = False,
+    start: Bundle | None = None,
     devices: int = 1,
     device: str = "cpu",
     on_progress: Callable[[Progress], None] = lambda _: None,
@@ -90,6 +92,7 @@ def train(
         data: folder of the sequences, filled by `Cache.fill` and `Recorded.fill`.
         more: files of further sequences, as `data.save` writes them.
         resume: go on from the checkpoint in `out`, where there is one.
+        start: a model to begin from; a checkpoint that is gone on from knows its own.
         devices: processes that share each batch, each with its own device.
         device: `cpu`, `cuda` or `auto`; see `ranks.device_of`.
         on_progress: told after each segment.
@@ -98,15 +101,17 @@ def train(
         the bundle's path.
 
     Raises:
-        BrokenRecording: a sequence is missing or broken. BadModel: the checkpoint can not be gone on from.
+        BrokenRecording: a sequence is missing or broken. BadModel: the checkpoint can not be gone on from, or the
+            start is of another network.
         InvalidField: the batch does not split over the devices, or there are not so many. LostRank: one of them ended.
     """
     out.mkdir(parents=True, exist_ok=True)
     resume = resume and (out / CHECKPOINT).exists()
     sequences = Sequences([*Cache(data, config).paths(), *Recorded(data, config).paths(), *more])
-    begin(config, out, sequences, resume=resume, ranks=Ranks(count=devices))  # so that what is wrong is told by one
-    with together(devices, device, follow, (config, out, sequences.paths, resume)) as ranks:
-        run = begin(config, out, sequences, resume=resume, ranks=ranks)
+    how = _Beginning(resume, start)
+    begin(config, out, sequences, how, Ranks(count=devices))  # so that what is wrong is told by one
+    with together(devices, device, follow, (config, out, sequences.paths, how)) as ranks:
+        run = begin(config, out, sequences, how, ranks)
         with Scalars(out, run.step) as scalars:
             descend(run, sequences, out, on_progress, scalars.add)
     draw_curve(run.curve, out, f"{config.name}: {run.step} updates")
@@ -117,15 +122,24 @@ def train(
     return path
 
 
-def begin(config: TrainingConfig, out: Path, sequences: Sequences, *, resume: bool, ranks: Ranks) -> Run:
+class _Beginning(NamedTuple):
+    """Where a run's first weights come from: a checkpoint, a model, or the recipe's seed."""
+
+    resume: bool
+    start: Bundle | None
+
+
+def begin(config: TrainingConfig, out: Path, sequences: Sequences, how: _Beginning, ranks: Ranks) -> Run:
     """A rank's run at its first update, or at that of the checkpoint."""
-    return Run.restore(out / CHECKPOINT, config, ranks) if resume else Run.begin(config, sequences, ranks)
+    if how.resume:
+        return Run.restore(out / CHECKPOINT, config, ranks)
+    return Run.begin(config, sequences, ranks, how.start)
 
 
-def follow(config: TrainingConfig, out: Path, paths: list[Path], resume: bool, ranks: Ranks) -> None:
+def follow(config: TrainingConfig, out: Path, paths: list[Path], how: _Beginning, ranks: Ranks) -> None:
     """What every rank but the first does: learn, and write nothing."""
     sequences = Sequences(paths)
-    descend(begin(config, out, sequences, resume=resume, ranks=ranks), sequences, out)
+    descend(begin(config, out, sequences, how, ranks), sequences, out)
 
 
 def descend(
@@ -199,7 +213,7 @@ def provenance(run: Run, more: int = 0) -> str:
     also += f", {len(data.recordings)} recordings ({names[:_NAMES_CHARS]})" if names else ""
     also += f", {run.ranks.count} devices" if run.ranks.count > 1 else ""
     text = (
-        f"neurove train {run.config.name}: {run.step} updates of {recipe.batch} x {recipe.chunk_windows} windows, "
+        f"{_program(run)}: {run.step} updates of {recipe.batch} x {recipe.chunk_windows} windows, "
         f"seed {recipe.seed}, {data.sequences} simulated sequences of {data.seconds:g} s from seed {data.seed}{also}, "
         f"{run.cpu_s:.0f} CPU s, commit {commit() or 'unknown'}, torch {torch.__version__}"
     )
@@ -210,7 +224,7 @@ def about(run: Run) -> About:
     """How this model was made, as fields, and how far off it was at its last updates."""
     config = run.config
     made_by = MadeBy(
-        program=f"neurove train {config.name}",
+        program=_program(run),
         seed=config.recipe.seed,
         commit=commit(),
         torch=torch.__version__,
@@ -222,6 +236,11 @@ def about(run: Run) -> About:
     last = run.curve[-1] if run.curve else {}
     errors = ("linear_error_m_s", "angular_error_rad_s")
     return About(made_by=made_by, figures={f"training_{name}": last[name] for name in errors if name in last})
+
+
+def _program(run: Run) -> str:
+    begun = f", begun from {run.start[:12]}" if run.start else ""
+    return f"neurove train {run.config.name}{begun}"
 
 
 def golden_windows(sequences: Sequences) -> NDArray[np.uint8]:
@@ -269,6 +288,7 @@ def _write_run(run: Run, out: Path) -> None:
         "commit": commit(),
         "torch": torch.__version__,
         "step": run.step,
+        "start": run.start or None,
         "devices": run.ranks.count,
         "device": run.ranks.device.type,
         "cpu_s": round(run.cpu_s, 1),

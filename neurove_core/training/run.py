@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from neurove_core import networks
 from neurove_core.about import About
 from neurove_core.bundle import PER_HEIGHT, Bundle
+from neurove_core.config import ModelConfig
 from neurove_core.files import write_whole
 from neurove_core.loss import Balance
 from neurove_core.networks import Network
@@ -48,17 +49,32 @@ class Run:
     step: int = 0
     cpu_s: float = 0.0
     curve: list[dict[str, float]] = field(default_factory=list)
+    start: str = ""  # digest of the bundle that it began from, hex; empty where weights were drawn
 
     @classmethod
-    def begin(cls, config: TrainingConfig, sequences: Sequences, ranks: Ranks = ALONE) -> Self:
+    def begin(
+        cls, config: TrainingConfig, sequences: Sequences, ranks: Ranks = ALONE, start: Bundle | None = None
+    ) -> Self:
         """A run at its first step; weights and order are drawn from the recipe's seed, the order anew for each rank.
+
+        Args:
+            config: of the run.
+            sequences: that it learns from.
+            ranks: the process that it runs in.
+            start: a model whose weights, norms and scaling it begins from, instead of drawn ones.
 
         Raises:
             InvalidField: the batch can not be shared evenly, or no sequence knows one of the two velocities.
+            BadModel: the start is of another network than the configuration's, or not per metre of camera height.
         """
-        offset, scale = (one.to(ranks.device) for one in output_scaling(sequences))
+        scaling = output_scaling(sequences) if start is None else (start.offset, start.scale)
+        offset, scale = (one.to(ranks.device, copy=True) for one in scaling)
         network, optimiser = _network(config, ranks)
-        return cls(config, network, optimiser, offset, scale, _order(config, ranks), _balance(ranks), ranks)
+        if start is not None:
+            _take_over(network, start, config)
+        run = cls(config, network, optimiser, offset, scale, _order(config, ranks), _balance(ranks), ranks)
+        run.start = "" if start is None else start.digest
+        return run
 
     @property
     def share(self) -> RecipeConfig:
@@ -95,7 +111,7 @@ class Run:
                 tensors[f"adam.{index}.{name}"] = value
         tensors |= {"offset": self.offset, "scale": self.scale, "balance": torch.stack(list(self.balance))}
         about = {"config": self.config.model_dump(mode="json"), "step": self.step, "cpu_s": self.cpu_s}
-        about |= {"orders": orders, "curve": self.curve}
+        about |= {"orders": orders, "curve": self.curve, "start": self.start}
         stored = {name: tensor.cpu() for name, tensor in tensors.items()}
         write_whole(path, safetensors.torch.save(stored, {_KEY: json.dumps(about)}))
 
@@ -129,6 +145,7 @@ class Run:
             run = cls(config, network, optimiser, offset, scale, np.random.default_rng())
             run.balance, run.ranks = Balance(*balance.unbind()), ranks
             run.step, run.cpu_s, run.curve = int(about["step"]), float(about["cpu_s"]), list(about["curve"])
+            run.start = str(about.get("start", ""))  # checkpoints of before were all begun from drawn weights
             run.rng.bit_generator.state = orders[ranks.rank]
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise BadModel(path.name, f"a checkpoint that does not hold this run: {error}") from None
@@ -180,6 +197,29 @@ def _network(config: TrainingConfig, ranks: Ranks) -> tuple[Network, torch.optim
         torch.device(ranks.device).type == "cpu"
     )  # one pass over the weights: a quarter of the time; steps count there
     return network, torch.optim.Adam(network.parameters(), lr=config.recipe.learning_rate, fused=fused)
+
+
+def _take_over(network: Network, start: Bundle, config: TrainingConfig) -> None:
+    """Give a network the weights and norms of a model; its measure of its errors is left out, for that is fitted anew.
+
+    What shapes no tensor may differ: how gradients pass a spike, and the precision of the convolutions.
+    """
+    if start.linear_unit != PER_HEIGHT:
+        raise BadModel(start.name, f"linear_unit={start.linear_unit!r}: training goes on from {PER_HEIGHT!r} alone")
+    had, wanted = _shape(start.config), _shape(config.model)
+    for name, value in wanted.items():
+        if had[name] != value:
+            raise BadModel(start.name, f"it has {name}={had[name]}, the configuration says {value}")
+    weights = {name: one for name, one in start.network.state_dict().items() if not name.startswith("spread.")}
+    network.load_state_dict(weights)
+
+
+def _shape(config: ModelConfig) -> dict[str, Any]:
+    """What must be the same for one model's weights to mean the same in another."""
+    free = {"surrogate", "surrogate_width", "precision"}
+    parts = {"window": config.window, "canonical": config.canonical, "network": config.network}
+    found = {f"{part}.{name}": value for part, model in parts.items() for name, value in model if name not in free}
+    return {"kind": config.kind} | found
 
 
 def _restore_optimiser(optimiser: torch.optim.Adam, parameters: list[Any], tensors: dict[str, Tensor]) -> None:

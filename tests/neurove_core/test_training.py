@@ -1,6 +1,7 @@
 """Training: sequences as the service sees them, augmentations that keep the truth true, runs that go on exactly."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -216,6 +217,48 @@ def test_a_finished_run_goes_on_for_another_cycle_as_if_it_had_been_planned(fold
         train(TINY, tmp_path / "longer", folder, resume=True)
 
 
+def test_a_run_begins_from_a_model_where_one_is_given(folder, sequences, tmp_path):
+    first = bundle.load(train(TINY, tmp_path / "first", folder))
+    network = MODEL.network.model_copy(update={"precision": "int8", "surrogate": "arctan"})
+    config = TINY.model_copy(update={"model": MODEL.model_copy(update={"network": network, "settle_windows": 3})})
+    run = Run.begin(config, sequences, start=first)
+    weights = run.network.state_dict()
+    assert all(torch.equal(tensor, weights[name]) for name, tensor in first.network.state_dict().items())
+    assert torch.equal(run.scale, first.scale)
+    assert torch.equal(run.offset, first.offset)
+    made = bundle.load(train(config, tmp_path / "second", folder, start=first))
+    assert f"begun from {first.digest[:12]}" in made.provenance
+    assert made.about.made_by.program == f"neurove train tiny, begun from {first.digest[:12]}"
+    assert json.loads((tmp_path / "second" / RUN_JSON).read_text())["start"] == first.digest
+    resumed = bundle.load(train(config, tmp_path / "second", folder, resume=True))
+    assert resumed.digest == made.digest
+
+
+def test_a_model_with_a_measure_of_its_errors_is_begun_from_without_it(folder, sequences, tmp_path):
+    first = bundle.load(train(TINY, tmp_path, folder))
+    first.network.add_spread()
+    assert Run.begin(TINY, sequences, start=first).network.spread is None
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"network": MODEL.network.model_copy(update={"hidden": 8})}, "network.hidden=16, the configuration says 8"),
+        ({"canonical": CanonicalConfig(width=20, height=16)}, "canonical.width=22, the configuration says 20"),
+        ({"kind": "ann"}, "kind=neurove, the configuration says ann"),
+    ],
+)
+def test_a_run_does_not_begin_from_a_model_of_another_shape(sequences, change, why):
+    start = replace(bundle.untrained(config=MODEL), linear_unit=bundle.PER_HEIGHT)
+    with pytest.raises(BadModel, match=why):
+        Run.begin(TINY.model_copy(update={"model": MODEL.model_copy(update=change)}), sequences, start=start)
+
+
+def test_a_run_does_not_begin_from_a_model_that_answers_in_another_unit(sequences):
+    with pytest.raises(BadModel, match="linear_unit='m/s'"):
+        Run.begin(TINY, sequences, start=bundle.untrained(config=MODEL))
+
+
 def test_a_checkpoint_of_another_recipe_is_refused_with_the_field_that_differs(folder, tmp_path):
     train(TINY, tmp_path, folder)
     with pytest.raises(BadModel, match="recipe.steps=12, the configuration says 16"):
@@ -286,8 +329,12 @@ def test_the_learning_rate_rises_falls_and_ends_at_zero():
     assert np.all(np.diff(rates[10:]) < 0)
 
 
-def test_the_default_configuration_is_whole():
-    assert configs.load("default").name == "default"
+def test_the_default_model_learned_by_two_configurations_of_one_network():
+    first, then = configs.load("default"), configs.load("longer")
+    assert (first.name, then.name) == ("default", "default")
+    assert first.model == then.model
+    seeds = [set(range(one.data.seed, one.data.seed + one.data.sequences)) for one in (first, then)]
+    assert not seeds[0] & seeds[1]  # what was learned is not learned again
 
 
 @pytest.mark.parametrize(
