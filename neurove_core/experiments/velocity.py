@@ -183,7 +183,8 @@ def shipped(plan: Plan, folder: Path) -> dict[str, Any] | None:
     if (model.config.window, model.config.canonical) != (plan.config.model.window, plan.config.model.canonical):
         return None
     figures, _ = _figures(model, items(plan.recordings, quick=plan.quick), Kept(folder, plan.config.model))
-    return figures | {"updates": model.about.made_by.updates if model.about.made_by else None}
+    made_by = model.about.made_by
+    return figures | {"updates": made_by and made_by.updates, "program": made_by and made_by.program}
 
 
 def turning(plan: Plan, folder: Path) -> dict[str, dict[str, Any]]:

