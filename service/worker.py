@@ -138,21 +138,22 @@ class StreamWorker:
         outlet = self._open_outlet()
         try:
             self._see_through(outlet.ask_camera)
-            pause_s = 0.0
+            rests_until = 0.0  # a time, not a span: packets that come meanwhile must not begin the rest anew
             while not self._stopping.is_set():
                 self.beat_ns = time.monotonic_ns()
-                sample, dropped = self._inbox.take(pause_s if self.stream.owes else _IDLE_BEAT_S)
+                rest_s = max(0.0, rests_until - time.monotonic())
+                sample, dropped = self._inbox.take(rest_s if self.stream.owes else _IDLE_BEAT_S)
                 if dropped:
                     self.stream.overloaded(dropped)
                 if sample is not None:
                     self._work(sample, outlet)
                 elif self.stream.owes:
-                    pause_s = self._attend()
+                    rests_until = time.monotonic() + self._attend()
         finally:
             outlet.close()
 
     def _attend(self) -> float:
-        """Give a model beside the one that answers what time is left; how long to wait for a packet then [s]."""
+        """Give a model beside the one that answers what time is left; how long to leave it to others then [s]."""
         if not self._spare.acquire(blocking=False):
             return _NO_SPARE_S
         began = time.monotonic()

@@ -116,6 +116,18 @@ def test_a_fault_while_working_on_a_packet_does_not_end_the_stream(worker, publi
     assert worker.stream.counters.failed_packets == 1
 
 
+def test_a_model_beside_gets_its_turns_however_often_packets_come(worker, monkeypatch):
+    turns = []
+    monkeypatch.setattr(Stream, "owes", property(lambda _: True))
+    monkeypatch.setattr(worker.stream, "attend", lambda: turns.append(threading.Event().wait(0.03)))
+    for packet in make_packets(400, n=5):
+        worker.put_packet(encode_packet(packet), 1)
+        threading.Event().wait(0.005)  # a packet comes in each of its rests
+        if len(turns) == 4:
+            return
+    pytest.fail(f"{len(turns)} turns in 400 packets")
+
+
 def test_a_camera_that_can_not_be_read_is_refused_and_the_stream_goes_on(slot):
     def broken():
         raise Malformed("camera info", "planted")
