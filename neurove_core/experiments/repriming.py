@@ -56,7 +56,7 @@ class Report(NamedTuple):
     seconds: float
     errors: dict[str, list[float]]  # RMS over axes, bins and swaps, of each window after the change
     worst: dict[str, list[float]]  # of the worst axis, RMS over bins and swaps
-    to_truth: dict[str, list[float]]  # as errors, but against the truth, and NEVER among the ways
+    off_truth: dict[str, dict[str, list[float]]]  # "m/s" and "deg/s": by way, NEVER among them, RMSE of each window
     least_primed: int | None  # least N whose first estimate is within SETTLED; None where none is
 
 
@@ -86,18 +86,16 @@ def run(
     windows = swaps_at[-1] + AFTER
     seconds = windows * bundle.config.window.duration_us / 1e6
     squares: dict[str, list[Array]] = {}
-    off_truth: dict[str, list[Array]] = {}
+    off: dict[str, list[Array]] = {}
     for street in range(streets):
         simulation = simulation_of(f"sim://street?seed={FIRST_SEED + street}&camera={CAMERA}&seconds={seconds + 0.1:g}")
-        seen, truth = windows_of(simulation, new)[:windows], truth_of(simulation, new, windows)
-        variance, followed = _ways(new, old, seen, swaps_at, replayed)
+        units = np.array([simulation.lens.height_m] * 3 + [180 / np.pi] * 3)  # it answers for a camera at 1 m
+        truth = true_twists(simulation.trajectory, windows, new.config) * ([1.0] * 3 + [180 / np.pi] * 3)
+        variance, followed = _ways(new, old, windows_of(simulation, new)[:windows], swaps_at, replayed)
         for way, runs in followed.items():
-            for at, said in zip(swaps_at, runs, strict=True):
-                for against, found in (
-                    (followed[NEVER][swaps_at.index(at)], squares),
-                    (truth[at : at + AFTER], off_truth),
-                ):
-                    found.setdefault(way, []).append(((said - against) ** 2).mean(axis=1) / variance)
+            for at, said, never in zip(swaps_at, runs, followed[NEVER], strict=True):
+                squares.setdefault(way, []).append(((said - never) ** 2).mean(axis=1) / variance)
+                off.setdefault(way, []).append(((said * units - truth[at : at + AFTER]) ** 2).mean(axis=1))
         progress(simulation.name)
     del squares[NEVER]
     means = {way: np.mean(errors, axis=0) for way, errors in squares.items()}  # (AFTER, 6)
@@ -111,7 +109,10 @@ def run(
         seconds=seconds,
         errors=rms,
         worst={way: np.sqrt(mean.max(axis=1)).tolist() for way, mean in means.items()},
-        to_truth={way: np.sqrt(np.mean(errors, axis=(0, 2))).tolist() for way, errors in off_truth.items()},
+        off_truth={
+            unit: {way: np.sqrt(np.mean(one, axis=0)[:, part].sum(axis=1)).tolist() for way, one in off.items()}
+            for unit, part in (("m/s", slice(0, 3)), ("deg/s", slice(3, 6)))
+        },
         least_primed=settled[0] if settled else None,
     )
 
@@ -136,13 +137,6 @@ def windows_of(simulation: Simulation, estimator: Estimator) -> list[Window]:
         cut = pushed.state
         windows += pushed.windows
     return windows
-
-
-def truth_of(simulation: Simulation, estimator: Estimator, windows: int) -> Array:
-    """The true twists (windows, n, 6) as a model answers that is not told the camera's height: as if it were 1 m."""
-    truth = true_twists(simulation.trajectory, windows, estimator.config)
-    truth[..., :3] /= simulation.lens.height_m
-    return truth
 
 
 def _ways(
@@ -183,9 +177,13 @@ def _name(primed: int) -> str:
 def to_json(report: Report) -> str:
     """The report for machines."""
     about: dict[str, Any] = report._asdict()
-    for part in ("errors", "worst", "to_truth"):
-        about[part] = {way: [round(one, 5) for one in errors] for way, errors in about[part].items()}
+    about |= {"errors": _rounded(report.errors), "worst": _rounded(report.worst)}
+    about["off_truth"] = {unit: _rounded(ways) for unit, ways in report.off_truth.items()}
     return json.dumps(about) + "\n"
+
+
+def _rounded(ways: dict[str, list[float]]) -> dict[str, list[float]]:
+    return {way: [round(one, 5) for one in errors] for way, errors in ways.items()}
 
 
 def to_markdown(report: Report) -> str:
@@ -203,13 +201,14 @@ def to_markdown(report: Report) -> str:
         lines.append(f"| {way} | {' | '.join(cells)} | {report.worst[way][0]:.4f} |")
     least = "no N of these" if report.least_primed is None else f"N = {report.least_primed}"
     lines += ["", f"Least N whose first estimate is within {100 * SETTLED:g} % of the standard deviation: {least}.", ""]
-    lines += ["Error of the same estimates against the truth, over that of the run that was never swapped.", ""]
-    lines += ["| way | " + " | ".join("first" if i == 0 else f"{i} windows later" for i in shown) + " |"]
-    lines += ["| --- |" + " --- |" * len(shown)]
-    never = report.to_truth[NEVER]
-    for way, errors in report.to_truth.items():
-        if way != NEVER:
-            lines.append(f"| {way} | {' | '.join(f'{errors[i] / never[i]:.2f}' for i in shown if i < len(errors))} |")
+    lines += ["RMSE of the same estimates against the truth, linear [m/s] / angular [deg/s].", ""]
+    lines += ["| way | " + " | ".join("first" if i == 0 else f"{i} windows later" for i in shown) + " | all |"]
+    lines += ["| --- |" + " --- |" * (len(shown) + 1)]
+    for way, linear in report.off_truth["m/s"].items():
+        both = linear, report.off_truth["deg/s"][way]
+        cells = [" / ".join(f"{one[i]:.2f}" for one in both) for i in shown if i < len(linear)]
+        cells.append(" / ".join(f"{np.sqrt(np.mean(np.square(one))):.2f}" for one in both))
+        lines.append(f"| {way} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
