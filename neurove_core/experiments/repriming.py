@@ -60,6 +60,13 @@ class Report(NamedTuple):
     least_primed: int | None  # least N whose first estimate is within SETTLED; None where none is
 
 
+class _Answers(NamedTuple):
+    """What was said on one street."""
+
+    variance: Array  # (6) of the run that was never swapped
+    of: dict[str, list[Array]]  # by way of changing, for each change the answers (AFTER, n, 6) after it
+
+
 def run(
     model: str = models.DEFAULT,
     streets: int = 6,
@@ -85,20 +92,20 @@ def run(
     swaps_at = [replayed[-1] + 16 + i * APART for i in range(SWAPS)]
     windows = swaps_at[-1] + AFTER
     seconds = windows * bundle.config.window.duration_us / 1e6
-    squares: dict[str, list[Array]] = {}
+    apart: dict[str, list[Array]] = {}
     off: dict[str, list[Array]] = {}
     for street in range(streets):
         simulation = simulation_of(f"sim://street?seed={FIRST_SEED + street}&camera={CAMERA}&seconds={seconds + 0.1:g}")
-        units = np.array([simulation.lens.height_m] * 3 + [180 / np.pi] * 3)  # it answers for a camera at 1 m
-        truth = true_twists(simulation.trajectory, windows, new.config) * ([1.0] * 3 + [180 / np.pi] * 3)
-        variance, followed = _ways(new, old, windows_of(simulation, new)[:windows], swaps_at, replayed)
-        for way, runs in followed.items():
-            for at, said, never in zip(swaps_at, runs, followed[NEVER], strict=True):
-                squares.setdefault(way, []).append(((said - never) ** 2).mean(axis=1) / variance)
+        answers = _ways(new, old, windows_of(simulation, new)[:windows], swaps_at, replayed)
+        truth = true_twists(simulation.trajectory, windows, new.config)
+        units = np.array([simulation.lens.height_m] * 3 + [1.0] * 3)  # it answers for a camera at 1 m
+        for way, runs in answers.of.items():
+            for at, said, never in zip(swaps_at, runs, answers.of[NEVER], strict=True):
+                apart.setdefault(way, []).append(((said - never) ** 2).mean(axis=1) / answers.variance)
                 off.setdefault(way, []).append(((said * units - truth[at : at + AFTER]) ** 2).mean(axis=1))
         progress(simulation.name)
-    del squares[NEVER]
-    means = {way: np.mean(errors, axis=0) for way, errors in squares.items()}  # (AFTER, 6)
+    del apart[NEVER]
+    means = {way: np.mean(errors, axis=0) for way, errors in apart.items()}  # (AFTER, 6)
     rms = {way: np.sqrt(mean.mean(axis=1)).tolist() for way, mean in means.items()}
     settled = [n for n in replayed if rms[_name(n)][0] <= SETTLED]
     return Report(
@@ -109,12 +116,14 @@ def run(
         seconds=seconds,
         errors=rms,
         worst={way: np.sqrt(mean.max(axis=1)).tolist() for way, mean in means.items()},
-        off_truth={
-            unit: {way: np.sqrt(np.mean(one, axis=0)[:, part].sum(axis=1)).tolist() for way, one in off.items()}
-            for unit, part in (("m/s", slice(0, 3)), ("deg/s", slice(3, 6)))
-        },
+        off_truth={"m/s": _lengths(off, slice(0, 3), 1.0), "deg/s": _lengths(off, slice(3, 6), 180 / np.pi)},
         least_primed=settled[0] if settled else None,
     )
+
+
+def _lengths(off: dict[str, list[Array]], axes: slice, unit: float) -> dict[str, list[float]]:
+    """Root of the mean squared length of a group of axes, by way and window, in another unit."""
+    return {way: (unit * np.sqrt(np.mean(one, axis=0)[:, axes].sum(axis=1))).tolist() for way, one in off.items()}
 
 
 def shifted(bundle: Bundle, share: float = SHIFT) -> Bundle:
@@ -139,10 +148,8 @@ def windows_of(simulation: Simulation, estimator: Estimator) -> list[Window]:
     return windows
 
 
-def _ways(
-    new: Estimator, old: Estimator, windows: list[Window], swaps_at: list[int], primed: list[int]
-) -> tuple[Array, dict[str, list[Array]]]:
-    """The variance of each axis; and by way of changing, for each swap the answers (AFTER, n, 6) after it."""
+def _ways(new: Estimator, old: Estimator, windows: list[Window], swaps_at: list[int], primed: list[int]) -> _Answers:
+    """Follow one street in every way of changing."""
     never, _ = _said(new, windows, _rest(new))
     variance = never.reshape(-1, 6).var(axis=0)
     carried = _rest(old)
@@ -156,7 +163,7 @@ def _ways(
         for way, state in starts.items():
             said, _ = _said(new, windows[at : at + AFTER], state)
             found.setdefault(way, []).append(said)
-    return variance, found
+    return _Answers(variance, found)
 
 
 def _said(estimator: Estimator, windows: list[Window], state: StreamState) -> tuple[Array, StreamState]:
