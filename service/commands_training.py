@@ -23,10 +23,13 @@ def train(args: argparse.Namespace) -> int:
     from neurove_core import bundle, models
     from neurove_core.training import config as configs
     from neurove_core.training import data, loop, ranks, recorded
+    from neurove_core.training import run as runs
 
     torch.set_num_threads(args.threads)
     config = configs.load(args.config)
     start = models.find(args.start) if args.start else None
+    if start is not None:
+        runs.check_start(start, config)
     ranks.device_of(args.device, devices=args.devices)  # told before anything is simulated
     out: Path = args.out or Path("runs") / config.name
     folder: Path = args.data or out / "data"

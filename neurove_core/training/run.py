@@ -65,13 +65,15 @@ class Run:
 
         Raises:
             InvalidField: the batch can not be shared evenly, or no sequence knows one of the two velocities.
-            BadModel: the start is of another network than the configuration's, or not per metre of camera height.
+            BadModel: the start is of another network than the configuration's, see `check_start`.
         """
+        if start is not None:
+            check_start(start, config)
         scaling = output_scaling(sequences) if start is None else (start.offset, start.scale)
         offset, scale = (one.to(ranks.device, copy=True) for one in scaling)
         network, optimiser = _network(config, ranks)
         if start is not None:
-            _take_over(network, start, config)
+            _take_over(network, start)
         run = cls(config, network, optimiser, offset, scale, _order(config, ranks), _balance(ranks), ranks)
         run.start = "" if start is None else start.digest
         return run
@@ -199,10 +201,13 @@ def _network(config: TrainingConfig, ranks: Ranks) -> tuple[Network, torch.optim
     return network, torch.optim.Adam(network.parameters(), lr=config.recipe.learning_rate, fused=fused)
 
 
-def _take_over(network: Network, start: Bundle, config: TrainingConfig) -> None:
-    """Give a network the weights and norms of a model; its measure of its errors is left out, for that is fitted anew.
+def check_start(start: Bundle, config: TrainingConfig) -> None:
+    """Refuse to begin from a model whose weights would mean something else in the configuration's network.
 
     What shapes no tensor may differ: how gradients pass a spike, and the precision of the convolutions.
+
+    Raises:
+        BadModel: a field that differs is named with both values.
     """
     if start.linear_unit != PER_HEIGHT:
         raise BadModel(start.name, f"linear_unit={start.linear_unit!r}: training goes on from {PER_HEIGHT!r} alone")
@@ -210,6 +215,10 @@ def _take_over(network: Network, start: Bundle, config: TrainingConfig) -> None:
     for name, value in wanted.items():
         if had[name] != value:
             raise BadModel(start.name, f"it has {name}={had[name]}, the configuration says {value}")
+
+
+def _take_over(network: Network, start: Bundle) -> None:
+    """Give a network the weights and norms of a model, but not its measure of its errors: that is fitted anew."""
     weights = {name: one for name, one in start.network.state_dict().items() if not name.startswith("spread.")}
     network.load_state_dict(weights)
 

@@ -335,6 +335,7 @@ def test_the_default_model_learned_by_two_configurations_of_one_network():
     assert first.model == then.model
     seeds = [set(range(one.data.seed, one.data.seed + one.data.sequences)) for one in (first, then)]
     assert not seeds[0] & seeds[1]  # what was learned is not learned again
+    assert configs.load("int8").data == then.data
 
 
 @pytest.mark.parametrize(

@@ -117,6 +117,13 @@ def test_a_wrong_configuration_ends_in_one_line(run, tmp_path):
     assert "recipe.steps" in err
 
 
+def test_a_model_of_another_shape_is_refused_before_anything_is_simulated(run, tmp_path):
+    code, _, err = run("train", "velocity-quick", "--start", "default", "--out", str(tmp_path / "out"))
+    assert code == 2
+    assert err.strip() == "neurove: model default: it has canonical.width=86, the configuration says 22"
+    assert not (tmp_path / "out").exists()
+
+
 def test_training_ends_with_a_calibrated_model_and_calibrating_again_tells_how_well_it_holds(trained, run):
     path = trained / "out" / "tiny.safetensors"
     assert bundle.load(path).uncertainty.provenance.startswith("neurove calibrate: 16 simulated sequences")
