@@ -56,6 +56,8 @@ def augment(
         twists: (S, n, 6).
         recipe: how often each change is made.
     """
+    if recipe.still and rng.uniform() < recipe.still:
+        return at_rest(rng, counts.shape, math.exp(rng.uniform(*np.log(recipe.still_noise)))), np.zeros_like(twists)
     chance = rng.uniform(size=5)
     gain, noise = math.exp(rng.uniform(*np.log(recipe.gain))), rng.uniform(0, recipe.noise_max)
     if chance[0] < recipe.mirror:
@@ -119,6 +121,20 @@ def regained(rng: np.random.Generator, counts: NDArray[np.uint8], gain: float) -
     seen = np.flatnonzero(scaled)
     scaled[seen] = np.minimum(scaled[seen] * gain + rng.uniform(size=seen.size), 255).astype(np.uint8)
     return scaled.reshape(counts.shape)
+
+
+def at_rest(rng: np.random.Generator, shape: tuple[int, ...], mean: float) -> NDArray[np.uint8]:
+    """What a camera sees that stands still in a world that does: the noise of its pixels, some louder than others.
+
+    Args:
+        rng: of the run.
+        shape: (S, 2n, H, W) of the counts.
+        mean: events per cell and bin; each cell and polarity has a rate of its own, exponentially distributed.
+    """
+    segment, channels, rows, columns = shape
+    rates = mean * rng.standard_exponential((2, rows, columns), np.float32)
+    drawn = rng.poisson(np.tile(rates, (channels // 2, 1, 1)), (segment, channels, rows, columns))
+    return np.minimum(drawn, 255).astype(np.uint8)
 
 
 def noisy(rng: np.random.Generator, counts: NDArray[np.uint8], mean: float) -> NDArray[np.uint8]:

@@ -114,6 +114,8 @@ class RecipeConfig(Config):
     polarity_flip: float = Field(0.5, ge=0, le=1, description="Share of segments whose ON is OFF.")
     noisy: float = Field(0.25, ge=0, le=1, description="Share of segments with random events added.")
     noise_max: float = Field(0.1, ge=0, le=10, description="Most of these, per cell and bin.")
+    still: float = Field(0.0, ge=0, le=1, description="Share of segments of a camera at rest, which sees noise alone.")
+    still_noise: Span = Field((0.001, 0.5), description="Of these, the mean per cell and bin, log-uniform.")
     regained: float = Field(0.25, ge=0, le=1, description="Share of segments whose counts are scaled.")
     gain: Span = Field(
         (0.5, 4.0), description="By how much, log-uniform: pixels per cell are as many as the sensor has."

@@ -19,7 +19,7 @@ from neurove_core.sim.simulate import Simulation
 from neurove_core.sim.trajectory import Mounted, rotation
 from neurove_core.training import config as configs
 from neurove_core.training import data
-from neurove_core.training.batches import backwards, doubled, draw, mirrored, noisy, polarity_flipped, regained
+from neurove_core.training.batches import at_rest, backwards, doubled, draw, mirrored, noisy, polarity_flipped, regained
 from neurove_core.training.config import DataConfig, RecipeConfig, TrainingConfig
 from neurove_core.training.loop import CHECKPOINT, RUN_JSON, golden_windows, learn, learning_rate, train
 from neurove_core.training.run import Run
@@ -182,6 +182,19 @@ def test_gain_and_noise_change_the_mean_as_told_and_never_wrap():
     assert (noisy(rng, full, 5.0) == 255).all()
 
 
+def test_a_camera_at_rest_sees_noise_whose_pixels_differ_and_no_motion(sequences):
+    rng = np.random.default_rng(3)
+    noise = at_rest(rng, (40, 10, 16, 22), 0.3)
+    assert noise.dtype == np.uint8
+    assert noise.mean() == pytest.approx(0.3, rel=0.1)
+    rates = noise.reshape(200, 2, 16, 22).mean(axis=0)
+    assert rates.std() == pytest.approx(0.3, rel=0.2)  # of an exponential distribution; equal pixels would give 0.04
+    recipe = TINY.recipe.model_copy(update={"still": 1.0, "still_noise": (0.2, 0.2)})
+    segment = draw(np.random.default_rng(1), sequences, recipe)
+    assert not segment.twists.any()
+    assert float(segment.counts.float().mean()) == pytest.approx(0.2, rel=0.2)
+
+
 def test_a_run_that_goes_on_from_its_checkpoint_ends_as_one_that_was_never_stopped(folder, tmp_path):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     at_once = train(TINY, whole, folder)
@@ -335,7 +348,7 @@ def test_the_default_model_learned_by_two_configurations_of_one_network():
     assert first.model == then.model
     seeds = [set(range(one.data.seed, one.data.seed + one.data.sequences)) for one in (first, then)]
     assert not seeds[0] & seeds[1]  # what was learned is not learned again
-    assert configs.load("int8").data == then.data
+    assert configs.load("int8").data == configs.load("rest").data == then.data
 
 
 @pytest.mark.parametrize(
