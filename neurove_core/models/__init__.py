@@ -8,7 +8,7 @@ from neurove_core import bundle
 from neurove_core.bundle import Bundle
 
 DEFAULT: Final = "default"
-"""The model that serves where no other is named: trained by `neurove train default`."""
+"""The model that serves where no other is named: how it was trained is in README.md."""
 
 
 @functools.cache

@@ -36,8 +36,8 @@ from protocol.errors import BadModel, InvalidField
 from protocol.velocity import AXES
 
 SEQUENCES: Final = 96
-UNCERTAIN_ABOVE: Final = 0.5
-"""Of the linear sigma over the speed: from here on an estimate is flagged."""
+UNCERTAIN_ABOVE: Final = 0.3
+"""Of the linear sigma over the speed: from here on an estimate is flagged (decision 48)."""
 
 SEEN: Final = ("as it is", "holes", "few events", "noise")
 """The ways in which each sequence is seen."""
