@@ -1,7 +1,7 @@
 """The peers' neurons in our network: same weights, same input, their LIF layers as their users run them.
 
 They come with the extra `bench`, except those whose requirements would pull another torch:
-`pip install --no-deps spikingjelly norse nir nirtorch sinabs`. What is not installed is named and left out.
+`pip install --no-deps spikingjelly norse nir nirtorch sinabs pbr`. What is not installed is named and left out.
 """
 
 import copy
