@@ -42,7 +42,6 @@ SWAPS = 4  # per street
 APART = 12  # windows between them
 NEVER = "never swapped"
 
-
 Array = NDArray[np.float64]
 
 

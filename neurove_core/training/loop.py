@@ -108,7 +108,7 @@ def train(
     out.mkdir(parents=True, exist_ok=True)
     resume = resume and (out / CHECKPOINT).exists()
     sequences = Sequences([*Cache(data, config).paths(), *Recorded(data, config).paths(), *more])
-    how = _Beginning(resume, start)
+    how = Beginning(resume, start)
     begin(config, out, sequences, how, Ranks(count=devices))  # so that what is wrong is told by one
     with together(devices, device, follow, (config, out, sequences.paths, how)) as ranks:
         run = begin(config, out, sequences, how, ranks)
@@ -122,21 +122,21 @@ def train(
     return path
 
 
-class _Beginning(NamedTuple):
+class Beginning(NamedTuple):
     """Where a run's first weights come from: a checkpoint, a model, or the recipe's seed."""
 
     resume: bool
     start: Bundle | None
 
 
-def begin(config: TrainingConfig, out: Path, sequences: Sequences, how: _Beginning, ranks: Ranks) -> Run:
+def begin(config: TrainingConfig, out: Path, sequences: Sequences, how: Beginning, ranks: Ranks) -> Run:
     """A rank's run at its first update, or at that of the checkpoint."""
     if how.resume:
         return Run.restore(out / CHECKPOINT, config, ranks)
     return Run.begin(config, sequences, ranks, how.start)
 
 
-def follow(config: TrainingConfig, out: Path, paths: list[Path], how: _Beginning, ranks: Ranks) -> None:
+def follow(config: TrainingConfig, out: Path, paths: list[Path], how: Beginning, ranks: Ranks) -> None:
     """What every rank but the first does: learn, and write nothing."""
     sequences = Sequences(paths)
     descend(begin(config, out, sequences, how, ranks), sequences, out)

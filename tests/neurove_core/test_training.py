@@ -342,13 +342,13 @@ def test_the_learning_rate_rises_falls_and_ends_at_zero():
     assert np.all(np.diff(rates[10:]) < 0)
 
 
-def test_the_default_model_learned_by_two_configurations_of_one_network():
-    first, then = configs.load("default"), configs.load("longer")
-    assert (first.name, then.name) == ("default", "default")
-    assert first.model == then.model
+def test_the_default_model_learned_by_three_configurations_of_one_network():
+    first, then, last = (configs.load(name) for name in ("default", "longer", "rest"))
+    assert {one.name for one in (first, then, last)} == {"default"}
+    assert first.model == then.model == last.model
     seeds = [set(range(one.data.seed, one.data.seed + one.data.sequences)) for one in (first, then)]
     assert not seeds[0] & seeds[1]  # what was learned is not learned again
-    assert configs.load("int8").data == configs.load("rest").data == then.data
+    assert configs.load("int8").data == last.data == then.data
 
 
 @pytest.mark.parametrize(
