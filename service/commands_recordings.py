@@ -226,7 +226,9 @@ def add(commands: Any) -> None:
 def _add_simulate(commands: Any) -> None:
     parser = command(commands, "simulate", simulate)
     parser.add_argument(
-        "scene", metavar="SCENE", help="street, bare-street, corridor, room, wall; or carla: of a CARLA server"
+        "scene",
+        metavar="SCENE",
+        help="street, bare-street, corridor, room, plain-room, wall; or carla: of a CARLA server",
     )
     parser.add_argument(
         "--out", type=Path, required=True, metavar="FILE", help=".mcap (ours), .h5 (DSEC); .npz of carla"

@@ -77,6 +77,48 @@ def room(trajectory: Moving, seed: int) -> Scene:
     return Fixed(Panels.join(parts), Sky(_flat(0.3), 0.3, 200.0))
 
 
+def plain_room(trajectory: Moving, seed: int) -> Scene:
+    """A room of plain walls around the whole trajectory, with a few flat shapes on them: little to see but edges.
+
+    Of a trajectory longer than two minutes it is around those.
+    """
+    t_s = np.linspace(0, min(trajectory.duration_s, 120.0), 2400)
+    position = trajectory.pose(t_s)[0]
+    rng = np.random.default_rng((seed, 106))
+    low, high = position.min(0) - rng.uniform(0.8, 4.0, 3), position.max(0) + rng.uniform(0.8, 4.0, 3)
+    middle, size, light = (low + high) / 2, high - low, rng.uniform(0.5, 1.0)
+    axes = np.eye(3)
+    parts = []
+    for axis in range(3):
+        u, v = axes[axis - 2], axes[axis - 1]
+        sides = (float(size[axis - 2]), float(size[axis - 1]))
+        for side in (-1.0, 1.0):
+            centre = middle + side * size[axis] / 2 * axes[axis]
+            parts.append(panel(centre, u, v, sides, "paint", repeat_m=3.0, gain=light * rng.uniform(0.8, 1.0)))
+            parts += _shapes(rng, centre - 0.01 * side * axes[axis], u, v, sides)
+    return Fixed(Panels.join(parts), Sky(_flat(0.3), 0.3, 200.0))
+
+
+def _shapes(
+    rng: np.random.Generator,
+    centre: NDArray[np.float64],
+    u: NDArray[np.float64],
+    v: NDArray[np.float64],
+    sides: tuple[float, float],
+) -> list[Panels]:
+    """Rectangles, turned at random, on a wall of these sides: one on each square metre or so, at most forty."""
+    count = min(40, 1 + int(rng.poisson(sides[0] * sides[1] * rng.uniform(0.5, 1.5))))
+    parts = []
+    for _ in range(count):
+        at = centre + rng.uniform(-0.45, 0.45) * sides[0] * u + rng.uniform(-0.45, 0.45) * sides[1] * v
+        angle = rng.uniform(0, np.pi)
+        along, across = np.cos(angle) * u + np.sin(angle) * v, np.cos(angle) * v - np.sin(angle) * u
+        wide, high = (float(length) for length in rng.uniform(0.08, 0.7, 2))
+        texture = "paint" if rng.uniform() < 0.8 else "posters"
+        parts.append(panel(at, along, across, (wide, high), texture, repeat_m=1.0, gain=rng.uniform(0.05, 0.6)))
+    return parts
+
+
 def _furniture(
     rng: np.random.Generator, start: NDArray[np.float64], end: NDArray[np.float64], height: float
 ) -> list[Panels]:
@@ -117,6 +159,7 @@ SCENES: Final[dict[str, Callable[[Moving, int], Scene]]] = {
     "bare-street": bare_street,
     "corridor": corridor,
     "room": room,
+    "plain-room": plain_room,
     "wall": wall,
 }
 """Scenes by name: trajectory, as the camera goes, and seed."""

@@ -1,7 +1,7 @@
 """Segments of sequences side by side, as the loop learns from them: drawn at random, mirrored, flipped, disturbed."""
 
 import math
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import torch
@@ -13,6 +13,8 @@ from neurove_core.training.data import Sequences
 
 _MIRRORED = np.array([-1, 1, 1, 1, -1, -1], np.float32)
 """What a mirror across x makes of a twist; see `mirrored`."""
+
+_SEEN_FIRST: Final = 4  # so many windows at least before the feed thins or ends, else there is no speed to go on with
 
 
 class Segment(NamedTuple):
@@ -70,7 +72,29 @@ def augment(
         counts = regained(rng, counts, gain)
     if chance[3] < recipe.noisy:
         counts = noisy(rng, counts, noise)
+    if recipe.thinned and rng.uniform() < recipe.thinned:
+        counts = thinned(rng, counts, recipe)
+    if recipe.holes and rng.uniform() < recipe.holes:
+        counts = with_holes(rng, counts, recipe)
     return counts, twists
+
+
+def thinned(rng: np.random.Generator, counts: NDArray[np.uint8], recipe: RecipeConfig) -> NDArray[np.uint8]:
+    """A segment (S, 2n, H, W) that has few events from some window on, while the camera moves as before."""
+    first, seen = int(rng.integers(_SEEN_FIRST, max(_SEEN_FIRST + 1, len(counts) // 2))), counts.copy(order="C")
+    seen[first:] = regained(rng, seen[first:], math.exp(rng.uniform(*np.log(recipe.thinned_to))))
+    return seen
+
+
+def with_holes(rng: np.random.Generator, counts: NDArray[np.uint8], recipe: RecipeConfig) -> NDArray[np.uint8]:
+    """A segment (S, 2n, H, W) with holes in its feed, while the camera moves on: something was seen before each."""
+    seen, at = counts.copy(order="C"), 0
+    while at < len(seen):
+        at += int(rng.integers(_SEEN_FIRST, 4 * _SEEN_FIRST))
+        length = int(math.exp(rng.uniform(*np.log(recipe.hole_windows))))
+        seen[at : at + length] = 0
+        at += length
+    return seen
 
 
 def mirrored(counts: NDArray[np.uint8], twists: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:

@@ -16,7 +16,12 @@ CONFIGS: Final = Path(__file__).parent / "configs"
 Span = tuple[Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]]
 """Least and greatest value that is drawn."""
 
-Shares = dict[str, Annotated[float, Field(ge=0)]]
+LogSpan = tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]
+"""The same, of what is drawn so that its logarithm is uniform."""
+
+Size = Annotated[float, Field(ge=0)]
+
+Shares = dict[str, Size]
 
 
 class RecordedConfig(Config):
@@ -62,18 +67,23 @@ class DataConfig(Config):
         description="Share of each camera; small ones are quickly simulated.",
     )
     hfov_deg: Span = Field((55.0, 95.0), description="Field of view of a pinhole that is named without one.")
-    height_m: Span = Field((0.3, 2.5), description="Of the camera above the ground, log-uniform.")
+    height_m: LogSpan = Field((0.3, 2.5), description="Of the camera above the ground, log-uniform.")
     pitch_deg: Span = Field((0.0, 12.0), description="How far the camera looks down, uniform.")
-    slowed_drive: Span = Field((1.0, 4.0), description="Log-uniform: how many times slower than a car.")
-    slowed_hand: Span = Field((1.0, 6.0), description="Log-uniform: in a room, how many times slower than a wild hand.")
-    spun_rad_s: Span = Field((0.1, 2.0), description="Log-uniform: rate of a camera that spins in place.")
-    threshold: Span = Field((0.15, 0.4), description="Of ON events, log-uniform; OFF lies within 15 % of it.")
+    slowed_drive: LogSpan = Field((1.0, 4.0), description="Log-uniform: how many times slower than a car.")
+    slowed_hand: LogSpan = Field(
+        (1.0, 6.0), description="Log-uniform: in a room, so many times slower than a wild hand."
+    )
+    spun_rad_s: LogSpan = Field((0.1, 2.0), description="Log-uniform: rate of a camera that spins in place.")
+    spun_axis: tuple[Size, Size, Size] = Field(
+        (0.4, 1.0, 0.4), description="Spread of the components x, y and z of its axis before that gets length 1."
+    )
+    threshold: LogSpan = Field((0.15, 0.4), description="Of ON events, log-uniform; OFF lies within 15 % of it.")
     threshold_sigma: Span = Field((0.02, 0.05), description="Spread of the thresholds between pixels, uniform.")
     refractory_us: Span = Field((100.0, 1000.0), description="Uniform.")
     leak_hz: Span = Field((0.0, 0.2), description="Uniform.")
-    shot_noise_hz: Span = Field((0.001, 2.0), description="Log-uniform.")
-    cutoff_hz: Span = Field((100.0, 1000.0), description="Log-uniform: how fast pixels are, which light decides.")
-    eps: Span = Field((0.001, 0.02), description="Log-uniform: how much of the log intensity the dark hides.")
+    shot_noise_hz: LogSpan = Field((0.001, 2.0), description="Log-uniform.")
+    cutoff_hz: LogSpan = Field((100.0, 1000.0), description="Log-uniform: how fast pixels are, which light decides.")
+    eps: LogSpan = Field((0.001, 0.02), description="Log-uniform: how much of the log intensity the dark hides.")
 
     @model_validator(mode="after")
     def _something(self) -> Self:
@@ -85,10 +95,12 @@ class DataConfig(Config):
     def _spans_and_shares(self) -> Self:
         for name in type(self).model_fields:
             value = getattr(self, name)
-            if name != "recordings" and isinstance(value, tuple) and value[0] > value[1]:
+            if name not in ("recordings", "spun_axis") and isinstance(value, tuple) and value[0] > value[1]:
                 raise ValueError(f"{name}={value}: the least value comes first")
             if isinstance(value, dict) and not sum(value.values()) > 0:
                 raise ValueError(f"{name}={value}: some share must be above 0")
+        if not sum(self.spun_axis) > 0:
+            raise ValueError(f"spun_axis={self.spun_axis}: some spread must be above 0")
         return self
 
 
@@ -115,11 +127,15 @@ class RecipeConfig(Config):
     noisy: float = Field(0.25, ge=0, le=1, description="Share of segments with random events added.")
     noise_max: float = Field(0.1, ge=0, le=10, description="Most of these, per cell and bin.")
     still: float = Field(0.0, ge=0, le=1, description="Share of segments of a camera at rest, which sees noise alone.")
-    still_noise: Span = Field((0.001, 0.5), description="Of these, the mean per cell and bin, log-uniform.")
+    still_noise: LogSpan = Field((0.001, 0.5), description="Of these, the mean per cell and bin, log-uniform.")
     regained: float = Field(0.25, ge=0, le=1, description="Share of segments whose counts are scaled.")
-    gain: Span = Field(
+    gain: LogSpan = Field(
         (0.5, 4.0), description="By how much, log-uniform: pixels per cell are as many as the sensor has."
     )
+    holes: float = Field(0.0, ge=0, le=1, description="Share of segments in whose feed are holes.")
+    hole_windows: LogSpan = Field((1.0, 20.0), description="Of a hole, its length, log-uniform.")
+    thinned: float = Field(0.0, ge=0, le=1, description="Share of segments with few events from some window on.")
+    thinned_to: LogSpan = Field((0.01, 0.5), description="Share of the events that is left of them, log-uniform.")
     checkpoint_s: float = Field(120.0, ge=0, description="A checkpoint is written so often [s], and at the end.")
 
     @model_validator(mode="after")

@@ -39,6 +39,9 @@ FORMAT: Final = 1
 DRIVE_S: Final = 120.0
 """A sequence is a part of a drive of this length."""
 
+IN_A_HAND: Final = ("room", "plain-room")
+"""Scenes through which nothing drives."""
+
 _SAMPLES: Final = 4  # of the exact twist in each bin, whose mean is the bin's
 
 
@@ -99,9 +102,10 @@ def drawn(config: DataConfig, index: int) -> Simulation:
         cutoff_hz=log_uniform(rng, config.cutoff_hz),
         eps=log_uniform(rng, config.eps),
     )
-    slowed = log_uniform(rng, config.slowed_hand if scene == "room" else config.slowed_drive)
+    in_a_hand = scene in IN_A_HAND
+    slowed = log_uniform(rng, config.slowed_hand if in_a_hand else config.slowed_drive)
     trajectory: Trajectory
-    if scene == "room":
+    if in_a_hand:
         trajectory = _in_a_hand(rng, config, seed, slowed)
     else:
         trajectory = turning_part(rng, driving(seed, DRIVE_S + config.seconds), slowed, config.seconds)
@@ -237,10 +241,10 @@ class Sequences:
 
 
 def _in_a_hand(rng: np.random.Generator, config: DataConfig, seed: int, slowed: float) -> Trajectory:
-    """A camera that is waved about, only turned, or only moved; or one that spins on a random, mostly upright axis."""
+    """A camera that is waved about, only turned, or only moved; or one that spins on a random axis."""
     way = _choice(rng, config.hands)
     if way == "spun":
-        axis = rng.standard_normal(3) * (0.4, 1.0, 0.4)
+        axis = rng.standard_normal(3) * config.spun_axis
         rate = log_uniform(rng, config.spun_rad_s) * axis / np.linalg.norm(axis)
         wx, wy, wz = (float(one) for one in rate)
         return rotation(wx, wy, wz, config.seconds)

@@ -41,6 +41,7 @@ TRAJECTORIES = {
     "bare-street": driving(3, 30),
     "corridor": slider(0, 0, 2, 30),
     "room": hand_held(1, 10),
+    "plain-room": hand_held(1, 10),
     "wall": slider(0.3, 0, 0, 5),
 }
 
@@ -153,7 +154,7 @@ def test_flow_from_truth_and_depth_is_where_the_points_go(scene):
     assert np.abs(flow - went).max() < 0.02 * np.abs(flow).max() + 1e-3
 
 
-@pytest.mark.parametrize("scene", ["street", "corridor", "room", "wall"])
+@pytest.mark.parametrize("scene", ["street", "corridor", "room", "plain-room", "wall"])
 def test_the_picture_moves_by_the_flow_of_the_truth(scene):
     simulation, info, rays = film(scene, TRAJECTORIES[scene], 5), SMALL.info, rays_of(SMALL.info)
     at, dt = 3.0, 4e-3

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from pydantic import ValidationError
 
 from neurove_core import bundle, golden
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
@@ -19,7 +20,18 @@ from neurove_core.sim.simulate import Simulation
 from neurove_core.sim.trajectory import Mounted, rotation
 from neurove_core.training import config as configs
 from neurove_core.training import data
-from neurove_core.training.batches import at_rest, backwards, doubled, draw, mirrored, noisy, polarity_flipped, regained
+from neurove_core.training.batches import (
+    at_rest,
+    backwards,
+    doubled,
+    draw,
+    mirrored,
+    noisy,
+    polarity_flipped,
+    regained,
+    thinned,
+    with_holes,
+)
 from neurove_core.training.config import DataConfig, RecipeConfig, TrainingConfig
 from neurove_core.training.loop import CHECKPOINT, RUN_JSON, golden_windows, learn, learning_rate, train
 from neurove_core.training.run import Run
@@ -193,6 +205,47 @@ def test_a_camera_at_rest_sees_noise_whose_pixels_differ_and_no_motion(sequences
     segment = draw(np.random.default_rng(1), sequences, recipe)
     assert not segment.twists.any()
     assert float(segment.counts.float().mean()) == pytest.approx(0.2, rel=0.2)
+
+
+def test_holes_come_after_something_was_seen_and_the_camera_moves_on_through_them(sequences):
+    recipe = RecipeConfig(segment_windows=48, holes=1.0)
+    counts = np.random.default_rng(1).integers(1, 9, (48, 4, 5, 6), np.uint8)
+    rng, lengths = np.random.default_rng(0), []
+    for _ in range(50):
+        seen = with_holes(rng, counts, recipe)
+        empty = ~seen.any(axis=(1, 2, 3))
+        assert (seen[~empty] == counts[~empty]).all()
+        assert empty.any()
+        assert not empty[:4].any()
+        edges = np.flatnonzero(np.diff(np.r_[False, empty, False]))
+        lengths += (edges[1::2] - edges[::2]).tolist()
+    assert min(lengths) == 1
+    assert 15 <= max(lengths) <= 20
+    whole = TINY.recipe.model_copy(update={"holes": 1.0, "segment_windows": 10, "doubled": 0.0})
+    segment = draw(np.random.default_rng(1), sequences, whole)
+    still = ~segment.counts.flatten(2).any(2).T  # (B, S)
+    assert still.any()
+    assert all(segment.twists[hole, stream].any() for stream, row in enumerate(still) for hole in row.nonzero())
+
+
+def test_few_events_come_from_some_window_on_and_not_before():
+    recipe = RecipeConfig(thinned=1.0, thinned_to=(0.1, 0.1))
+    counts = np.full((32, 4, 20, 20), 3, np.uint8)
+    for seed in range(10):
+        means = thinned(np.random.default_rng(seed), counts, recipe).reshape(32, -1).mean(axis=1)
+        first = int((means < 3).argmax())
+        assert 4 <= first < 16
+        assert (means[:first] == 3).all()
+        assert means[first:] == pytest.approx(0.3, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("section", "field", "value"),
+    [("data", "spun_axis", [0, 0, 0]), ("data", "spun_rad_s", [0, 1]), ("recipe", "hole_windows", [0, 3])],
+)
+def test_a_span_that_has_no_logarithm_and_an_axis_without_length_are_refused(section, field, value):
+    with pytest.raises(ValidationError, match=field):
+        TrainingConfig.model_validate({section: {field: value}})
 
 
 def test_a_run_that_goes_on_from_its_checkpoint_ends_as_one_that_was_never_stopped(folder, tmp_path):

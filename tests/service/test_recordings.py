@@ -112,7 +112,7 @@ def test_a_simulation_is_written_with_its_truth(run, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["nowhere"], "scene='nowhere': known are street, bare-street, corridor, room, wall"),
+        (["nowhere"], "scene='nowhere': known are street, bare-street, corridor, room, plain-room, wall"),
         (["street", "--camera", "nikon"], "camera='nikon': known are"),
         (["street", "--trajectory", "flying"], "'flying': neither a known trajectory nor a file"),
         (["street", "--height", "0"], "height"),
