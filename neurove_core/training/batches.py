@@ -59,7 +59,8 @@ def augment(
         recipe: how often each change is made.
     """
     if recipe.still and rng.uniform() < recipe.still:
-        return at_rest(rng, counts.shape, math.exp(rng.uniform(*np.log(recipe.still_noise)))), np.zeros_like(twists)
+        noise = at_rest(rng, counts.shape, math.exp(rng.uniform(*np.log(recipe.still_noise))))
+        return _with_hot_pixels(rng, noise, recipe), np.zeros_like(twists)
     chance = rng.uniform(size=5)
     gain, noise = math.exp(rng.uniform(*np.log(recipe.gain))), rng.uniform(0, recipe.noise_max)
     if chance[0] < recipe.mirror:
@@ -72,11 +73,38 @@ def augment(
         counts = regained(rng, counts, gain)
     if chance[3] < recipe.noisy:
         counts = noisy(rng, counts, noise)
+    if recipe.lopsided and rng.uniform() < recipe.lopsided:
+        counts = lopsided(rng, counts, math.exp(rng.uniform(*np.log(recipe.lopsided_by))))
+    counts = _with_hot_pixels(rng, counts, recipe)
     if recipe.thinned and rng.uniform() < recipe.thinned:
         counts = thinned(rng, counts, recipe)
     if recipe.holes and rng.uniform() < recipe.holes:
         counts = with_holes(rng, counts, recipe)
     return counts, twists
+
+
+def lopsided(rng: np.random.Generator, counts: NDArray[np.uint8], ratio: float) -> NDArray[np.uint8]:
+    """Counts (S, 2n, H, W) of pixels whose thresholds differ: ON over OFF becomes so many times what it was."""
+    seen = counts.copy(order="C")
+    for polarity, gain in ((0, ratio**-0.5), (1, ratio**0.5)):
+        seen[:, polarity::2] = regained(rng, seen[:, polarity::2], gain)
+    return seen
+
+
+def _with_hot_pixels(rng: np.random.Generator, counts: NDArray[np.uint8], recipe: RecipeConfig) -> NDArray[np.uint8]:
+    return with_hot_pixels(rng, counts, recipe) if recipe.hot and rng.uniform() < recipe.hot else counts
+
+
+def with_hot_pixels(rng: np.random.Generator, counts: NDArray[np.uint8], recipe: RecipeConfig) -> NDArray[np.uint8]:
+    """Counts (S, 2n, H, W) with cells that fire all the time, three in the mean, each with a rate and a share of ON."""
+    seen = counts.copy(order="C")
+    segment, channels, rows, columns = seen.shape
+    for _ in range(1 + rng.poisson(2.0)):
+        rate, on = math.exp(rng.uniform(*np.log(recipe.hot_rate))), rng.uniform()
+        row, column = rng.integers(rows), rng.integers(columns)
+        fired = rng.poisson(rate * np.tile([1 - on, on], channels // 2), (segment, channels))
+        seen[:, :, row, column] = np.minimum(seen[:, :, row, column] + fired, 255)
+    return seen
 
 
 def thinned(rng: np.random.Generator, counts: NDArray[np.uint8], recipe: RecipeConfig) -> NDArray[np.uint8]:

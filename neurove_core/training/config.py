@@ -132,6 +132,12 @@ class RecipeConfig(Config):
     gain: LogSpan = Field(
         (0.5, 4.0), description="By how much, log-uniform: pixels per cell are as many as the sensor has."
     )
+    lopsided: float = Field(
+        0.0, ge=0, le=1, description="Share of segments with more of one polarity than of the other."
+    )
+    lopsided_by: LogSpan = Field((0.4, 2.5), description="So many times as many ON as before, over OFF; log-uniform.")
+    hot: float = Field(0.0, ge=0, le=1, description="Share of segments with a few hot pixels, which fire all the time.")
+    hot_rate: LogSpan = Field((0.1, 20.0), description="Of each of them, events per bin, log-uniform.")
     holes: float = Field(0.0, ge=0, le=1, description="Share of segments in whose feed are holes.")
     hole_windows: LogSpan = Field((1.0, 20.0), description="Of a hole, its length, log-uniform.")
     thinned: float = Field(0.0, ge=0, le=1, description="Share of segments with few events from some window on.")

@@ -25,12 +25,14 @@ from neurove_core.training.batches import (
     backwards,
     doubled,
     draw,
+    lopsided,
     mirrored,
     noisy,
     polarity_flipped,
     regained,
     thinned,
     with_holes,
+    with_hot_pixels,
 )
 from neurove_core.training.config import DataConfig, RecipeConfig, TrainingConfig
 from neurove_core.training.loop import CHECKPOINT, RUN_JSON, golden_windows, learn, learning_rate, train
@@ -237,6 +239,26 @@ def test_few_events_come_from_some_window_on_and_not_before():
         assert 4 <= first < 16
         assert (means[:first] == 3).all()
         assert means[first:] == pytest.approx(0.3, rel=0.15)
+
+
+def test_of_one_polarity_there_are_so_many_times_more_and_as_many_together():
+    counts = np.random.default_rng(0).poisson(2.0, (20, 4, 30, 30)).astype(np.uint8)
+    seen = lopsided(np.random.default_rng(1), counts, 4.0)
+    assert seen[:, 1::2].mean() == pytest.approx(4.0, rel=0.02)
+    assert seen[:, ::2].mean() == pytest.approx(1.0, rel=0.02)
+
+
+def test_hot_pixels_are_few_and_fire_in_every_window():
+    counts = np.zeros((40, 10, 16, 22), np.uint8)
+    recipe = RecipeConfig(hot=1.0, hot_rate=(10.0, 10.0))
+    seen = with_hot_pixels(np.random.default_rng(2), counts, recipe)
+    per_window = seen.sum(axis=1)
+    hot = per_window.any(axis=0)
+    assert 1 <= hot.sum() <= 10
+    assert (per_window[:, hot] > 0).all()
+    assert per_window[:, hot].mean() >= 0.9 * 10 * 5
+    full = np.full_like(counts, 255)
+    assert (with_hot_pixels(np.random.default_rng(2), full, recipe) == 255).all()
 
 
 @pytest.mark.parametrize(
