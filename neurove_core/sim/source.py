@@ -21,6 +21,7 @@ TRAJECTORY_OF: Final = {
     "bare-street": "driving",
     "corridor": "driving",
     "room": "handheld",
+    "plain-room": "handheld",
     "wall": "slider?vx=0.3",
 }
 """What moves the camera where nothing else is said."""

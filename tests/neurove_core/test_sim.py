@@ -65,6 +65,12 @@ def world_at(scene: str, t_s: float, seed: int = 3) -> tuple[World, np.ndarray, 
 
 
 @pytest.mark.parametrize("scene", SCENES)
+def test_every_scene_is_filmed_by_its_name_alone(scene):
+    events = Events.join(list(simulation_of(f"sim://{scene}?camera=pinhole:24x18:75&seconds=0.5").chunks()))
+    assert events.n > 100
+
+
+@pytest.mark.parametrize("scene", SCENES)
 def test_the_compiled_renderer_draws_what_the_plain_one_does(scene):
     world, position, turned = world_at(scene, 1.7)
     rays = rays_of(named_camera("pinhole:28x21:80").info)
