@@ -119,14 +119,13 @@ def diffuse(spikes: Tensor, v: Tensor, d: Tensor | float) -> Tensor:
 def lif_scan(currents: Tensor, state: LIFState, params: LIFParams) -> tuple[Tensor, LIFState]:
     """A LIF population over a sequence: currents (T, ...) to spikes (T, ...) and the last state.
 
-    On a CPU, and with the rectangular surrogate where gradients are asked for, this is one compiled pass over all
-    steps (scan.py); else, or inside `plain()`, it is `lif_scan_reference`. Spikes and state are the same bit for bit.
+    On a CPU this is one compiled pass over all steps (scan.py); else, or inside `plain()`, it is `lif_scan_reference`.
+    Spikes and state are the same bit for bit.
     """
     if currents.dtype in (torch.bfloat16, torch.float16) and state.v.dtype == torch.float32:
         currents = currents.float()  # as a sum with the potentials would: autocast keeps maps in half precision
-    trained = torch.is_grad_enabled() and (currents.requires_grad or state.v.requires_grad)
-    if not is_plain() and scan.fits(currents, state.v) and (params.surrogate == "rectangular" or not trained):
-        spikes, v = scan.scan(currents, state.v, params.decay, params.v_th, params.surrogate_width)
+    if not is_plain() and scan.fits(currents, state.v):
+        spikes, v = scan.scan(currents, state.v, params.decay, params.v_th, params.surrogate_width, params.surrogate)
         return spikes, LIFState(v)
     return lif_scan_reference(currents, state, params)
 

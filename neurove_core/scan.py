@@ -1,11 +1,13 @@
 """A population of LIF neurons over all its time steps in one pass: what `neurons.lif_scan` runs on a CPU.
 
 Step after step, plain PyTorch sends every membrane potential to memory and back some ten times per step. Here a block
-of neurons stays in the cache for all T steps; currents are read once and spikes written once. The backward pass keeps
-one byte per neuron and step instead of potentials and spikes. `neurons.lif_scan_reference` is the plain form; tests
-compare spikes and potentials bit for bit, and gradients.
+of neurons stays in the cache for all T steps; currents are read once and spikes written once. For the backward pass the
+rectangular surrogate leaves one byte per neuron and step, any other how far the potential was from the threshold.
+`neurons.lif_scan_reference` is the plain form; tests compare spikes and potentials bit for bit, and gradients.
 """
 
+import math
+from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
@@ -15,6 +17,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from neurove_core.kernels import compiled
+from neurove_core.surrogate import Surrogate
 
 Array = NDArray[Any]  # float32 or float64
 
@@ -36,21 +39,25 @@ def fits(currents: Tensor, v: Tensor) -> bool:
     )
 
 
-def scan(currents: Tensor, v: Tensor, decay: float, v_th: float, width: float) -> tuple[Tensor, Tensor]:
-    """A LIF population over a sequence, with the rectangular surrogate.
+def scan(
+    currents: Tensor, v: Tensor, decay: float, v_th: float, width: float, surrogate: Surrogate = "rectangular"
+) -> tuple[Tensor, Tensor]:
+    """A LIF population over a sequence.
 
     Args:
         currents: (T, ...) as `fits` wants them; answered in the layout that they come in, channels last too.
         v: potentials after the reset of the step before (...).
         decay: per step.
         v_th: firing threshold.
-        width: of the surrogate's window, in units of the potential.
+        width: of the surrogate, in units of the potential.
+        surrogate: what the gradient of a spike is taken for.
 
     Returns:
         spikes (T, ...) of 0 and 1, and the potentials after the last reset.
     """
     if torch.is_grad_enabled() and (currents.requires_grad or v.requires_grad):
-        return _Scan.apply(currents, v, decay, v_th, width)  # type: ignore[no-any-return, no-untyped-call]  # torch types apply as Any
+        by_surrogate = _Scan if surrogate == "rectangular" else _GradedScan
+        return by_surrogate.apply(currents, v, decay, v_th, width, surrogate)  # type: ignore[no-any-return, no-untyped-call]  # torch types apply as Any
     spikes, after, _ = _run(currents, v, decay, v_th, width, tape=False)
     return spikes, after
 
@@ -81,7 +88,7 @@ def scan_in_place(maps: Tensor, v: Tensor, decay: float, v_th: float) -> tuple[T
 class _Scan(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, currents: Tensor, v: Tensor, decay: float, v_th: float, width: float
+        ctx: Any, currents: Tensor, v: Tensor, decay: float, v_th: float, width: float, _: Surrogate
     ) -> tuple[Tensor, Tensor]:  # torch's own type
         spikes, after, codes = _run(currents, v, decay, v_th, width, tape=True)
         ctx.save_for_backward(codes)
@@ -90,17 +97,44 @@ class _Scan(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, None, None, None]:  # torch's own type
-        (codes,) = ctx.saved_tensors
-        by_spikes = _rows(grads[0], ctx.channels_last)
-        by_v = _flat(grads[1], ctx.channels_last).clone()  # becomes the gradient by v of the start
-        by_currents = torch.empty_like(by_spikes)
-        kind = by_spikes.numpy().dtype.type
-        _backward(
-            by_spikes.numpy(), codes.numpy(), by_currents.numpy(), by_v.numpy(), kind(ctx.decay), kind(ctx.height)
-        )
-        shape, channels_last = grads[0].shape, ctx.channels_last
-        return _shaped(by_currents, shape, channels_last), _shaped(by_v, shape[1:], channels_last), None, None, None
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, None, None, None, None]:  # torch's own type
+        return *_back(_backward, ctx, grads, ctx.decay, ctx.height), None, None, None, None
+
+
+class _GradedScan(torch.autograd.Function):
+    """The same for a surrogate that is no window: its height depends on how far a potential is from the threshold."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, currents: Tensor, v: Tensor, decay: float, v_th: float, width: float, surrogate: Surrogate
+    ) -> tuple[Tensor, Tensor]:  # torch's own type
+        channels_last = _is_channels_last(currents)
+        rows, after = _rows(currents.detach(), channels_last), _flat(v.detach(), channels_last).clone()
+        spikes, distances = torch.empty_like(rows), torch.empty_like(rows)
+        kind = rows.numpy().dtype.type
+        _forward_graded(rows.numpy(), after.numpy(), spikes.numpy(), distances.numpy(), kind(decay), kind(v_th))
+        ctx.save_for_backward(distances)
+        ctx.decay, ctx.width, ctx.channels_last, ctx.arctan = decay, width, channels_last, surrogate == "arctan"
+        shape = currents.shape
+        return _shaped(spikes, shape, channels_last), _shaped(after, shape[1:], channels_last)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, None, None, None, None]:  # torch's own type
+        kernel = _backward_arctan if ctx.arctan else _backward_triangle
+        return *_back(kernel, ctx, grads, ctx.decay, ctx.width), None, None, None, None
+
+
+def _back(kernel: Callable[..., None], ctx: Any, grads: tuple[Tensor, ...], *constants: float) -> tuple[Tensor, Tensor]:
+    """Gradients by the currents and by the potentials of the start, by a kernel that reads the tape of ctx."""
+    (tape,) = ctx.saved_tensors
+    by_spikes = _rows(grads[0], ctx.channels_last)
+    by_v = _flat(grads[1], ctx.channels_last).clone()  # becomes the gradient by v of the start
+    by_currents = torch.empty_like(by_spikes)
+    kind = by_spikes.numpy().dtype.type
+    kernel(by_spikes.numpy(), tape.numpy(), by_currents.numpy(), by_v.numpy(), *map(kind, constants))
+    shape = grads[0].shape
+    return _shaped(by_currents, shape, ctx.channels_last), _shaped(by_v, shape[1:], ctx.channels_last)
 
 
 def _run(
@@ -181,6 +215,65 @@ def _backward(
             for i in range(stop - start):
                 slope = height if code[i] & NEAR else none
                 kept = none if code[i] & FIRED else one
+                u = pull[i] * slope + carried[i] * kept
+                out[i] = u
+                carried[i] = decay * u
+
+
+@compiled
+def _forward_graded(
+    currents: Array, v: Array, spikes: Array, distances: Array, decay: Any, v_th: Any
+) -> None:  # pragma: no cover (machine code)
+    steps, n = currents.shape
+    one, none = v.dtype.type(1), v.dtype.type(0)
+    for start in range(0, n, _BLOCK):
+        stop = min(start + _BLOCK, n)
+        v_now = v[start:stop]
+        for t in range(steps):
+            current, s, distance = currents[t, start:stop], spikes[t, start:stop], distances[t, start:stop]
+            for i in range(stop - start):
+                u = decay * v_now[i] + current[i]
+                distance[i] = u - v_th
+                fired = one if u - v_th >= none else none
+                s[i] = fired
+                v_now[i] = u * (one - fired)
+
+
+@compiled
+def _backward_arctan(
+    by_spikes: Array, distances: Array, by_currents: Array, by_v: Array, decay: Any, width: Any
+) -> None:  # pragma: no cover (machine code)
+    steps, n = by_spikes.shape
+    one, none = by_v.dtype.type(1), by_v.dtype.type(0)
+    per_width = by_v.dtype.type(math.pi) / width
+    for start in range(0, n, _BLOCK):
+        stop = min(start + _BLOCK, n)
+        carried = by_v[start:stop]
+        for t in range(steps - 1, -1, -1):
+            pull, distance, out = by_spikes[t, start:stop], distances[t, start:stop], by_currents[t, start:stop]
+            for i in range(stop - start):
+                far = per_width * distance[i]
+                kept = none if distance[i] >= none else one
+                u = pull[i] / (width * (one + far * far)) + carried[i] * kept
+                out[i] = u
+                carried[i] = decay * u
+
+
+@compiled
+def _backward_triangle(
+    by_spikes: Array, distances: Array, by_currents: Array, by_v: Array, decay: Any, width: Any
+) -> None:  # pragma: no cover (machine code)
+    steps, n = by_spikes.shape
+    one, none = by_v.dtype.type(1), by_v.dtype.type(0)
+    for start in range(0, n, _BLOCK):
+        stop = min(start + _BLOCK, n)
+        carried = by_v[start:stop]
+        for t in range(steps - 1, -1, -1):
+            pull, distance, out = by_spikes[t, start:stop], distances[t, start:stop], by_currents[t, start:stop]
+            for i in range(stop - start):
+                near = one - abs(distance[i]) / width
+                slope = near / width if near > none else none
+                kept = none if distance[i] >= none else one
                 u = pull[i] * slope + carried[i] * kept
                 out[i] = u
                 carried[i] = decay * u

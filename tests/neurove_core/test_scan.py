@@ -132,12 +132,13 @@ def test_half_precision_and_one_state_for_all_neurons_take_the_plain_way():
         assert torch.equal(spikes, lif_scan_reference(odd, LIFState(state), PARAMS)[0])
 
 
-def test_inside_plain_every_step_is_autograds_and_outside_it_is_not():
+@pytest.mark.parametrize("surrogate", ["rectangular", "arctan", "triangle"])
+def test_inside_plain_every_step_is_autograds_and_outside_it_is_not(surrogate):
     currents, v = make_currents()
     currents.requires_grad_()
 
     def recorded() -> str:
-        return type(lif_scan(currents, LIFState(v), PARAMS)[0].grad_fn).__name__
+        return type(lif_scan(currents, LIFState(v), PARAMS._replace(surrogate=surrogate))[0].grad_fn).__name__
 
     with plain():
         assert "Stack" in recorded()
