@@ -82,6 +82,7 @@ class Extractor:
 
     def __init__(self, layers: list[Layer], sizes: list[tuple[int, int]], lif: LIFParams) -> None:
         self._layers, self._lif = layers, lif
+        self._decay, self._v_th = np.float32(lif.decay), np.float32(lif.v_th)
         self._blocks = [(_over_a_block(layer.factor), _over_a_block(layer.offset)) for layer in layers]
         tops = [255] + [1] * (len(layers) - 1)
         self._plain = [plain_sums(layer.weights.q, top) for layer, top in zip(layers, tops, strict=True)]
@@ -105,14 +106,12 @@ class Extractor:
         return spikes.flatten(0, 1).to(torch.uint8), after.v
 
     def _fire(self, found: Tensor, block: tuple[Array, Array], v: Tensor) -> tuple[Tensor, Tensor]:
-        rows = found.permute(0, 2, 3, 1).contiguous()
+        rows = np.ascontiguousarray(found.numpy().transpose(0, 2, 3, 1))
         before = np.ascontiguousarray(v.detach().numpy().transpose(0, 2, 3, 1))
-        after = np.empty_like(before)
-        spikes = torch.empty_like(rows, dtype=torch.uint8)
-        flat, decay, v_th = before.size, np.float32(self._lif.decay), np.float32(self._lif.v_th)
-        sums_of_steps, fired = rows.numpy().reshape(-1, flat), spikes.numpy().reshape(-1, flat)
-        _scan(sums_of_steps, *block, before.reshape(-1), after.reshape(-1), decay, v_th, fired)
-        return spikes.permute(0, 3, 1, 2), torch.from_numpy(after).permute(0, 3, 1, 2)
+        spikes, after = np.empty(rows.shape, np.uint8), np.empty_like(before)
+        steps = rows.reshape(-1, before.size), *block, before.reshape(-1), after.reshape(-1)
+        _scan(*steps, self._decay, self._v_th, spikes.reshape(-1, before.size))
+        return torch.from_numpy(spikes).permute(0, 3, 1, 2), torch.from_numpy(after).permute(0, 3, 1, 2)
 
 
 def _over_a_block(by_channel: Tensor) -> Array:
@@ -202,7 +201,7 @@ def _scan(
     v_th: Any,
     spikes: NDArray[np.uint8],
 ) -> None:  # pragma: no cover (machine code)
-    """As scan._in_place, of currents found * factor + offset; channels vary fastest.
+    """As scan._in_place, of currents found * factor + offset; channels vary fastest. Two steps are taken at a time.
 
     Args:
         found: (T, N).
@@ -216,12 +215,24 @@ def _scan(
     """
     steps, n = found.shape
     one, none = after.dtype.type(1), after.dtype.type(0)
+    even = steps - steps % 2
     for start in range(0, n, factor.size):
         stop = min(start + factor.size, n)
         v_before, v_now = before[start:stop], after[start:stop]
         for i in range(stop - start):
             v_now[i] = v_before[i]
-        for t in range(steps):
+        for t in range(0, even, 2):
+            row, s = found[t, start:stop], spikes[t, start:stop]
+            next_row, next_s = found[t + 1, start:stop], spikes[t + 1, start:stop]
+            for i in range(stop - start):
+                u = decay * v_now[i] + (row[i] * factor[i] + offset[i])
+                fires = u - v_th >= none
+                s[i] = np.uint8(fires)
+                u = decay * (u * (none if fires else one)) + (next_row[i] * factor[i] + offset[i])
+                fires = u - v_th >= none
+                next_s[i] = np.uint8(fires)
+                v_now[i] = u * (none if fires else one)
+        for t in range(even, steps):
             row, s = found[t, start:stop], spikes[t, start:stop]
             for i in range(stop - start):
                 u = decay * v_now[i] + (row[i] * factor[i] + offset[i])
