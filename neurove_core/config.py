@@ -56,7 +56,7 @@ class NetworkConfig(Config):
 
     encoding: Literal["binary", "log1p"] = Field("log1p", description="Counts to input: 0/1, or log(1 + count).")
     precision: Literal["float32", "int8"] = Field(
-        "float32", description="Of the convolutions; int8 rounds their weights to 8 bits and the input to 1/32."
+        "float32", description="Of extractor and projection; int8 rounds their weights to 8 bits, the input to 1/32."
     )
     channels: Annotated[tuple[int, ...], Field(min_length=1, max_length=8)] = (16, 32, 64, 64)
     features: int = Field(128, ge=1, le=4096, description="Width of the layer between extractor and estimator.")

@@ -54,7 +54,11 @@ class Engine:
                 )
             else:
                 self._convolutions = [_convolution(block, *size) for block, size in zip(blocks, sizes, strict=False)]
-            self._project = _projection(network, net.channels[-1], *sizes[-1])
+            self._project: Folded | int8.Projection
+            if net.precision == "int8":
+                self._project = int8.Projection(_int8_projection(network, net.channels[-1], *sizes[-1]))
+            else:
+                self._project = _projection(network, net.channels[-1], *sizes[-1])
             self._readout = Folded(*(tensor.detach().clone() for tensor in network.outputs()))
             self._kappa = float(torch.sigmoid(network.kappa_logit))
             cells = [cell for cell in network.cells if isinstance(cell, ASLSTM)]
@@ -77,7 +81,7 @@ class Engine:
         """
         steps, batch = spikes.shape[:2]
         x, membranes = self._features(spikes, state)
-        rows = x.permute(0, 2, 3, 1).reshape(steps * batch, -1)  # as it lies in memory
+        rows = self._rows(x)
         answers, cells, y = (self._plain_cells if is_plain() else self._fused_cells)(rows, steps, state)
         twists = answers[..., : 6 * self._bins].reshape(steps, batch, self._bins, 6)
         return twists, NetworkState(membranes, cells, y)
@@ -101,7 +105,7 @@ class Engine:
             LIFState(torch.cat([m.v for m in maps])) for maps in zip(*(s.membranes for s in states), strict=True)
         )
         x, membranes = self._features(spikes, NetworkState(together, (), states[0].readout))
-        rows = x.permute(0, 2, 3, 1).reshape(len(states), -1)
+        rows = self._rows(x)
         answers = []
         for b, state in enumerate(states):
             found, cells, y = (self._plain_cells if is_plain() else self._fused_cells)(rows[b : b + 1], 1, state)
@@ -113,7 +117,8 @@ class Engine:
     @torch.inference_mode()
     def features(self, spikes: Tensor, state: NetworkState) -> tuple[Tensor, tuple[LIFState, ...]]:
         """Spikes (T * B, C, H', W') of the last map of the feature extractor alone, and its membranes after them."""
-        return self._features(spikes, state)
+        x, membranes = self._features(spikes, state)
+        return x.float(), membranes
 
     def _features(self, spikes: Tensor, state: NetworkState) -> tuple[Tensor, tuple[LIFState, ...]]:
         if self._extractor is not None:
@@ -125,6 +130,11 @@ class Engine:
             x, after = fire(convolve(x), membrane.v)
             membranes.append(LIFState(after))
         return x, tuple(membranes)
+
+    def _rows(self, x: Tensor) -> Tensor:
+        """What the cells are given of the last map (R, C, H, W): its spikes (R, I), in int8 their projection (R, F)."""
+        rows = x.permute(0, 2, 3, 1).flatten(1)  # as it lies in memory
+        return self._project(rows) if isinstance(self._project, int8.Projection) else rows
 
     def _fused_fire(self, currents: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         return scan.scan_in_place(currents, v, self._lif.decay, self._lif.v_th)
@@ -139,7 +149,7 @@ class Engine:
         carried = torch.stack([field for cell in state.cells for field in cell])  # (3 L, B, N): c, v, s of each layer
         y = state.readout.clone()
         answers = torch.empty(steps, *y.shape)
-        features = self._project.bias.numel()
+        features = self._project.bias.numel() if isinstance(self._project, Folded) else 0
         _cells(rows.numpy(), self._weights, features, self._constants, carried.numpy(), y.numpy(), answers.numpy())
         fields = carried.unbind()
         return answers, tuple(ASLSTMState(*fields[i : i + 3]) for i in range(0, len(fields), 3)), y
@@ -148,7 +158,8 @@ class Engine:
         self, rows: Tensor, steps: int, state: NetworkState
     ) -> tuple[Tensor, tuple[ASLSTMState, ...], Tensor]:
         y, cells, answers = state.readout, list(state.cells), []
-        for z in linear(rows, *self._project).view(steps, rows.shape[0] // steps, -1):
+        x = linear(rows, *self._project) if isinstance(self._project, Folded) else rows
+        for z in x.view(steps, rows.shape[0] // steps, -1):
             for index, params in enumerate(self._params):
                 cells[index] = aslstm_step(z, cells[index], params)
                 z = diffuse(cells[index].s, cells[index].v, self._d_space[index])
@@ -191,18 +202,26 @@ def _projection(network: NeuroVE, channels: int, rows: int, columns: int) -> Fol
     return Folded(weight.view(-1, channels, rows, columns).permute(0, 2, 3, 1).flatten(1).contiguous(), bias)
 
 
+def _int8_projection(network: NeuroVE, channels: int, rows: int, columns: int) -> int8.Layer:
+    """The same in whole numbers; the norm's factor takes the step of the weights with it."""
+    (q, step), norm = int8.quantised(network.project.weight), network.project_norm
+    factor, offset = folded(step.double().view(-1, 1), norm)
+    q = q.view(-1, channels, rows, columns).permute(0, 2, 3, 1).flatten(1)
+    return int8.Layer(int8.Quantised(q, step), factor.view(-1).float(), offset.float())
+
+
 def _copied(params: ASLSTMParams) -> ASLSTMParams:
     w_x, w_v, b, d_time = (tensor.detach().clone() for tensor in (params.w_x, params.w_v, params.b, params.d_time))
     return ASLSTMParams(w_x, w_v, b, d_time, params.alpha, params.v_th)
 
 
-def _flattened(project: Folded, cells: list[ASLSTMParams], d_space: Tensor, readout: Folded) -> Array:
+def _flattened(project: Folded | int8.Projection, cells: list[ASLSTMParams], d_space: Tensor, readout: Folded) -> Array:
     """All weights of the compiled pass in one vector, in the order in which `_cells` takes them off it.
 
     Matrices are transposed, so that a row is what one input gives to all outputs; one array is handed over in a few
-    microseconds, twenty would take longer than a layer.
+    microseconds, twenty would take longer than a layer. A projection in int8 is none of it.
     """
-    tensors = [project.weight.T, project.bias]
+    tensors = [project.weight.T, project.bias] if isinstance(project, Folded) else []
     for params, d in zip(cells, d_space, strict=True):
         tensors += [params.w_x.T, params.w_v.T, params.b, params.d_time, d]
     tensors += [readout.weight.T, readout.bias]
@@ -305,17 +324,19 @@ def _layer(x, weights, at, c, v, s, alpha, v_th):  # type: ignore[no-untyped-def
 
 @fused
 def _cells(rows, weights, features, constants, carried, y, answers):  # type: ignore[no-untyped-def]  # compiled for its arguments
-    """From the last map's spikes (T * B, cells of it) to answers (T, B, R).
+    """From the last map's spikes (T * B, cells of it) to answers (T, B, R); features 0: rows are projected already.
 
     The carried c, v, s of each layer (3 L, B, N) and the potentials y (B, R) of the readout move on in place.
     """
     steps, batch, outputs = answers.shape
     layers, _, hidden = carried.shape
     alpha, v_th, kappa = constants
-    project, at = _matrix(weights, 0, rows.shape[1], features)
-    bias, at = _matrix(weights, at, 1, features)
-    x = _rows_of(bias[0], steps * batch)
-    _add_product(rows, project, x)
+    x, at = rows, 0
+    if features:
+        project, at = _matrix(weights, at, rows.shape[1], features)
+        bias, at = _matrix(weights, at, 1, features)
+        x = _rows_of(bias[0], steps * batch)
+        _add_product(rows, project, x)
     for layer in range(0, layers, 3):
         x, at = _layer(x, weights, at, carried[layer], carried[layer + 1], carried[layer + 2], alpha, v_th)
     readout, at = _matrix(weights, at, hidden, outputs)

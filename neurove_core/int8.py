@@ -1,12 +1,12 @@
-"""Convolutions in 8-bit integers, for networks whose bundle asks for them: same spikes as in float32, bit for bit.
+"""Convolutions and projection in 8-bit integers, for networks whose bundle asks for them: as in float32, bit for bit.
 
-    precision = "int8": every convolution's weights are whole multiples q of a step per output channel, |q| <= 127,
-    and the network's input is rounded to 1/32. Spikes are 0 or 1.
+    precision = "int8": the weights of every convolution and of the projection are whole multiples q of a step per
+    output channel, |q| <= 127, and the network's input is rounded to 1/32. Spikes are 0 or 1.
 
-So a convolution is a sum of products of whole numbers, exact in any order and any arithmetic that can hold it: int32,
-or float32 below 2**24. The norm's factor and offset follow in float32, one product and one sum for each neuron, and
-then the LIF scan. `neurons.plain()` computes the same with the public float32 operators; tests compare bit for bit.
-Training sees the rounding (`rounded`) and passes gradients through it.
+So a convolution or a projection is a sum of products of whole numbers, exact in any order and any arithmetic that can
+hold it: int32, or float32 below 2**24. The norm's factor and offset follow in float32, one product and one sum for each
+neuron, and then the LIF scan or the first cell. `neurons.plain()` computes the same with the public float32 operators;
+tests compare bit for bit. Training sees the rounding (`rounded`) and passes gradients through it.
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import conv2d
+from torch.nn.functional import conv2d, linear
 
 from neurove_core.compiled import compiled
 from neurove_core.convolution import Convolution, say_once
@@ -28,6 +28,7 @@ LEVELS: Final = 32
 _MOST: Final = 127  # of a weight
 _EXACT: Final = 1 << 24  # whole numbers below this are exact in float32
 _BLOCK: Final = 1024  # neurons whose potentials stay in the first cache over all steps
+_GATHERED: Final = 256  # inputs whose weights are summed in 16 bits: 256 * 127 < 2**15
 
 Array = NDArray[Any]
 
@@ -35,22 +36,30 @@ Array = NDArray[Any]
 class Quantised(NamedTuple):
     """Weights as whole numbers."""
 
-    q: Tensor  # (C', C, 3, 3) int8
+    q: Tensor  # (C', C, 3, 3) of a convolution, (F, I) of the projection, int8
     step: Tensor  # (C') float32, positive: weight = q * step
 
 
 def quantised(weight: Tensor) -> Quantised:
     """The nearest multiples of a step per output channel, which is its largest weight / 127."""
-    largest = weight.detach().abs().flatten(1).amax(dim=1)
-    step = torch.where(largest > 0, largest, torch.ones_like(largest)) / _MOST
-    q = (weight.detach() / step.view(-1, 1, 1, 1)).round().clamp(-_MOST, _MOST)
-    return Quantised(q.to(torch.int8), step)
+    whole, step = _multiples(weight)
+    return Quantised(whole.to(torch.int8), step)
 
 
 def rounded(weight: Tensor) -> Tensor:
     """The weights that `quantised` stands for, in float32; gradients pass as if nothing were rounded."""
-    q, step = quantised(weight)
-    return weight + (q * step.view(-1, 1, 1, 1) - weight).detach()
+    whole, step = _multiples(weight)
+    return weight + whole.mul_(_by_output(step, weight)).sub_(weight.detach())  # in place: a projection may be large
+
+
+def _multiples(weight: Tensor) -> tuple[Tensor, Tensor]:
+    largest = torch.linalg.vector_norm(weight.detach().flatten(1), torch.inf, dim=1)
+    step = torch.where(largest > 0, largest, torch.ones_like(largest)) / _MOST
+    return weight.detach().div(_by_output(step, weight)).round_().clamp_(-_MOST, _MOST), step
+
+
+def _by_output(step: Tensor, weight: Tensor) -> Tensor:
+    return step.view(-1, *[1] * (weight.dim() - 1))
 
 
 def rounded_input(spikes: Tensor) -> Tensor:
@@ -64,7 +73,7 @@ def codes(spikes: Tensor) -> Tensor:
 
 
 class Layer(NamedTuple):
-    """One block of the extractor: whole numbers in, spikes out."""
+    """One block of the extractor, whole numbers in and spikes out; or the projection, spikes in and currents out."""
 
     weights: Quantised
     factor: Tensor  # (C') float32: of the norm and the steps
@@ -82,13 +91,14 @@ class Extractor:
 
     def __init__(self, layers: list[Layer], sizes: list[tuple[int, int]], lif: LIFParams) -> None:
         self._layers, self._lif = layers, lif
+        self._decay, self._v_th = np.float32(lif.decay), np.float32(lif.v_th)
         self._blocks = [(_over_a_block(layer.factor), _over_a_block(layer.offset)) for layer in layers]
         tops = [255] + [1] * (len(layers) - 1)
         self._plain = [plain_sums(layer.weights.q, top) for layer, top in zip(layers, tops, strict=True)]
         self._fast = [sums(layer.weights.q, top, *size) for layer, top, size in zip(layers, tops, sizes, strict=False)]
 
     def __call__(self, spikes: Tensor, membranes: tuple[LIFState, ...]) -> tuple[Tensor, tuple[LIFState, ...]]:
-        """Input (T * B, 2n, H, W), as float32 or as uint8 codes, to spikes (T * B, C', H', W') and potentials."""
+        """Input (T * B, 2n, H, W), as float32 or as uint8 codes, to uint8 spikes (T * B, C', H', W') and potentials."""
         x = (spikes if spikes.dtype == torch.uint8 else codes(spikes)).contiguous(memory_format=torch.channels_last)
         after = []
         for index, (layer, membrane) in enumerate(zip(self._layers, membranes, strict=True)):
@@ -97,7 +107,7 @@ class Extractor:
             else:
                 x, v = self._fire(self._fast[index](x), self._blocks[index], membrane.v)
             after.append(LIFState(v))
-        return x.float(), tuple(after)
+        return x, tuple(after)
 
     def _plain_fire(self, found: Tensor, layer: Layer, v: Tensor) -> tuple[Tensor, Tensor]:
         currents = found * layer.factor.view(-1, 1, 1) + layer.offset.view(-1, 1, 1)
@@ -105,14 +115,35 @@ class Extractor:
         return spikes.flatten(0, 1).to(torch.uint8), after.v
 
     def _fire(self, found: Tensor, block: tuple[Array, Array], v: Tensor) -> tuple[Tensor, Tensor]:
-        rows = found.permute(0, 2, 3, 1).contiguous()
+        rows = np.ascontiguousarray(found.numpy().transpose(0, 2, 3, 1))
         before = np.ascontiguousarray(v.detach().numpy().transpose(0, 2, 3, 1))
-        after = np.empty_like(before)
-        spikes = torch.empty_like(rows, dtype=torch.uint8)
-        flat, decay, v_th = before.size, np.float32(self._lif.decay), np.float32(self._lif.v_th)
-        sums_of_steps, fired = rows.numpy().reshape(-1, flat), spikes.numpy().reshape(-1, flat)
-        _scan(sums_of_steps, *block, before.reshape(-1), after.reshape(-1), decay, v_th, fired)
-        return spikes.permute(0, 3, 1, 2), torch.from_numpy(after).permute(0, 3, 1, 2)
+        spikes, after = np.empty(rows.shape, np.uint8), np.empty_like(before)
+        steps = rows.reshape(-1, before.size), *block, before.reshape(-1), after.reshape(-1)
+        _scan(*steps, self._decay, self._v_th, spikes.reshape(-1, before.size))
+        return torch.from_numpy(spikes).permute(0, 3, 1, 2), torch.from_numpy(after).permute(0, 3, 1, 2)
+
+
+class Projection:
+    """The projection of one network in whole numbers: weights are read where a spike asks for them, and added up.
+
+    Args:
+        layer: its weights (F, I), in the order in which spikes lie in memory.
+    """
+
+    def __init__(self, layer: Layer) -> None:
+        self.layer = layer
+        self._largest = _largest_sum(layer.weights.q)
+        self._rows = layer.weights.q.T.contiguous().numpy()  # (I, F): what one spike gives to all features
+
+    def __call__(self, spikes: Tensor) -> Tensor:
+        """Spikes (R, I), uint8 of 0 and 1, to currents (R, F)."""
+        (q, _), factor, offset = self.layer
+        if is_plain() or self._largest >= 1 << 31:
+            kind = torch.float32 if self._largest < _EXACT else torch.float64
+            return linear(spikes.to(kind), q.to(kind)).to(torch.float32) * factor + offset
+        currents = torch.empty(spikes.shape[0], q.shape[0])
+        _gather(spikes.numpy(), self._rows, factor.numpy(), offset.numpy(), currents.numpy())
+        return currents
 
 
 def _over_a_block(by_channel: Tensor) -> Array:
@@ -157,7 +188,12 @@ def plain_sums(q: Tensor, top: int) -> Convolution:
 
 
 def _exact_in_float32(q: Tensor, top: int) -> bool:
-    return int(q.abs().to(torch.int64).flatten(1).sum(dim=1).max()) * top < _EXACT
+    return _largest_sum(q) * top < _EXACT
+
+
+def _largest_sum(q: Tensor) -> int:
+    """Of any output, where every input is one."""
+    return int(q.abs().flatten(1).sum(dim=1).max())  # torch adds up int8 in int64
 
 
 def _packed(q: Tensor, rows: int, columns: int) -> Convolution:
@@ -202,7 +238,7 @@ def _scan(
     v_th: Any,
     spikes: NDArray[np.uint8],
 ) -> None:  # pragma: no cover (machine code)
-    """As scan._in_place, of currents found * factor + offset; channels vary fastest.
+    """As scan._in_place, of currents found * factor + offset; channels vary fastest. Two steps are taken at a time.
 
     Args:
         found: (T, N).
@@ -216,15 +252,73 @@ def _scan(
     """
     steps, n = found.shape
     one, none = after.dtype.type(1), after.dtype.type(0)
+    even = steps - steps % 2
     for start in range(0, n, factor.size):
         stop = min(start + factor.size, n)
         v_before, v_now = before[start:stop], after[start:stop]
         for i in range(stop - start):
             v_now[i] = v_before[i]
-        for t in range(steps):
+        for t in range(0, even, 2):
+            row, s = found[t, start:stop], spikes[t, start:stop]
+            next_row, next_s = found[t + 1, start:stop], spikes[t + 1, start:stop]
+            for i in range(stop - start):
+                u = decay * v_now[i] + (row[i] * factor[i] + offset[i])
+                fires = u - v_th >= none
+                s[i] = np.uint8(fires)
+                u = decay * (u * (none if fires else one)) + (next_row[i] * factor[i] + offset[i])
+                fires = u - v_th >= none
+                next_s[i] = np.uint8(fires)
+                v_now[i] = u * (none if fires else one)
+        for t in range(even, steps):
             row, s = found[t, start:stop], spikes[t, start:stop]
             for i in range(stop - start):
                 u = decay * v_now[i] + (row[i] * factor[i] + offset[i])
                 fires = u - v_th >= none
                 s[i] = np.uint8(fires)
                 v_now[i] = u * (none if fires else one)
+
+
+@compiled
+def _gather(
+    spikes: NDArray[np.uint8], weights: NDArray[np.int8], factor: Array, offset: Array, currents: Array
+) -> None:  # pragma: no cover (machine code)
+    """Currents factor * sum + offset, sum = spikes times weights; rows of weights that no spike asks for are not read.
+
+    Sums are of 32 bits and become float32 once, rounded where they are 2**24 or more, as those of float64 would.
+
+    Args:
+        spikes: (R, I) of 0 and 1.
+        weights: (I, F).
+        factor: of the features (F).
+        offset: of the same.
+        currents: (R, F), written.
+    """
+    rows, inputs = spikes.shape
+    features = factor.size
+    sums_of_rows, part = np.zeros((rows, features), np.int32), np.empty(features, np.int16)
+    asked = np.empty(_GATHERED, np.int64)
+    for start in range(0, inputs, _GATHERED):
+        stop = min(start + _GATHERED, inputs)
+        for r in range(rows):  # a block's weights stay in the second cache over all rows
+            fired, found = spikes[r, start:stop], 0
+            for i in range(stop - start):
+                asked[found] = start + i
+                found += fired[i]
+            for j in range(features):
+                part[j] = 0
+            whole = found - found % 4
+            for n in range(0, whole, 4):
+                w0, w1, w2, w3 = weights[asked[n]], weights[asked[n + 1]], weights[asked[n + 2]], weights[asked[n + 3]]
+                for j in range(features):
+                    part[j] += np.int16(w0[j]) + np.int16(w1[j]) + np.int16(w2[j]) + np.int16(w3[j])
+            for n in range(whole, found):
+                w0 = weights[asked[n]]
+                for j in range(features):
+                    part[j] += np.int16(w0[j])
+            total = sums_of_rows[r]
+            for j in range(features):
+                total[j] += np.int32(part[j])
+    for r in range(rows):
+        current, total = currents[r], sums_of_rows[r]
+        for j in range(features):
+            current[j] = np.float32(total[j]) * factor[j] + offset[j]

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import conv2d
+from torch.nn.functional import conv2d, linear
 
 from neurove_core import carried
 from neurove_core.cells import ASLSTM, ASLSTMState, readout_step
@@ -55,7 +55,8 @@ class SpikingBlock(nn.Module):
 class NeuroVE(nn.Module):
     """The network of paper Fig. 2: one time step per window, 2n channels in, n twists out, all state streamed.
 
-    Its outputs are in the bundle's scaled units; Estimator turns them into m/s and rad/s.
+    Its outputs are in the bundle's scaled units; Estimator turns them into m/s and rad/s. In int8 the weights of its
+    convolutions and of its projection are rounded to 8 bits, in training too (decision 38).
     """
 
     def __init__(self, config: ModelConfig) -> None:
@@ -156,7 +157,8 @@ class NeuroVE(nn.Module):
         for block, membrane in zip(self.blocks, state.membranes, strict=True):
             spikes, membrane = block(spikes, membrane)
             membranes.append(membrane)
-        x = self.project_norm(self.project(spikes.flatten(2).flatten(0, 1))).unflatten(0, (steps, batch))
+        weight = rounded(self.project.weight) if self._int8 else self.project.weight
+        x = self.project_norm(linear(spikes.flatten(2).flatten(0, 1), weight)).unflatten(0, (steps, batch))
         cells = []
         for index, (layer, cell) in enumerate(zip(self._layers(), state.cells, strict=True)):
             scanned, last = layer(x, cell)

@@ -40,7 +40,7 @@ def window(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool
 
 
 def with_precision(config: ModelConfig, precision: str) -> ModelConfig:
-    """The same network with its convolutions in float32 or int8."""
+    """The same network with its extractor and projection in float32 or int8."""
     return config.model_copy(update={"network": config.network.model_copy(update={"precision": precision})})
 
 

@@ -204,7 +204,7 @@ def _network(config: TrainingConfig, ranks: Ranks) -> tuple[Network, torch.optim
 def check_start(start: Bundle, config: TrainingConfig) -> None:
     """Refuse to begin from a model whose weights would mean something else in the configuration's network.
 
-    What shapes no tensor may differ: how gradients pass a spike, and the precision of the convolutions.
+    What shapes no tensor may differ: how gradients pass a spike, and the precision of the weights.
 
     Raises:
         BadModel: a field that differs is named with both values.

@@ -20,7 +20,8 @@ SMALL = ModelConfig(
     network=NetworkConfig(channels=(6, 8), features=13, hidden=11, cells=3, v_th=0.4),
 )
 SHIPPED = ModelConfig(network=NetworkConfig(v_th=0.4))
-each_shape = pytest.mark.parametrize("config", [SMALL, SHIPPED], ids=["small", "shipped"])
+INT8 = SMALL.model_copy(update={"network": SMALL.network.model_copy(update={"precision": "int8"})})
+each_shape = pytest.mark.parametrize("config", [SMALL, SHIPPED, INT8], ids=["small", "shipped", "int8"])
 
 
 def make_network(config: ModelConfig, seed: int = 0) -> NeuroVE:

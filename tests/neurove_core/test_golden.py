@@ -14,7 +14,7 @@ from neurove_core.golden import Golden
 from protocol import Sensor
 from protocol.errors import BadModel
 from tests.builders import make_events
-from tests.bundles import CONFIG, ORIGINAL, refusal, with_fields, with_tensors
+from tests.bundles import CONFIG, ORIGINAL, make_bundle, refusal, with_fields, with_tensors
 
 
 def make_counts(windows: int = 5, *, mean: float = 0.4, seed: int = 0, config: ModelConfig = CONFIG):
@@ -82,6 +82,16 @@ def test_a_machine_that_computes_otherwise_is_refused_with_window_bin_and_axis(a
     with pytest.raises(BadModel, match=rf"golden test: window 3, bin 1: {('vx', 'vy', 'vz', 'wx', 'wy', 'wz')[axis]}="):
         golden.check(Estimator(replace(model, golden=model.golden._replace(twists=wrong))))
     golden.check(Estimator(replace(model, golden=model.golden._replace(twists=wrong, tolerance=0.05))))
+
+
+@pytest.mark.parametrize("precision", ["float32", "int8"])
+def test_a_refused_int8_model_is_told_that_its_precision_once_meant_less(precision):
+    network = CONFIG.network.model_copy(update={"precision": precision})
+    model = with_test(model=make_bundle(network=network))
+    off = model.golden._replace(twists=model.golden.twists + np.float32(0.1))
+    with pytest.raises(BadModel, match="golden test: window") as refused:
+        golden.check(Estimator(replace(model, golden=off)))
+    assert ("before the projection was in int8" in str(refused.value)) == (precision == "int8")
 
 
 def test_the_tolerance_is_a_share_of_the_models_own_scale():

@@ -1,4 +1,4 @@
-"""An int8 network fires in 8-bit integers as in float32, bit for bit, and learns through the rounding."""
+"""An int8 network fires and projects in 8-bit integers as in float32, bit for bit, and learns through the rounding."""
 
 import logging
 
@@ -57,18 +57,92 @@ def test_the_engine_answers_as_the_network_does_that_training_sees():
         assert ((one.v == 0) != (other.v == 0)).double().mean() < 5e-3
 
 
-def test_weights_move_by_half_a_step_at_most_and_rounding_again_changes_nothing():
-    weight = torch.randn(5, 4, 3, 3) * torch.tensor([1e-3, 1.0, 50.0, 0.0, 1.0]).view(-1, 1, 1, 1)
+@pytest.mark.parametrize("steps", [1, 2, 5])
+@pytest.mark.parametrize("seed", range(3))
+def test_window_after_window_fires_and_projects_as_in_float32_bit_for_bit(seed, steps):
+    """Calls of odd and even lengths, whose state goes on; the first of zeros, the third with every cell at its most."""
+    engine, projection = Engine(network_of(SHIPPED, seed)), projection_of(64 * 5 * 6, 128, seed)
+    states = [network_of(SHIPPED, seed).initial_state(2) for _ in range(2)]
+    for turn in range(5):
+        spikes = draw(SHIPPED, 2, steps, seed=turn) if turn else torch.zeros_like(draw(SHIPPED, 2, steps))
+        if turn == 2:
+            spikes = torch.full_like(spikes, 256.0).log()
+        found, after = engine.features(spikes, states[0])
+        rows = found.permute(0, 2, 3, 1).flatten(1).to(torch.uint8)
+        currents, states[0] = projection(rows), engine(spikes, states[0])[1]
+        with plain():
+            expected, expected_after = engine.features(spikes, states[1])
+            expected_currents, states[1] = projection(rows), engine(spikes, states[1])[1]
+        assert torch.equal(found, expected)
+        assert torch.equal(currents, expected_currents)
+        for one, other in zip(after, expected_after, strict=True):
+            assert torch.equal(one.v, other.v)
+        for one, other in zip(states[0].cells, states[1].cells, strict=True):
+            assert torch.equal(one.s, other.s)
+
+
+def projection_of(inputs: int, features: int, seed: int = 0, *, q: torch.Tensor | None = None) -> int8.Projection:
+    generator = torch.Generator().manual_seed(seed)
+    if q is None:
+        q = torch.randint(-127, 128, (features, inputs), generator=generator, dtype=torch.int8)
+    step, factor, offset = torch.rand(3, features, generator=generator)
+    return int8.Projection(int8.Layer(int8.Quantised(q, step), factor / 100, offset - 0.5))
+
+
+@pytest.mark.parametrize("inputs", [1, 255, 256, 257, 700, 25_344])
+@pytest.mark.parametrize("features", [1, 13, 64])
+@pytest.mark.parametrize("share", [0, 0.15, 1], ids=["no spike", "spikes", "all fire"])
+def test_the_projection_adds_up_as_float32_does_bit_for_bit(inputs, features, share):
+    projection = projection_of(inputs, features, seed=inputs)
+    for rows in (1, 3, 8):
+        spikes = (torch.rand(rows, inputs, generator=torch.Generator().manual_seed(rows)) < share).to(torch.uint8)
+        with plain():
+            expected = projection(spikes)
+        assert torch.equal(projection(spikes), expected)
+        assert expected.shape == (rows, features)
+
+
+@pytest.mark.parametrize("inputs", [1000, 132_104, 132_105], ids=["few", "largest below 2**24", "above"])
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_the_largest_sums_of_a_projection_are_exact(inputs, sign):
+    """All weights at their most and every input firing: 16-bit sums of a block must not wrap, nor float32 round."""
+    projection = projection_of(inputs, 3, q=torch.full((3, inputs), sign * 127, dtype=torch.int8))
+    at_zero = projection(torch.zeros(1, inputs, dtype=torch.uint8))  # the offset
+    found = projection(torch.ones(2, inputs, dtype=torch.uint8))
+    _, factor, _ = projection.layer
+    assert torch.equal(found, (torch.full((2, 3), 127.0 * sign * inputs) * factor + at_zero))
+
+
+@pytest.mark.parametrize("shape", [(5, 4, 3, 3), (5, 36)], ids=["convolution", "projection"])
+def test_weights_move_by_half_a_step_at_most_and_rounding_again_changes_nothing(shape):
+    by_row = (-1, *[1] * (len(shape) - 1))
+    weight = torch.randn(shape) * torch.tensor([1e-3, 1.0, 50.0, 0.0, 1.0]).view(by_row)
     rounded, step = int8.rounded(weight), int8.quantised(weight).step
-    assert torch.all((rounded - weight).abs() <= 0.501 * step.view(-1, 1, 1, 1))
+    assert torch.all((rounded - weight).abs() <= 0.501 * step.view(by_row))
     assert torch.equal(int8.quantised(rounded).q, int8.quantised(weight).q)
 
 
-def test_gradients_pass_the_rounding_as_if_it_were_not_there():
-    weight = torch.randn(5, 4, 3, 3, requires_grad=True)
-    pull = torch.randn(5, 4, 3, 3)
+@pytest.mark.parametrize("shape", [(5, 4, 3, 3), (5, 36)], ids=["convolution", "projection"])
+def test_gradients_pass_the_rounding_as_if_it_were_not_there(shape):
+    weight = torch.randn(shape, requires_grad=True)
+    pull = torch.randn(shape)
     int8.rounded(weight).backward(pull)
     torch.testing.assert_close(weight.grad, pull)
+
+
+@torch.no_grad()
+def test_training_sees_the_projection_that_runs():
+    """Moved by a third of a step, its weights are rounded to what they were; an unrounded network answers otherwise."""
+    for precision, moves in (("int8", False), ("float32", True)):
+        config = SMALL.model_copy(update={"network": SMALL.network.model_copy(update={"precision": precision})})
+        network, spikes = network_of(config), draw(config)
+        weight = network.project.weight
+        q, step = int8.quantised(weight)
+        weight.copy_(q * step.view(-1, 1))
+        before = network(spikes, network.initial_state(1))[0]
+        weight.add_(step.view(-1, 1) / 3 * (q.abs() < 127))
+        after = network(spikes, network.initial_state(1))[0]
+        assert torch.allclose(after, before, rtol=1e-5, atol=1e-6) != moves
 
 
 @pytest.mark.parametrize("encoding", ["binary", "log1p"])
