@@ -1,7 +1,5 @@
 """The benchmarks compare like with like; how fast is not a test's business."""
 
-import importlib.util
-
 import pytest
 
 from neurove_core.bench import Row, chart, ingest, interleaved, machine, peers, processes, rows, simulate, sine, window
@@ -9,7 +7,7 @@ from neurove_core.config import ModelConfig
 
 QUICK = {"quick": True, "with_peers": True}
 PEERS = {"spikingjelly": "spikingjelly", "snntorch": "snnTorch", "norse": "norse", "sinabs": "sinabs"}
-INSTALLED = {name for module, name in PEERS.items() if importlib.util.find_spec(module)}
+INSTALLED = {name for module, name in PEERS.items() if peers.load(module, []) is not None}
 
 
 def test_the_fused_recurrence_and_plain_steps_give_the_same_answers():
