@@ -58,9 +58,9 @@ def augment(
         twists: (S, n, 6).
         recipe: how often each change is made.
     """
-    if recipe.still and rng.uniform() < recipe.still:
-        noise = at_rest(rng, counts.shape, math.exp(rng.uniform(*np.log(recipe.still_noise))))
-        return _with_hot_pixels(rng, noise, recipe), np.zeros_like(twists)
+    if _happens(rng, recipe.still):
+        rest = at_rest(rng, counts.shape, math.exp(rng.uniform(*np.log(recipe.still_noise))))
+        return with_hot_pixels(rng, rest, recipe) if _happens(rng, recipe.hot) else rest, np.zeros_like(twists)
     chance = rng.uniform(size=5)
     gain, noise = math.exp(rng.uniform(*np.log(recipe.gain))), rng.uniform(0, recipe.noise_max)
     if chance[0] < recipe.mirror:
@@ -73,14 +73,20 @@ def augment(
         counts = regained(rng, counts, gain)
     if chance[3] < recipe.noisy:
         counts = noisy(rng, counts, noise)
-    if recipe.lopsided and rng.uniform() < recipe.lopsided:
+    if _happens(rng, recipe.lopsided):
         counts = lopsided(rng, counts, math.exp(rng.uniform(*np.log(recipe.lopsided_by))))
-    counts = _with_hot_pixels(rng, counts, recipe)
-    if recipe.thinned and rng.uniform() < recipe.thinned:
+    if _happens(rng, recipe.hot):
+        counts = with_hot_pixels(rng, counts, recipe)
+    if _happens(rng, recipe.thinned):
         counts = thinned(rng, counts, recipe)
-    if recipe.holes and rng.uniform() < recipe.holes:
+    if _happens(rng, recipe.holes):
         counts = with_holes(rng, counts, recipe)
     return counts, twists
+
+
+def _happens(rng: np.random.Generator, share: float) -> bool:
+    """Whether it happens this time; what never does draws no number, so a recipe without it draws as it always did."""
+    return share > 0 and bool(rng.uniform() < share)
 
 
 def lopsided(rng: np.random.Generator, counts: NDArray[np.uint8], ratio: float) -> NDArray[np.uint8]:
@@ -89,10 +95,6 @@ def lopsided(rng: np.random.Generator, counts: NDArray[np.uint8], ratio: float) 
     for polarity, gain in ((0, ratio**-0.5), (1, ratio**0.5)):
         seen[:, polarity::2] = regained(rng, seen[:, polarity::2], gain)
     return seen
-
-
-def _with_hot_pixels(rng: np.random.Generator, counts: NDArray[np.uint8], recipe: RecipeConfig) -> NDArray[np.uint8]:
-    return with_hot_pixels(rng, counts, recipe) if recipe.hot and rng.uniform() < recipe.hot else counts
 
 
 def with_hot_pixels(rng: np.random.Generator, counts: NDArray[np.uint8], recipe: RecipeConfig) -> NDArray[np.uint8]:
