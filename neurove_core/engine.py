@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
-from neurove_core import int8, scan
+from neurove_core import int8, scan, sparse
 from neurove_core.activations import fused, sigmoid, tanh
 from neurove_core.cells import ASLSTM, ASLSTMParams, ASLSTMState, aslstm_step, readout_step
 from neurove_core.convolution import Convolution, convolution
@@ -47,7 +47,7 @@ class Engine:
         sizes = [(grid.height, grid.width), *network.map_sizes()]
         with torch.no_grad():
             self._lif: LIFParams = blocks[0].lif
-            self._extractor, self._convolutions = None, []
+            self._extractor, self._sparse, self._convolutions = None, None, []
             if net.precision == "int8":
                 self._extractor = int8.Extractor(
                     [_int8_layer(block, at=i) for i, block in enumerate(blocks)], sizes, self._lif
@@ -59,12 +59,15 @@ class Engine:
                 self._project = int8.Projection(_int8_projection(network, net.channels[-1], *sizes[-1]))
             else:
                 self._project = _projection(network, net.channels[-1], *sizes[-1])
+                self._sparse = self._over_lists(blocks, sizes)
             self._readout = Folded(*(tensor.detach().clone() for tensor in network.outputs()))
             self._kappa = float(torch.sigmoid(network.kappa_logit))
             cells = [cell for cell in network.cells if isinstance(cell, ASLSTM)]
             self._params = [_copied(cell.params()) for cell in cells]
             self._d_space = network.d_space.detach().clone()
-        self._weights = _flattened(self._project, self._params, self._d_space, self._readout)
+        inside = self._project if isinstance(self._project, Folded) and self._sparse is None else None
+        self._features_inside = inside.bias.numel() if inside else 0  # of a projection that `_cells` computes
+        self._weights = _flattened(inside, self._params, self._d_space, self._readout)
         self._constants = np.array([net.alpha, net.v_th, self._kappa], np.float32)
 
     @torch.inference_mode()
@@ -118,11 +121,13 @@ class Engine:
     def features(self, spikes: Tensor, state: NetworkState) -> tuple[Tensor, tuple[LIFState, ...]]:
         """Spikes (T * B, C, H', W') of the last map of the feature extractor alone, and its membranes after them."""
         x, membranes = self._features(spikes, state)
-        return x.float(), membranes
+        return sparse.maps_of(x) if isinstance(x, sparse.Fired) else x.float(), membranes
 
-    def _features(self, spikes: Tensor, state: NetworkState) -> tuple[Tensor, tuple[LIFState, ...]]:
+    def _features(self, spikes: Tensor, state: NetworkState) -> tuple[Tensor | sparse.Fired, tuple[LIFState, ...]]:
         if self._extractor is not None:
             return self._extractor(spikes.flatten(0, 1), state.membranes)
+        if self._sparse is not None and not is_plain():
+            return self._sparse(spikes.flatten(0, 1), state.membranes)
         x = spikes.flatten(0, 1).contiguous(memory_format=torch.channels_last)
         fire = self._plain_fire if is_plain() else self._fused_fire
         membranes = []
@@ -131,10 +136,20 @@ class Engine:
             membranes.append(LIFState(after))
         return x, tuple(membranes)
 
-    def _rows(self, x: Tensor) -> Tensor:
-        """What the cells are given of the last map (R, C, H, W): its spikes (R, I), in int8 their projection (R, F)."""
+    def _rows(self, x: Tensor | sparse.Fired) -> Tensor:
+        """What the cells are given of the last map (R, C, H, W): its spikes (R, I), or their projection (R, F)."""
+        if isinstance(x, sparse.Fired):
+            assert self._sparse is not None  # it made them
+            return self._sparse.project(x)
         rows = x.permute(0, 2, 3, 1).flatten(1)  # as it lies in memory
         return self._project(rows) if isinstance(self._project, int8.Projection) else rows
+
+    def _over_lists(self, blocks: list[SpikingBlock], sizes: list[tuple[int, int]]) -> sparse.Extractor | None:
+        layers = [
+            sparse.Layer(*folded(block.conv.weight, block.norm), convolve, *size)
+            for block, convolve, size in zip(blocks, self._convolutions, sizes, strict=False)
+        ]
+        return sparse.extractor(layers, self._project, self._lif) if isinstance(self._project, Folded) else None
 
     def _fused_fire(self, currents: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         return scan.scan_in_place(currents, v, self._lif.decay, self._lif.v_th)
@@ -149,8 +164,15 @@ class Engine:
         carried = torch.stack([field for cell in state.cells for field in cell])  # (3 L, B, N): c, v, s of each layer
         y = state.readout.clone()
         answers = torch.empty(steps, *y.shape)
-        features = self._project.bias.numel() if isinstance(self._project, Folded) else 0
-        _cells(rows.numpy(), self._weights, features, self._constants, carried.numpy(), y.numpy(), answers.numpy())
+        _cells(
+            rows.numpy(),
+            self._weights,
+            self._features_inside,
+            self._constants,
+            carried.numpy(),
+            y.numpy(),
+            answers.numpy(),
+        )
         fields = carried.unbind()
         return answers, tuple(ASLSTMState(*fields[i : i + 3]) for i in range(0, len(fields), 3)), y
 
@@ -215,13 +237,13 @@ def _copied(params: ASLSTMParams) -> ASLSTMParams:
     return ASLSTMParams(w_x, w_v, b, d_time, params.alpha, params.v_th)
 
 
-def _flattened(project: Folded | int8.Projection, cells: list[ASLSTMParams], d_space: Tensor, readout: Folded) -> Array:
+def _flattened(project: Folded | None, cells: list[ASLSTMParams], d_space: Tensor, readout: Folded) -> Array:
     """All weights of the compiled pass in one vector, in the order in which `_cells` takes them off it.
 
     Matrices are transposed, so that a row is what one input gives to all outputs; one array is handed over in a few
-    microseconds, twenty would take longer than a layer. A projection in int8 is none of it.
+    microseconds, twenty would take longer than a layer. A projection of its own is none of it.
     """
-    tensors = [project.weight.T, project.bias] if isinstance(project, Folded) else []
+    tensors = [project.weight.T, project.bias] if project else []
     for params, d in zip(cells, d_space, strict=True):
         tensors += [params.w_x.T, params.w_v.T, params.b, params.d_time, d]
     tensors += [readout.weight.T, readout.bias]

@@ -1,0 +1,334 @@
+"""Convolutions and projection over the neurons that fired, and no others: as the dense ones in float32, bit for bit.
+
+A spike is 0 or 1, and most are 0. The dense convolution adds w * x to each sum in the order of rows, columns and
+channels, and the bias last; where x is 0 that changes nothing, where it is 1 it adds w. So adding the weights of those
+that fired, in the same order, gives the same sums, with a seventh of the work where a seventh fires. Between layers
+goes a list of who fired. Neurons fire where their current is summed up: it never goes to memory.
+
+Which order oneDNN takes is written nowhere: at load each layer is tried against its dense form, and where one bit
+differs the dense ones serve, slower; that is said once in the log.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import torch
+from numba.core.errors import NumbaError
+from numpy.typing import NDArray
+from torch import Tensor
+
+from neurove_core.compiled import compiled
+from neurove_core.convolution import LARGE, Convolution, say_once
+from neurove_core.neurons import LIFParams, LIFState
+from neurove_core.vectors import LANES, fire, nothing, plus, put, tile_of
+
+Array = NDArray[np.float32]
+Places = NDArray[np.int32]
+
+_MANY: Final = 0.4
+"""Share of spikes from which maps are convolved dense: with AVX-512 large ones take as long then (with AVX2 at 0.7)."""
+
+_CHUNK: Final = 512  # inputs of the projection whose weights, 512 KiB for 256 features, stay in the second cache
+
+
+class Fired(NamedTuple):
+    """Who fired, in maps (R, H, W, C)."""
+
+    places: Places  # of those that fired, in their map as it lies channels last, ascending; map after map
+    starts: Places  # (R * H * W + 1): where in `places` each cell begins
+    shape: tuple[int, int, int, int]
+    found: int  # of `places`; what lies behind means nothing
+
+
+class Layer(NamedTuple):
+    """A folded convolution of the extractor."""
+
+    weight: Tensor  # (C', C, 3, 3)
+    bias: Tensor  # (C')
+    dense: Convolution
+    rows: int  # of the map that it mostly sees
+    columns: int
+
+
+class Extractor:
+    """The feature extractor of one network and the projection behind it, over lists of who fired.
+
+    Args:
+        layers: its blocks; the first, whose input is no spikes, stays dense.
+        projection: weight (F, I), in the order in which spikes lie in memory, and bias (F).
+        lif: of its neurons.
+    """
+
+    def __init__(self, layers: Sequence[Layer], projection: tuple[Tensor, Tensor], lif: LIFParams) -> None:
+        self._decay, self._v_th = np.float32(lif.decay), np.float32(lif.v_th)
+        self._first = layers[0]
+        self._layers = [OverList(layer) for layer in layers[1:]]
+        weight, bias = projection
+        self._rows, self._bias = weight.T.reshape(-1).numpy(), bias.numpy()
+
+    def __call__(self, spikes: Tensor, membranes: Sequence[LIFState]) -> tuple[Fired, tuple[LIFState, ...]]:
+        """Input (T * B, 2n, H, W) to who fired in the last map, and the potentials after the last reset."""
+        constants = self._decay, self._v_th
+        x = spikes.contiguous(memory_format=torch.channels_last)
+        v = _own(membranes[0].v)
+        fired = _fired(self._first.dense(x), v, *constants)
+        after = [v]
+        for layer, membrane in zip(self._layers, membranes[1:], strict=True):
+            v = _own(membrane.v)
+            fired = layer(fired, v, *constants)
+            after.append(v)
+        return fired, tuple(LIFState(torch.from_numpy(v).permute(0, 3, 1, 2)) for v in after)
+
+    def project(self, fired: Fired) -> Tensor:
+        """What the projection makes of each map (R, F)."""
+        maps, rows, columns, channels = fired.shape
+        out = np.empty((maps, self._bias.size), np.float32)
+        chunk = max(1, _CHUNK // channels)
+        tile = tile_of(self._bias.size)
+        _project(tile, fired.places, fired.starts, rows * columns, self._rows, self._bias, chunk, out)
+        return torch.from_numpy(out)
+
+
+def extractor(layers: Sequence[Layer], projection: tuple[Tensor, Tensor], lif: LIFParams) -> Extractor | None:
+    """An extractor over lists, where all widths suit its vectors and it computes what the dense layers do."""
+    if any(bias.numel() % LANES for bias in (*(layer.bias for layer in layers), projection[1])):
+        return None
+    try:
+        if all(_agrees(layer) for layer in layers[1:]):
+            return Extractor(layers, projection, lif)
+        reason = "they compute something else"
+    except (RuntimeError, NumbaError) as error:
+        reason = str(error).partition("\n")[0]
+    say_once("convolutions over spikes alone", reason)
+    return None
+
+
+def maps_of(fired: Fired) -> Tensor:
+    """Spikes of 0 and 1 (R, C, H, W), channels last."""
+    maps = np.zeros((fired.shape[0], fired.shape[1] * fired.shape[2] * fired.shape[3]), np.float32)
+    _mark(fired.places, fired.starts, maps)
+    return torch.from_numpy(maps.reshape(fired.shape)).permute(0, 3, 1, 2)
+
+
+def listed(maps: Tensor) -> Fired:
+    """What `maps_of` undoes."""
+    rows = np.ascontiguousarray(maps.numpy().transpose(0, 2, 3, 1))
+    flat = rows.reshape(rows.shape[0], -1)
+    places = np.nonzero(flat)[1].astype(np.int32)
+    cells = np.count_nonzero(rows.reshape(-1, rows.shape[3]), axis=1)
+    starts = np.concatenate([[0], np.cumsum(cells)]).astype(np.int32)
+    return Fired(places, starts, rows.shape, places.size)
+
+
+class OverList:
+    """One layer over a list: (R, H, W, C) to who fires in (R, H', W', C')."""
+
+    def __init__(self, layer: Layer) -> None:
+        self._dense = layer.dense
+        self._weight = layer.weight.permute(2, 3, 1, 0).reshape(-1).numpy()  # a row is what one spike gives to all C'
+        self._bias = layer.bias.numpy()
+        self._tile = tile_of(self._bias.size)
+
+    def __call__(self, fired: Fired, v: Array, decay: np.float32, v_th: np.float32) -> Fired:
+        """Potentials v (B, H', W', C') move on in place."""
+        if fired.found > _MANY * math.prod(fired.shape):
+            return _fired(self._dense(maps_of(fired)), v, decay, v_th)
+        return self.over_list(fired, v, decay, v_th)
+
+    def over_list(self, fired: Fired, v: Array, decay: np.float32, v_th: np.float32) -> Fired:
+        """The same, however many fired."""
+        shape = fired.shape[0], *v.shape[1:]
+        places, starts = _lists(shape)
+        given = fired.places, fired.starts, fired.shape, self._weight, self._bias
+        count = _convolve(self._tile, *given, v.reshape(v.shape[0], -1), decay, v_th, places, starts)
+        return Fired(places, starts, shape, count)
+
+
+def _own(v: Tensor) -> Array:
+    """A copy of potentials, channels last."""
+    return np.array(v.detach().numpy().transpose(0, 2, 3, 1), order="C")
+
+
+def _lists(shape: tuple[int, int, int, int]) -> tuple[Places, Places]:
+    """Room for all of these maps to fire."""
+    cells = shape[0] * shape[1] * shape[2]
+    return np.empty(cells * shape[3] + LANES, np.int32), np.empty(cells + 1, np.int32)
+
+
+def _fired(currents: Tensor, v: Array, decay: np.float32, v_th: np.float32) -> Fired:
+    """Who fires of currents (R, C, H, W); potentials v (B, H, W, C) move on in place."""
+    rows = np.ascontiguousarray(currents.numpy().transpose(0, 2, 3, 1))
+    places, starts = _lists(rows.shape)
+    channels = rows.shape[3]
+    flat = v.reshape(v.shape[0], -1)
+    count = _fire(tile_of(channels), rows.reshape(-1), channels, flat, decay, v_th, places, starts)
+    return Fired(places, starts, rows.shape, count)
+
+
+@torch.inference_mode()
+def _agrees(layer: Layer) -> bool:
+    """Whether a layer sums as its dense form, bit for bit: of few spikes and of all, one map and, if small, three."""
+    generator = torch.Generator().manual_seed(0)
+    sparse, (outputs, inputs) = OverList(layer), layer.weight.shape[:2]
+    size = (outputs, (layer.rows + 1) // 2, (layer.columns + 1) // 2)
+    for count in (1, 3) if inputs * layer.rows * layer.columns <= LARGE else (1,):
+        for share in (0.15, 1.0):
+            draw = torch.rand(count, layer.rows, layer.columns, inputs, generator=generator) < share
+            x = draw.float().permute(0, 3, 1, 2)
+            v = _own(torch.zeros(count, *size))
+            sparse.over_list(listed(x), v, np.float32(0), np.float32(np.inf))  # nobody fires: v becomes the currents
+            if not torch.equal(torch.from_numpy(v).permute(0, 3, 1, 2), layer.dense(x)):
+                return False
+    return True
+
+
+# --- machine code -----------------------------------------------------------------------------------------------------
+
+
+@compiled
+def _fire(
+    like: tuple[int, ...],
+    currents: Array,
+    channels: int,
+    v: Array,
+    decay: Any,
+    v_th: Any,
+    places: Places,
+    starts: Places,
+) -> int:  # pragma: no cover (machine code)
+    """Who fires of currents (R * cells * channels), R a multiple of B.
+
+    Args:
+        like: width of a tile.
+        currents: channels vary fastest.
+        channels: a multiple of the tile's width.
+        v: (B, cells * channels), moves on.
+        decay: per step.
+        v_th: firing threshold.
+        places: written, as `starts`; see Fired.
+        starts: of R * cells and 1.
+
+    Returns:
+        how many fire.
+    """
+    batch, n = v.shape
+    potentials, cells, width = v.reshape(-1), n // channels, LANES * len(like)
+    found = 0
+    for r in range(currents.size // n):
+        for cell in range(cells):
+            starts[r * cells + cell] = found
+            for first in range(cell * channels, (cell + 1) * channels, width):
+                current = plus(nothing(like), currents, r * n + first)
+                found = fire(current, potentials, r % batch * n + first, decay, v_th, places, found, first)
+    starts[starts.size - 1] = found
+    return found
+
+
+@compiled
+def _convolve(
+    like: tuple[int, ...],
+    given: Places,
+    given_starts: Places,
+    shape: tuple[int, int, int, int],
+    weight: Array,
+    bias: Array,
+    v: Array,
+    decay: Any,
+    v_th: Any,
+    places: Places,
+    starts: Places,
+) -> int:  # pragma: no cover (machine code)
+    """Who fires of a convolution of 3x3, stride 2, one cell of zeros around.
+
+    The three cells of a row under a kernel lie side by side, so those of them that fired are one piece of the list, and
+    its rows of weights lie in the same order.
+
+    Args:
+        like: width of a tile.
+        given: who fired before, as `given_starts` and `shape`; see Fired.
+        given_starts: of R * H * W and 1.
+        shape: R, H, W, C.
+        weight: 3, 3, C, C'.
+        bias: C'.
+        v: (B, H' * W' * C'), moves on.
+        decay: per step.
+        v_th: firing threshold.
+        places: written, as `starts`; see Fired.
+        starts: of R * H' * W' and 1.
+
+    Returns:
+        how many fire.
+    """
+    maps, rows, columns, channels = shape
+    outputs, width = bias.size, LANES * len(like)
+    batch, n = v.shape
+    potentials, found, cell = v.reshape(-1), 0, 0
+    for r in range(maps):
+        at = 0  # in the new map
+        for row in range(-1, rows - 1, 2):  # the kernel's first
+            for column in range(-1, columns - 1, 2):
+                starts[cell] = found
+                cell += 1
+                left, right = max(column, 0), min(column + 3, columns)
+                for tile in range(0, outputs, width):
+                    current = nothing(like)
+                    for y in range(max(row, 0), min(row + 3, rows)):
+                        line = (r * rows + y) * columns
+                        shift = ((y - row) * 3 - (y * columns + column)) * channels
+                        for i in range(given_starts[line + left], given_starts[line + right]):
+                            current = plus(current, weight, (given[i] + shift) * outputs + tile)
+                    current = plus(current, bias, tile)
+                    found = fire(current, potentials, r % batch * n + at, decay, v_th, places, found, at)
+                    at += width
+    starts[cell] = found
+    return found
+
+
+@compiled
+def _project(
+    like: tuple[int, ...],
+    given: Places,
+    starts: Places,
+    cells: int,
+    weight: Array,
+    bias: Array,
+    chunk: int,
+    out: Array,
+) -> None:  # pragma: no cover (machine code)
+    """Out (R, F) = bias + the weights of those that fired, added up one after the other for each map alone.
+
+    Args:
+        like: width of a tile.
+        given: who fired, as `starts`; see Fired.
+        starts: of R * cells and 1.
+        cells: of a map.
+        weight: I, F.
+        bias: F.
+        chunk: cells whose weights stay in the cache while all maps have their turn.
+        out: written.
+    """
+    maps, features = out.shape
+    width, sums = LANES * len(like), out.reshape(-1)
+    for r in range(maps):
+        for first in range(0, features, width):
+            put(plus(nothing(like), bias, first), sums, r * features + first)
+    for start in range(0, cells, chunk):
+        stop = min(start + chunk, cells)
+        for r in range(maps):
+            begin, end = starts[r * cells + start], starts[r * cells + stop]
+            for first in range(0, features, width):
+                total = plus(nothing(like), sums, r * features + first)
+                for i in range(begin, end):
+                    total = plus(total, weight, given[i] * features + first)
+                put(total, sums, r * features + first)
+
+
+@compiled
+def _mark(given: Places, starts: Places, maps: Array) -> None:  # pragma: no cover (machine code)
+    """Write 1 where someone fired; maps (R, H * W * C) are 0."""
+    cells = (starts.size - 1) // maps.shape[0]
+    for r in range(maps.shape[0]):
+        for i in range(starts[r * cells], starts[(r + 1) * cells]):
+            maps[r, given[i]] = 1
