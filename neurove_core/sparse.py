@@ -22,7 +22,7 @@ from torch import Tensor
 from neurove_core.compiled import compiled
 from neurove_core.convolution import LARGE, Convolution, say_once
 from neurove_core.neurons import LIFParams, LIFState
-from neurove_core.vectors import LANES, fire, nothing, plus, put, tile_of
+from neurove_core.vectors import LANES, entry, fire, nothing, plus, plus_product, put, tile_of
 
 Array = NDArray[np.float32]
 Places = NDArray[np.int32]
@@ -56,24 +56,22 @@ class Extractor:
     """The feature extractor of one network and the projection behind it, over lists of who fired.
 
     Args:
-        layers: its blocks; the first, whose input is no spikes, stays dense.
+        layers: its blocks; the first sees numbers, the others spikes.
         projection: weight (F, I), in the order in which spikes lie in memory, and bias (F).
         lif: of its neurons.
     """
 
     def __init__(self, layers: Sequence[Layer], projection: tuple[Tensor, Tensor], lif: LIFParams) -> None:
         self._decay, self._v_th = np.float32(lif.decay), np.float32(lif.v_th)
-        self._first = layers[0]
-        self._layers = [OverList(layer) for layer in layers[1:]]
+        self._first, self._layers = OverValues(layers[0]), [OverList(layer) for layer in layers[1:]]
         weight, bias = projection
         self._rows, self._bias = weight.T.reshape(-1).numpy(), bias.numpy()
 
     def __call__(self, spikes: Tensor, membranes: Sequence[LIFState]) -> tuple[Fired, tuple[LIFState, ...]]:
         """Input (T * B, 2n, H, W) to who fired in the last map, and the potentials after the last reset."""
         constants = self._decay, self._v_th
-        x = spikes.contiguous(memory_format=torch.channels_last)
         v = _own(membranes[0].v)
-        fired = _fired(self._first.dense(x), v, *constants)
+        fired = self._first(_channels_last(spikes), v, *constants)
         after = [v]
         for layer, membrane in zip(self._layers, membranes[1:], strict=True):
             v = _own(membrane.v)
@@ -96,7 +94,7 @@ def extractor(layers: Sequence[Layer], projection: tuple[Tensor, Tensor], lif: L
     if any(bias.numel() % LANES for bias in (*(layer.bias for layer in layers), projection[1])):
         return None
     try:
-        if all(_agrees(layer) for layer in layers[1:]):
+        if all(_agrees(layer, first=layer is layers[0]) for layer in layers):
             return Extractor(layers, projection, lif)
         reason = "they compute something else"
     except (RuntimeError, NumbaError) as error:
@@ -114,7 +112,7 @@ def maps_of(fired: Fired) -> Tensor:
 
 def listed(maps: Tensor) -> Fired:
     """What `maps_of` undoes."""
-    rows = np.ascontiguousarray(maps.numpy().transpose(0, 2, 3, 1))
+    rows = _channels_last(maps)
     flat = rows.reshape(rows.shape[0], -1)
     places = np.nonzero(flat)[1].astype(np.int32)
     cells = np.count_nonzero(rows.reshape(-1, rows.shape[3]), axis=1)
@@ -122,13 +120,28 @@ def listed(maps: Tensor) -> Fired:
     return Fired(places, starts, rows.shape, places.size)
 
 
+class OverValues:
+    """The first layer: maps (R, H, W, C) of any float32 to who fires in (R, H', W', C')."""
+
+    def __init__(self, layer: Layer) -> None:
+        self._weight, self._bias = _by_input(layer.weight), layer.bias.numpy()
+        self._tile, self._firing = tile_of(self._bias.size, most=2), tile_of(self._bias.size)
+
+    def __call__(self, x: Array, v: Array, decay: np.float32, v_th: np.float32) -> Fired:
+        """Potentials v (B, H', W', C') move on in place."""
+        shape = x.shape[0], *v.shape[1:]
+        places, starts = _lists(shape)
+        given = self._tile, self._firing, x, self._weight, self._bias
+        found = _convolve_values(*given, v.reshape(v.shape[0], -1), decay, v_th, places, starts)
+        return Fired(places, starts, shape, found)
+
+
 class OverList:
     """One layer over a list: (R, H, W, C) to who fires in (R, H', W', C')."""
 
     def __init__(self, layer: Layer) -> None:
         self._dense = layer.dense
-        self._weight = layer.weight.permute(2, 3, 1, 0).reshape(-1).numpy()  # a row is what one spike gives to all C'
-        self._bias = layer.bias.numpy()
+        self._weight, self._bias = _by_input(layer.weight), layer.bias.numpy()
         self._tile = tile_of(self._bias.size)
 
     def __call__(self, fired: Fired, v: Array, decay: np.float32, v_th: np.float32) -> Fired:
@@ -146,6 +159,15 @@ class OverList:
         return Fired(places, starts, shape, count)
 
 
+def _by_input(weight: Tensor) -> Array:
+    """Weights (C', C, 3, 3) as one row after the other, each what one input gives to all C'."""
+    return weight.permute(2, 3, 1, 0).reshape(-1).numpy()
+
+
+def _channels_last(maps: Tensor) -> Array:
+    return np.ascontiguousarray(maps.detach().numpy().transpose(0, 2, 3, 1))
+
+
 def _own(v: Tensor) -> Array:
     """A copy of potentials, channels last."""
     return np.array(v.detach().numpy().transpose(0, 2, 3, 1), order="C")
@@ -159,7 +181,7 @@ def _lists(shape: tuple[int, int, int, int]) -> tuple[Places, Places]:
 
 def _fired(currents: Tensor, v: Array, decay: np.float32, v_th: np.float32) -> Fired:
     """Who fires of currents (R, C, H, W); potentials v (B, H, W, C) move on in place."""
-    rows = np.ascontiguousarray(currents.numpy().transpose(0, 2, 3, 1))
+    rows = _channels_last(currents)
     places, starts = _lists(rows.shape)
     channels = rows.shape[3]
     flat = v.reshape(v.shape[0], -1)
@@ -168,23 +190,106 @@ def _fired(currents: Tensor, v: Array, decay: np.float32, v_th: np.float32) -> F
 
 
 @torch.inference_mode()
-def _agrees(layer: Layer) -> bool:
-    """Whether a layer sums as its dense form, bit for bit: of few spikes and of all, one map and, if small, three."""
+def _agrees(layer: Layer, *, first: bool) -> bool:
+    """Whether a layer sums as its dense form, bit for bit: of few inputs and of all, one map and, if small, three."""
     generator = torch.Generator().manual_seed(0)
-    sparse, (outputs, inputs) = OverList(layer), layer.weight.shape[:2]
-    size = (outputs, (layer.rows + 1) // 2, (layer.columns + 1) // 2)
+    outputs, inputs = layer.weight.shape[:2]
+    silent = np.float32(0), np.float32(np.inf)  # nobody fires, and potentials become the currents
     for count in (1, 3) if inputs * layer.rows * layer.columns <= LARGE else (1,):
         for share in (0.15, 1.0):
-            draw = torch.rand(count, layer.rows, layer.columns, inputs, generator=generator) < share
-            x = draw.float().permute(0, 3, 1, 2)
-            v = _own(torch.zeros(count, *size))
-            sparse.over_list(listed(x), v, np.float32(0), np.float32(np.inf))  # nobody fires: v becomes the currents
+            drawn = torch.rand(2, count, layer.rows, layer.columns, inputs, generator=generator)
+            x = ((drawn[0] < share) * (drawn[1] if first else 1.0)).permute(0, 3, 1, 2)
+            v = np.zeros((count, (layer.rows + 1) // 2, (layer.columns + 1) // 2, outputs), np.float32)
+            if first:
+                OverValues(layer)(_channels_last(x), v, *silent)
+            else:
+                OverList(layer).over_list(listed(x), v, *silent)
             if not torch.equal(torch.from_numpy(v).permute(0, 3, 1, 2), layer.dense(x)):
                 return False
     return True
 
 
 # --- machine code -----------------------------------------------------------------------------------------------------
+
+
+@compiled
+def _convolve_values(
+    like: tuple[int, ...],
+    firing: tuple[int, ...],
+    x: Array,
+    weight: Array,
+    bias: Array,
+    v: Array,
+    decay: Any,
+    v_th: Any,
+    places: Places,
+    starts: Places,
+) -> int:  # pragma: no cover (machine code)
+    """Who fires of a convolution of any numbers, as `_convolve` otherwise; six cells side by side at a time.
+
+    Each sum is one chain of fused products, and a processor needs some ten of them under way.
+
+    Args:
+        like: width of a tile of six cells; all twelve fit into registers with two vectors.
+        firing: width of a tile that fires.
+        x: R, H, W, C.
+        weight: 3, 3, C, C'.
+        bias: C'.
+        v: (B, H' * W' * C'), moves on.
+        decay: per step.
+        v_th: firing threshold.
+        places: written, as `starts`; see Fired.
+        starts: of R * H' * W' and 1.
+
+    Returns:
+        how many fire.
+    """
+    maps, rows, columns, channels = x.shape
+    outputs, width, step = bias.size, LANES * len(like), 2 * channels
+    batch, n = v.shape
+    values, potentials, found, cell = x.reshape(-1), v.reshape(-1), 0, 0
+    currents = np.empty(6 * outputs, np.float32)
+    for r in range(maps):
+        at = 0  # in the new map
+        for row in range(-1, rows - 1, 2):  # the kernel's first
+            top, bottom = max(row, 0), min(row + 3, rows)
+            column = -1
+            while column < columns - 1:
+                cells = 6 if column >= 0 and column + 13 <= columns else 1  # at an edge one by one
+                left, right = (max(column, 0) - column) * channels, (min(column + 3, columns) - column) * channels
+                for tile in range(0, outputs, width):
+                    a, b, c = nothing(like), nothing(like), nothing(like)
+                    d, e, f = nothing(like), nothing(like), nothing(like)
+                    for y in range(top, bottom):
+                        k = ((r * rows + y) * columns + column) * channels + left
+                        w = ((y - row) * 3 * channels + left) * outputs + tile
+                        for _ in range(left, right):
+                            a = plus_product(a, values, k, weight, w)
+                            if cells == 6:
+                                b = plus_product(b, values, k + step, weight, w)
+                                c = plus_product(c, values, k + 2 * step, weight, w)
+                                d = plus_product(d, values, k + 3 * step, weight, w)
+                                e = plus_product(e, values, k + 4 * step, weight, w)
+                                f = plus_product(f, values, k + 5 * step, weight, w)
+                            k += 1
+                            w += outputs
+                    put(plus(a, bias, tile), currents, tile)
+                    if cells == 6:
+                        put(plus(b, bias, tile), currents, outputs + tile)
+                        put(plus(c, bias, tile), currents, 2 * outputs + tile)
+                        put(plus(d, bias, tile), currents, 3 * outputs + tile)
+                        put(plus(e, bias, tile), currents, 4 * outputs + tile)
+                        put(plus(f, bias, tile), currents, 5 * outputs + tile)
+                for i in range(cells):
+                    starts[cell] = found
+                    cell += 1
+                    for first in range(i * outputs, (i + 1) * outputs, LANES * len(firing)):
+                        current = plus(nothing(firing), currents, first)
+                        found = fire(current, potentials, r % batch * n + at, decay, v_th, places, found, at)
+                        at += LANES * len(firing)
+                column += 2 * cells
+    starts[cell] = found
+    return found
 
 
 @compiled
@@ -278,7 +383,7 @@ def _convolve(
                         line = (r * rows + y) * columns
                         shift = ((y - row) * 3 - (y * columns + column)) * channels
                         for i in range(given_starts[line + left], given_starts[line + right]):
-                            current = plus(current, weight, (given[i] + shift) * outputs + tile)
+                            current = plus(current, weight, (entry(given, i) + shift) * outputs + tile)
                     current = plus(current, bias, tile)
                     found = fire(current, potentials, r % batch * n + at, decay, v_th, places, found, at)
                     at += width
@@ -321,7 +426,7 @@ def _project(
             for first in range(0, features, width):
                 total = plus(nothing(like), sums, r * features + first)
                 for i in range(begin, end):
-                    total = plus(total, weight, given[i] * features + first)
+                    total = plus(total, weight, entry(given, i) * features + first)
                 put(total, sums, r * features + first)
 
 

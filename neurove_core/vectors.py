@@ -2,7 +2,7 @@
 
 numba's own vectors begin anew with every inner loop, and a loop over 64 channels is too short for that. Here a tile of
 up to 128 channels is one value of a compiled function. LLVM makes of it what the machine has, and nothing is reordered
-or fused: each lane is rounded as the same lines on single numbers would be.
+or fused but where it says so: each lane is rounded as the same lines on single numbers would be.
 
 A tile's width is told to compiled code by the type of `like`, a tuple of as many numbers as the tile has vectors of 16.
 """
@@ -18,15 +18,19 @@ from numba.extending import intrinsic, register_model
 LANES: Final = 16
 """Of one vector; widths of tiles are multiples of it."""
 
-_MOST: Final = 8  # vectors of a tile: half of AVX-512's registers
 _FLOAT, _INT = ir.FloatType(), ir.IntType(32)
 _function_of: Any = cgutils.get_or_insert_function
 instructions: Any = intrinsic  # for a type checker: compiled code calls what it gives without the first argument
 
 
-def tile_of(channels: int) -> tuple[int, ...]:
-    """The widest tile that divides a number of channels, itself a multiple of LANES; `like` of compiled functions."""
-    count = _MOST
+def tile_of(channels: int, most: int = 8) -> tuple[int, ...]:
+    """The widest tile that divides a number of channels, itself a multiple of LANES; `like` of compiled functions.
+
+    Args:
+        channels: to divide.
+        most: vectors of a tile, a power of two; eight are half of AVX-512's registers.
+    """
+    count = most
     while channels % (count * LANES):
         count //= 2
     return (0,) * count
@@ -68,6 +72,33 @@ def plus(typing, tile, numbers, at):  # type: ignore[no-untyped-def]  # pragma: 
         return builder.fadd(args[0], builder.load(where, align=4))
 
     return tile(tile, numbers, types.intp), write
+
+
+@instructions
+def plus_product(typing, tile, values, i, numbers, at):  # type: ignore[no-untyped-def]  # pragma: no cover (compiler)
+    """The tile plus values[i] times the float32 that begin at numbers[at], rounded once, as a fused product is."""
+
+    def write(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        tile, values, i, numbers, at = args
+        value = _spread(
+            builder, _entry(context, builder, signature.args[1], values, i), LANES * signature.args[0].count
+        )
+        factors = builder.load(_address(context, builder, signature.args[3], numbers, at, tile.type), align=4)
+        kind = tile.type
+        fused = _function_of(builder.module, ir.FunctionType(kind, [kind] * 3), f"llvm.fma.v{kind.count}f32")
+        return builder.call(fused, [value, factors, tile])
+
+    return tile(tile, values, types.intp, numbers, types.intp), write
+
+
+@instructions
+def entry(typing, numbers, i):  # type: ignore[no-untyped-def]  # pragma: no cover (compiler)
+    """numbers[i] of a flat array, i not negative: numba would ask each time whether it is."""
+
+    def write(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        return _entry(context, builder, signature.args[0], *args)
+
+    return numbers.dtype(numbers, types.intp), write
 
 
 @instructions
@@ -137,6 +168,10 @@ def _spread(builder: Any, value: Any, lanes: int) -> Any:  # pragma: no cover (c
     single = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(_INT, 0))
     everywhere = ir.Constant(ir.VectorType(_INT, lanes), [0] * lanes)
     return builder.shuffle_vector(single, ir.Constant(kind, ir.Undefined), everywhere)
+
+
+def _entry(context: Any, builder: Any, kind: Any, array: Any, at: Any) -> Any:  # pragma: no cover (compiler)
+    return builder.load(builder.gep(context.make_array(kind)(context, builder, array).data, [at]))
 
 
 def _address(context: Any, builder: Any, kind: Any, array: Any, at: Any, vector: Any) -> Any:  # pragma: no cover
