@@ -82,11 +82,9 @@ class Engine:
         Returns:
             twists (T, B, n, 6) in scaled units and the next state, as NeuroVE.forward.
         """
-        steps, batch = spikes.shape[:2]
         x, membranes = self._features(spikes, state)
-        rows = self._rows(x)
-        answers, cells, y = (self._plain_cells if is_plain() else self._fused_cells)(rows, steps, state)
-        twists = answers[..., : 6 * self._bins].reshape(steps, batch, self._bins, 6)
+        rows, steps = self._rows(x), spikes.shape[0]
+        twists, cells, y = (self._plain_cells if is_plain() else self._fused_cells)(rows, steps, state)
         return twists, NetworkState(membranes, cells, y)
 
     @torch.inference_mode()
@@ -111,8 +109,7 @@ class Engine:
         rows = self._rows(x)
         answers = []
         for b, state in enumerate(states):
-            found, cells, y = (self._plain_cells if is_plain() else self._fused_cells)(rows[b : b + 1], 1, state)
-            twists = found[..., : 6 * self._bins].reshape(1, 1, self._bins, 6)
+            twists, cells, y = (self._plain_cells if is_plain() else self._fused_cells)(rows[b : b + 1], 1, state)
             own = tuple(LIFState(membrane.v[b : b + 1].clone()) for membrane in membranes)  # a view would keep all
             answers.append((twists, NetworkState(own, cells, y)))
         return answers
@@ -127,7 +124,7 @@ class Engine:
         if self._extractor is not None:
             return self._extractor(spikes.flatten(0, 1), state.membranes)
         if self._sparse is not None and not is_plain():
-            return self._sparse(spikes.flatten(0, 1), state.membranes)
+            return self._sparse(spikes, state.membranes)
         x = spikes.flatten(0, 1).contiguous(memory_format=torch.channels_last)
         fire = self._plain_fire if is_plain() else self._fused_fire
         membranes = []
@@ -136,7 +133,7 @@ class Engine:
             membranes.append(LIFState(after))
         return x, tuple(membranes)
 
-    def _rows(self, x: Tensor | sparse.Fired) -> Tensor:
+    def _rows(self, x: Tensor | sparse.Fired) -> Tensor | Array:
         """What the cells are given of the last map (R, C, H, W): its spikes (R, I), or their projection (R, F)."""
         if isinstance(x, sparse.Fired):
             assert self._sparse is not None  # it made them
@@ -159,27 +156,21 @@ class Engine:
         return spikes.flatten(0, 1), after.v
 
     def _fused_cells(
-        self, rows: Tensor, steps: int, state: NetworkState
+        self, rows: Tensor | Array, steps: int, state: NetworkState
     ) -> tuple[Tensor, tuple[ASLSTMState, ...], Tensor]:
+        x: Array = rows.numpy() if isinstance(rows, Tensor) else rows
         carried = torch.stack([field for cell in state.cells for field in cell])  # (3 L, B, N): c, v, s of each layer
         y = state.readout.clone()
-        answers = torch.empty(steps, *y.shape)
-        _cells(
-            rows.numpy(),
-            self._weights,
-            self._features_inside,
-            self._constants,
-            carried.numpy(),
-            y.numpy(),
-            answers.numpy(),
-        )
+        answers = np.empty((steps, *y.shape), np.float32)
+        _cells(x, self._weights, self._features_inside, self._constants, carried.numpy(), y.numpy(), answers)
         fields = carried.unbind()
-        return answers, tuple(ASLSTMState(*fields[i : i + 3]) for i in range(0, len(fields), 3)), y
+        cells = tuple([ASLSTMState(*fields[i : i + 3]) for i in range(0, len(fields), 3)])
+        return torch.from_numpy(answers[..., : 6 * self._bins].reshape(steps, -1, self._bins, 6)), cells, y
 
     def _plain_cells(
-        self, rows: Tensor, steps: int, state: NetworkState
+        self, rows: Tensor | Array, steps: int, state: NetworkState
     ) -> tuple[Tensor, tuple[ASLSTMState, ...], Tensor]:
-        y, cells, answers = state.readout, list(state.cells), []
+        y, cells, answers, rows = state.readout, list(state.cells), [], torch.as_tensor(rows)
         x = linear(rows, *self._project) if isinstance(self._project, Folded) else rows
         for z in x.view(steps, rows.shape[0] // steps, -1):
             for index, params in enumerate(self._params):
@@ -187,7 +178,8 @@ class Engine:
                 z = diffuse(cells[index].s, cells[index].v, self._d_space[index])
             y = readout_step(z, y, *self._readout, self._kappa)
             answers.append(y)
-        return torch.stack(answers), tuple(cells), y
+        twists = torch.stack(answers)[..., : 6 * self._bins].reshape(steps, -1, self._bins, 6)
+        return twists, tuple(cells), y
 
 
 def folded(weight: Tensor, norm: nn.BatchNorm1d | nn.BatchNorm2d) -> Folded:

@@ -65,28 +65,26 @@ class Extractor:
         self._decay, self._v_th = np.float32(lif.decay), np.float32(lif.v_th)
         self._first, self._layers = OverValues(layers[0]), [OverList(layer) for layer in layers[1:]]
         weight, bias = projection
-        self._rows, self._bias = weight.T.reshape(-1).numpy(), bias.numpy()
+        self._rows, self._bias, self._tile = weight.T.reshape(-1).numpy(), bias.numpy(), tile_of(bias.numel())
 
     def __call__(self, spikes: Tensor, membranes: Sequence[LIFState]) -> tuple[Fired, tuple[LIFState, ...]]:
-        """Input (T * B, 2n, H, W) to who fired in the last map, and the potentials after the last reset."""
+        """Input (T, B, 2n, H, W) to who fired in the last map, and the potentials after the last reset."""
         constants = self._decay, self._v_th
-        v = _own(membranes[0].v)
-        fired = self._first(_channels_last(spikes), v, *constants)
+        x = np.ascontiguousarray(_values(spikes).transpose(0, 1, 3, 4, 2))
+        fired, v = self._first(x.reshape(-1, *x.shape[2:]), _cells_of(membranes[0].v), *constants)
         after = [v]
         for layer, membrane in zip(self._layers, membranes[1:], strict=True):
-            v = _own(membrane.v)
-            fired = layer(fired, v, *constants)
+            fired, v = layer(fired, _cells_of(membrane.v), *constants)
             after.append(v)
-        return fired, tuple(LIFState(torch.from_numpy(v).permute(0, 3, 1, 2)) for v in after)
+        return fired, tuple([LIFState(_maps(v)) for v in after])
 
-    def project(self, fired: Fired) -> Tensor:
+    def project(self, fired: Fired) -> Array:
         """What the projection makes of each map (R, F)."""
         maps, rows, columns, channels = fired.shape
         out = np.empty((maps, self._bias.size), np.float32)
         chunk = max(1, _CHUNK // channels)
-        tile = tile_of(self._bias.size)
-        _project(tile, fired.places, fired.starts, rows * columns, self._rows, self._bias, chunk, out)
-        return torch.from_numpy(out)
+        _project(self._tile, fired.places, fired.starts, rows * columns, self._rows, self._bias, chunk, out)
+        return out
 
 
 def extractor(layers: Sequence[Layer], projection: tuple[Tensor, Tensor], lif: LIFParams) -> Extractor | None:
@@ -107,12 +105,12 @@ def maps_of(fired: Fired) -> Tensor:
     """Spikes of 0 and 1 (R, C, H, W), channels last."""
     maps = np.zeros((fired.shape[0], fired.shape[1] * fired.shape[2] * fired.shape[3]), np.float32)
     _mark(fired.places, fired.starts, maps)
-    return torch.from_numpy(maps.reshape(fired.shape)).permute(0, 3, 1, 2)
+    return _maps(maps.reshape(fired.shape))
 
 
 def listed(maps: Tensor) -> Fired:
     """What `maps_of` undoes."""
-    rows = _channels_last(maps)
+    rows = _cells_of(maps)
     flat = rows.reshape(rows.shape[0], -1)
     places = np.nonzero(flat)[1].astype(np.int32)
     cells = np.count_nonzero(rows.reshape(-1, rows.shape[3]), axis=1)
@@ -125,15 +123,16 @@ class OverValues:
 
     def __init__(self, layer: Layer) -> None:
         self._weight, self._bias = _by_input(layer.weight), layer.bias.numpy()
+        self._widths = layer.weight.shape[1], layer.weight.shape[0]
         self._tile, self._firing = tile_of(self._bias.size, most=2), tile_of(self._bias.size)
 
-    def __call__(self, x: Array, v: Array, decay: np.float32, v_th: np.float32) -> Fired:
-        """Potentials v (B, H', W', C') move on in place."""
-        shape = x.shape[0], *v.shape[1:]
-        places, starts = _lists(shape)
+    def __call__(self, x: Array, v: Array, decay: np.float32, v_th: np.float32) -> tuple[Fired, Array]:
+        """Potentials (B, H', W', C') before, to who fires and the potentials after."""
+        shape = _after(x.shape, self._widths, v)
+        (places, starts), after = _lists(shape), np.empty_like(v)
         given = self._tile, self._firing, x, self._weight, self._bias
-        found = _convolve_values(*given, v.reshape(v.shape[0], -1), decay, v_th, places, starts)
-        return Fired(places, starts, shape, found)
+        found = _convolve_values(*given, v, after, decay, v_th, places, starts)
+        return Fired(places, starts, shape, found), after
 
 
 class OverList:
@@ -142,21 +141,32 @@ class OverList:
     def __init__(self, layer: Layer) -> None:
         self._dense = layer.dense
         self._weight, self._bias = _by_input(layer.weight), layer.bias.numpy()
+        self._widths = layer.weight.shape[1], layer.weight.shape[0]
         self._tile = tile_of(self._bias.size)
 
-    def __call__(self, fired: Fired, v: Array, decay: np.float32, v_th: np.float32) -> Fired:
-        """Potentials v (B, H', W', C') move on in place."""
+    def __call__(self, fired: Fired, v: Array, decay: np.float32, v_th: np.float32) -> tuple[Fired, Array]:
+        """Potentials (B, H', W', C') before, to who fires and the potentials after."""
         if fired.found > _MANY * math.prod(fired.shape):
             return _fired(self._dense(maps_of(fired)), v, decay, v_th)
         return self.over_list(fired, v, decay, v_th)
 
-    def over_list(self, fired: Fired, v: Array, decay: np.float32, v_th: np.float32) -> Fired:
+    def over_list(self, fired: Fired, v: Array, decay: np.float32, v_th: np.float32) -> tuple[Fired, Array]:
         """The same, however many fired."""
-        shape = fired.shape[0], *v.shape[1:]
-        places, starts = _lists(shape)
-        given = fired.places, fired.starts, fired.shape, self._weight, self._bias
-        count = _convolve(self._tile, *given, v.reshape(v.shape[0], -1), decay, v_th, places, starts)
-        return Fired(places, starts, shape, count)
+        shape = _after(fired.shape, self._widths, v)
+        (places, starts), after = _lists(shape), np.empty_like(v)
+        given = self._tile, fired.places, fired.starts, fired.shape, self._weight, self._bias
+        found = _convolve(*given, v, after, decay, v_th, places, starts)
+        return Fired(places, starts, shape, found), after
+
+
+def _after(given: tuple[int, ...], weights: tuple[int, int], v: Array) -> tuple[int, int, int, int]:
+    """Shape (R, H', W', C') after a layer of C and C' channels; compiled code asks no more whether all fits."""
+    maps, rows, columns, inputs = given
+    shape = (rows + 1) // 2, (columns + 1) // 2, weights[1]
+    if v.shape[1:] != shape or maps % v.shape[0] or inputs != weights[0] or v.dtype != np.float32:
+        have = f"{v.dtype} {v.shape}"
+        raise ValueError(f"maps {given} and weights {weights} give {shape} for each stream, potentials are {have}")
+    return maps, *shape
 
 
 def _by_input(weight: Tensor) -> Array:
@@ -164,13 +174,20 @@ def _by_input(weight: Tensor) -> Array:
     return weight.permute(2, 3, 1, 0).reshape(-1).numpy()
 
 
-def _channels_last(maps: Tensor) -> Array:
-    return np.ascontiguousarray(maps.detach().numpy().transpose(0, 2, 3, 1))
+def _values(x: Tensor) -> Array:
+    """Of a tensor, without its gradient; each call of torch takes as long as a small layer's kernel starts in."""
+    values: Array = (x.detach() if x.requires_grad else x).numpy()
+    return values
 
 
-def _own(v: Tensor) -> Array:
-    """A copy of potentials, channels last."""
-    return np.array(v.detach().numpy().transpose(0, 2, 3, 1), order="C")
+def _cells_of(maps: Tensor) -> Array:
+    """Maps (R, C, H, W) as (R, H, W, C): their own memory, where they lie channels last."""
+    return np.ascontiguousarray(_values(maps).transpose(0, 2, 3, 1))
+
+
+def _maps(cells: Array) -> Tensor:
+    """What `_cells_of` undoes."""
+    return torch.from_numpy(cells.transpose(0, 3, 1, 2))
 
 
 def _lists(shape: tuple[int, int, int, int]) -> tuple[Places, Places]:
@@ -179,14 +196,13 @@ def _lists(shape: tuple[int, int, int, int]) -> tuple[Places, Places]:
     return np.empty(cells * shape[3] + LANES, np.int32), np.empty(cells + 1, np.int32)
 
 
-def _fired(currents: Tensor, v: Array, decay: np.float32, v_th: np.float32) -> Fired:
-    """Who fires of currents (R, C, H, W); potentials v (B, H, W, C) move on in place."""
-    rows = _channels_last(currents)
-    places, starts = _lists(rows.shape)
+def _fired(currents: Tensor, v: Array, decay: np.float32, v_th: np.float32) -> tuple[Fired, Array]:
+    """Who fires of currents (R, C, H, W), and the potentials (B, H, W, C) after v."""
+    rows = _cells_of(currents)
+    (places, starts), after = _lists(rows.shape), np.empty_like(v)
     channels = rows.shape[3]
-    flat = v.reshape(v.shape[0], -1)
-    count = _fire(tile_of(channels), rows.reshape(-1), channels, flat, decay, v_th, places, starts)
-    return Fired(places, starts, rows.shape, count)
+    found = _fire(tile_of(channels), rows.reshape(-1), channels, v, after, decay, v_th, places, starts)
+    return Fired(places, starts, rows.shape, found), after
 
 
 @torch.inference_mode()
@@ -201,10 +217,10 @@ def _agrees(layer: Layer, *, first: bool) -> bool:
             x = ((drawn[0] < share) * (drawn[1] if first else 1.0)).permute(0, 3, 1, 2)
             v = np.zeros((count, (layer.rows + 1) // 2, (layer.columns + 1) // 2, outputs), np.float32)
             if first:
-                OverValues(layer)(_channels_last(x), v, *silent)
+                _, found = OverValues(layer)(_cells_of(x), v, *silent)
             else:
-                OverList(layer).over_list(listed(x), v, *silent)
-            if not torch.equal(torch.from_numpy(v).permute(0, 3, 1, 2), layer.dense(x)):
+                _, found = OverList(layer).over_list(listed(x), v, *silent)
+            if not torch.equal(_maps(found), layer.dense(x)):
                 return False
     return True
 
@@ -219,7 +235,8 @@ def _convolve_values(
     x: Array,
     weight: Array,
     bias: Array,
-    v: Array,
+    before: Array,
+    after: Array,
     decay: Any,
     v_th: Any,
     places: Places,
@@ -235,7 +252,8 @@ def _convolve_values(
         x: R, H, W, C.
         weight: 3, 3, C, C'.
         bias: C'.
-        v: (B, H' * W' * C'), moves on.
+        before: potentials (B, H', W', C').
+        after: the same, written.
         decay: per step.
         v_th: firing threshold.
         places: written, as `starts`; see Fired.
@@ -246,10 +264,13 @@ def _convolve_values(
     """
     maps, rows, columns, channels = x.shape
     outputs, width, step = bias.size, LANES * len(like), 2 * channels
-    batch, n = v.shape
-    values, potentials, found, cell = x.reshape(-1), v.reshape(-1), 0, 0
+    batch = before.shape[0]
+    n = before.size // batch
+    values, v, v_after, found, cell = x.reshape(-1), before.reshape(-1), after.reshape(-1), 0, 0
     currents = np.empty(6 * outputs, np.float32)
     for r in range(maps):
+        if r == batch:
+            v = v_after
         at = 0  # in the new map
         for row in range(-1, rows - 1, 2):  # the kernel's first
             top, bottom = max(row, 0), min(row + 3, rows)
@@ -285,7 +306,7 @@ def _convolve_values(
                     cell += 1
                     for first in range(i * outputs, (i + 1) * outputs, LANES * len(firing)):
                         current = plus(nothing(firing), currents, first)
-                        found = fire(current, potentials, r % batch * n + at, decay, v_th, places, found, at)
+                        found = fire(current, v, v_after, r % batch * n + at, decay, v_th, places, found, at)
                         at += LANES * len(firing)
                 column += 2 * cells
     starts[cell] = found
@@ -297,7 +318,8 @@ def _fire(
     like: tuple[int, ...],
     currents: Array,
     channels: int,
-    v: Array,
+    before: Array,
+    after: Array,
     decay: Any,
     v_th: Any,
     places: Places,
@@ -309,7 +331,8 @@ def _fire(
         like: width of a tile.
         currents: channels vary fastest.
         channels: a multiple of the tile's width.
-        v: (B, cells * channels), moves on.
+        before: potentials (B, H, W, C).
+        after: the same, written.
         decay: per step.
         v_th: firing threshold.
         places: written, as `starts`; see Fired.
@@ -318,15 +341,18 @@ def _fire(
     Returns:
         how many fire.
     """
-    batch, n = v.shape
-    potentials, cells, width = v.reshape(-1), n // channels, LANES * len(like)
+    batch = before.shape[0]
+    n = before.size // batch
+    v, v_after, cells, width = before.reshape(-1), after.reshape(-1), n // channels, LANES * len(like)
     found = 0
     for r in range(currents.size // n):
+        if r == batch:
+            v = v_after
         for cell in range(cells):
             starts[r * cells + cell] = found
             for first in range(cell * channels, (cell + 1) * channels, width):
                 current = plus(nothing(like), currents, r * n + first)
-                found = fire(current, potentials, r % batch * n + first, decay, v_th, places, found, first)
+                found = fire(current, v, v_after, r % batch * n + first, decay, v_th, places, found, first)
     starts[starts.size - 1] = found
     return found
 
@@ -339,7 +365,8 @@ def _convolve(
     shape: tuple[int, int, int, int],
     weight: Array,
     bias: Array,
-    v: Array,
+    before: Array,
+    after: Array,
     decay: Any,
     v_th: Any,
     places: Places,
@@ -357,7 +384,8 @@ def _convolve(
         shape: R, H, W, C.
         weight: 3, 3, C, C'.
         bias: C'.
-        v: (B, H' * W' * C'), moves on.
+        before: potentials (B, H', W', C').
+        after: the same, written.
         decay: per step.
         v_th: firing threshold.
         places: written, as `starts`; see Fired.
@@ -368,9 +396,12 @@ def _convolve(
     """
     maps, rows, columns, channels = shape
     outputs, width = bias.size, LANES * len(like)
-    batch, n = v.shape
-    potentials, found, cell = v.reshape(-1), 0, 0
+    batch = before.shape[0]
+    n = before.size // batch
+    v, v_after, found, cell = before.reshape(-1), after.reshape(-1), 0, 0
     for r in range(maps):
+        if r == batch:
+            v = v_after
         at = 0  # in the new map
         for row in range(-1, rows - 1, 2):  # the kernel's first
             for column in range(-1, columns - 1, 2):
@@ -385,7 +416,7 @@ def _convolve(
                         for i in range(given_starts[line + left], given_starts[line + right]):
                             current = plus(current, weight, (entry(given, i) + shift) * outputs + tile)
                     current = plus(current, bias, tile)
-                    found = fire(current, potentials, r % batch * n + at, decay, v_th, places, found, at)
+                    found = fire(current, v, v_after, r % batch * n + at, decay, v_th, places, found, at)
                     at += width
     starts[cell] = found
     return found

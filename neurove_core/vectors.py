@@ -114,13 +114,14 @@ def put(typing, tile, numbers, at):  # type: ignore[no-untyped-def]  # pragma: n
 
 
 @instructions
-def fire(typing, currents, v, at, decay, v_th, fired, found, first):  # type: ignore[no-untyped-def]  # pragma: no cover (compiler)
+def fire(typing, currents, before, after, at, decay, v_th, fired, found, first):  # type: ignore[no-untyped-def]  # pragma: no cover (compiler)
     """One step of the LIF neurons of a tile, as scan._in_place; which of them fire is written down.
 
     Args:
         typing: numba's.
         currents: a tile.
-        v: potentials, float32, flat; moved on in place.
+        before: potentials, float32, flat.
+        after: the same, written; may be `before`.
         at: where the tile's begin.
         decay: float32, per step.
         v_th: float32, firing threshold.
@@ -133,25 +134,26 @@ def fire(typing, currents, v, at, decay, v_th, fired, found, first):  # type: ig
     """
 
     def write(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        current, v, at, decay, v_th, fired, found, first = args
+        current, before, after, at, decay, v_th, fired, found, first = args
         lanes = LANES * currents.count
-        potentials = _address(context, builder, signature.args[1], v, at, current.type)
-        leaked = builder.fmul(_spread(builder, decay, lanes), builder.load(potentials, align=4))
+        v = builder.load(_address(context, builder, signature.args[1], before, at, current.type), align=4)
+        leaked = builder.fmul(_spread(builder, decay, lanes), v)
         u = builder.fadd(leaked, current)
         none, one = _filled(0.0, lanes), _filled(1.0, lanes)
         fires = builder.fcmp_ordered(">=", builder.fsub(u, _spread(builder, v_th, lanes)), none)
-        builder.store(builder.fmul(u, builder.select(fires, none, one)), potentials, align=4)
+        where = _address(context, builder, signature.args[2], after, at, current.type)
+        builder.store(builder.fmul(u, builder.select(fires, none, one)), where, align=4)
         places = _spread(builder, builder.trunc(first, _INT), LANES)
         for start in range(0, lanes, LANES):
             own = _numbers(range(start, start + LANES))
             some = builder.shuffle_vector(fires, ir.Constant(fires.type, ir.Undefined), own)
-            where = _address(context, builder, signature.args[5], fired, found, places.type)
+            where = _address(context, builder, signature.args[6], fired, found, places.type)
             builder.store(_packed(builder, builder.add(places, own), some), where, align=4)
             found = builder.add(found, _count(builder, some))
         return found
 
     single = types.float32, types.float32
-    return types.intp(currents, v, types.intp, *single, fired, types.intp, types.intp), write
+    return types.intp(currents, before, after, types.intp, *single, fired, types.intp, types.intp), write
 
 
 def _filled(value: float, lanes: int) -> Any:  # pragma: no cover (compiler)

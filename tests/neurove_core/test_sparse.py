@@ -9,7 +9,7 @@ import torch
 from neurove_core import bundle, convolution, scan, sparse
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
 from neurove_core.engine import Engine
-from neurove_core.neurons import LIFParams, plain
+from neurove_core.neurons import LIFParams, LIFState, plain
 
 DECAY, V_TH = 0.5, 0.7
 LIF = LIFParams(DECAY, V_TH)
@@ -33,10 +33,10 @@ def layer_of(inputs, outputs, rows, columns, seed=0):
 
 
 def fire_over(layer, spikes, v):
-    """Spikes and potentials of a layer over a list, v left as it is."""
-    own = np.array(v.numpy().transpose(0, 2, 3, 1), order="C")
-    fired = sparse.OverList(layer)(sparse.listed(spikes), own, np.float32(DECAY), np.float32(V_TH))
-    return sparse.maps_of(fired), torch.from_numpy(own).permute(0, 3, 1, 2)
+    """Spikes and potentials of a layer over a list."""
+    cells = np.ascontiguousarray(v.numpy().transpose(0, 2, 3, 1))
+    fired, after = sparse.OverList(layer)(sparse.listed(spikes), cells, np.float32(DECAY), np.float32(V_TH))
+    return sparse.maps_of(fired), torch.from_numpy(after.transpose(0, 3, 1, 2))
 
 
 @pytest.mark.parametrize("share", [0, 0.02, 0.15, 0.39, 0.6, 1])
@@ -76,10 +76,11 @@ def test_each_map_is_projected_as_alone_and_summed_in_the_order_of_its_neurons(f
     extractor = sparse.extractor([layer_of(4, 16, 5, 5)], (weight, bias), LIF)
     assert extractor is not None
     maps = spikes_of(4, *size, share)
-    found = extractor.project(sparse.listed(maps))
+    found = torch.from_numpy(extractor.project(sparse.listed(maps)))
     assert found.shape == (4, features)
     for index in range(4):
-        assert torch.equal(extractor.project(sparse.listed(maps[index : index + 1])), found[index : index + 1])
+        alone = torch.from_numpy(extractor.project(sparse.listed(maps[index : index + 1])))
+        assert torch.equal(alone, found[index : index + 1])
         expected = bias.clone()
         for place in maps[index].permute(1, 2, 0).flatten().nonzero():
             expected += weight[:, int(place)]
@@ -150,3 +151,15 @@ def test_streams_together_answer_as_each_alone_bit_for_bit():
         assert torch.equal(state.readout, expected_state.readout)
         for one, other in zip(state.membranes, expected_state.membranes, strict=True):
             assert torch.equal(one.v, other.v)
+
+
+@pytest.mark.parametrize("wrong", ["height", "channels", "batch", "potentials", "type"])
+def test_maps_that_do_not_fit_the_network_are_refused(wrong):
+    engine, start = Engine(network_of()), network_of().initial_state(2)
+    shape = {"height": (1, 2, 4, 17, 19), "channels": (1, 2, 5, 14, 19), "batch": (1, 3, 4, 14, 19)}
+    if wrong == "potentials":
+        start = start._replace(membranes=(start.membranes[0], *start.membranes[:2]))
+    if wrong == "type":
+        start = start._replace(membranes=tuple(LIFState(m.v.double()) for m in start.membranes))
+    with pytest.raises(ValueError, match="for each stream, potentials are"):
+        engine(torch.ones(shape.get(wrong, (1, 2, 4, 14, 19))), start)
