@@ -4,7 +4,8 @@
 
 is what the network in evaluation mode computes, up to rounding: folding a norm moves the last bits of a current, and a
 spike that hangs on them. What holds bit for bit is tested against the engine inside `neurons.plain()`: the same folded
-weights through `lif_step`, `aslstm_step` and `readout_step`. State goes to and fro between all of them.
+weights through `lif_step`, `aslstm_step` and `readout_step`. State goes to and fro between all of them. In float32 the
+convolutions and the projection are sums over the neurons that fired, where the widths allow it (sparse.py), else dense.
 """
 
 from collections.abc import Sequence
@@ -89,11 +90,11 @@ class Engine:
 
     @torch.inference_mode()
     def together(self, spikes: Tensor, states: Sequence[NetworkState]) -> list[tuple[Tensor, NetworkState]]:
-        """One window of each of B streams: the same as a call for each, in half the time.
+        """One window of each of B streams: the same as a call for each, of eight in 0.8 of the time.
 
         The feature extractor takes all at once; cells and readout take each stream alone, so that no sum of a stream
-        is grouped by what another one does. An int8 network's answers are those of single calls bit for bit; in float32
-        a convolution of several maps may round otherwise than one of a single map.
+        is grouped by what another one does. Answers are those of single calls bit for bit in int8, and over spikes
+        alone (sparse.py); a dense convolution of several maps may round otherwise than one of a single map.
 
         Args:
             spikes: (1, B, 2n, H, W), as in a call.

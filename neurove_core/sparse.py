@@ -30,6 +30,8 @@ Places = NDArray[np.int32]
 _MANY: Final = 0.4
 """Share of spikes from which maps are convolved dense: with AVX-512 large ones take as long then (with AVX2 at 0.7)."""
 
+_FEW: Final = 1 << 14  # that fired: fewer are summed up sooner than a dense convolution of a small map has begun
+
 _CHUNK: Final = 512  # inputs of the projection whose weights, 512 KiB for 256 features, stay in the second cache
 
 
@@ -146,7 +148,8 @@ class OverList:
 
     def __call__(self, fired: Fired, v: Array, decay: np.float32, v_th: np.float32) -> tuple[Fired, Array]:
         """Potentials (B, H', W', C') before, to who fires and the potentials after."""
-        if fired.found > _MANY * math.prod(fired.shape):
+        if fired.found > max(_FEW, _MANY * math.prod(fired.shape)):
+            _after(fired.shape, self._widths, v)
             return _fired(self._dense(maps_of(fired)), v, decay, v_th)
         return self.over_list(fired, v, decay, v_th)
 

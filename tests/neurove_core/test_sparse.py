@@ -42,10 +42,20 @@ def fire_over(layer, spikes, v):
 @pytest.mark.parametrize("share", [0, 0.02, 0.15, 0.39, 0.6, 1])
 @pytest.mark.parametrize(
     ("inputs", "outputs", "rows", "columns"),
-    [(1, 16, 1, 1), (5, 48, 4, 7), (20, 32, 9, 6), (16, 96, 2, 3), (64, 64, 9, 11), (32, 256, 5, 8), (130, 128, 7, 7)],
+    [
+        (1, 16, 1, 1),
+        (5, 48, 4, 7),
+        (20, 32, 9, 6),
+        (16, 96, 2, 3),
+        (64, 64, 9, 11),
+        (32, 256, 5, 8),
+        (130, 128, 7, 7),
+        (64, 16, 21, 19),
+    ],
 )
 @torch.inference_mode()
 def test_a_layer_over_a_list_fires_as_the_dense_one_bit_for_bit(inputs, outputs, rows, columns, share):
+    """Short lists and long ones, which are convolved dense: where a large map mostly fires."""
     layer = layer_of(inputs, outputs, rows, columns)
     size = (outputs, (rows + 1) // 2, (columns + 1) // 2)
     for steps, batch in ((1, 1), (3, 1), (1, 3), (2, 2)):
@@ -163,3 +173,19 @@ def test_maps_that_do_not_fit_the_network_are_refused(wrong):
         start = start._replace(membranes=tuple(LIFState(m.v.double()) for m in start.membranes))
     with pytest.raises(ValueError, match="for each stream, potentials are"):
         engine(torch.ones(shape.get(wrong, (1, 2, 4, 14, 19))), start)
+
+
+def test_a_number_that_is_not_finite_stays_in_the_state_where_a_check_finds_it():
+    spikes = torch.ones(2, 1, 4, 14, 19)
+    spikes[0, 0, 0, 0, 0] = float("nan")
+    assert not Engine(network_of())(spikes, network_of().initial_state(1))[1].finite()
+
+
+def test_running_changes_neither_the_state_that_was_given_nor_the_input():
+    engine, spikes = Engine(network_of()), torch.ones(3, 2, 4, 14, 19)
+    _, carried = engine(spikes, network_of().initial_state(2))
+    before = [carried.readout.clone(), *(membrane.v.clone() for membrane in carried.membranes), spikes.clone()]
+    once, again = engine(spikes, carried)[0], engine(spikes, carried)[0]
+    assert torch.equal(once, again)
+    after = [carried.readout, *(membrane.v for membrane in carried.membranes), spikes]
+    assert all(torch.equal(one, other) for one, other in zip(before, after, strict=True))
