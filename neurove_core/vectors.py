@@ -39,14 +39,14 @@ def tile_of(channels: int, most: int = 8) -> tuple[int, ...]:
 class Vector(types.Type):
     """Some vectors of LANES float32."""
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int) -> None:  # pragma: no cover (compiler)
         self.count = count
         super().__init__(f"Vector({count})")
 
 
 @register_model(Vector)
 class _VectorModel(models.PrimitiveModel):
-    def __init__(self, manager: Any, kind: Vector) -> None:
+    def __init__(self, manager: Any, kind: Vector) -> None:  # pragma: no cover (compiler)
         super().__init__(manager, kind, ir.VectorType(_FLOAT, LANES * kind.count))  # type: ignore[no-untyped-call]  # numba's
 
 
