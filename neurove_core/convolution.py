@@ -3,7 +3,7 @@
 import functools
 import logging
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ from torch.nn.functional import conv2d
 Convolution = Callable[[Tensor], Tensor]
 """(R, C, H, W) channels last to (R, C', H', W') channels last: 3x3, stride 2, one cell of zeros around."""
 
-_LARGE = 1 << 20
+LARGE: Final = 1 << 20
 """Values of a map from which a try on three of them would take seconds and memory of a running service."""
 
 log = logging.getLogger(__name__)
@@ -72,7 +72,7 @@ def _agrees(shape: tuple[int, ...], rows: int, columns: int) -> bool:
 
     weight, bias = draw(*shape), draw(shape[0])
     ours, public = _packed(weight, bias, rows, columns), plain_convolution(weight, bias)
-    for count in (1, 3) if shape[1] * rows * columns <= _LARGE else (1,):
+    for count in (1, 3) if shape[1] * rows * columns <= LARGE else (1,):
         x = draw(count, shape[1], rows, columns).contiguous(memory_format=torch.channels_last)
         got, want = ours(x), public(x)
         if got.shape != want.shape or not torch.allclose(got, want, rtol=1e-4, atol=1e-4 * float(want.abs().max())):

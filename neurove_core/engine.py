@@ -4,7 +4,8 @@
 
 is what the network in evaluation mode computes, up to rounding: folding a norm moves the last bits of a current, and a
 spike that hangs on them. What holds bit for bit is tested against the engine inside `neurons.plain()`: the same folded
-weights through `lif_step`, `aslstm_step` and `readout_step`. State goes to and fro between all of them.
+weights through `lif_step`, `aslstm_step` and `readout_step`. State goes to and fro between all of them. In float32 the
+convolutions and the projection are sums over the neurons that fired, where the widths allow it (sparse.py), else dense.
 """
 
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
-from neurove_core import int8, scan
+from neurove_core import int8, scan, sparse
 from neurove_core.activations import fused, sigmoid, tanh
 from neurove_core.cells import ASLSTM, ASLSTMParams, ASLSTMState, aslstm_step, readout_step
 from neurove_core.convolution import Convolution, convolution
@@ -47,7 +48,7 @@ class Engine:
         sizes = [(grid.height, grid.width), *network.map_sizes()]
         with torch.no_grad():
             self._lif: LIFParams = blocks[0].lif
-            self._extractor, self._convolutions = None, []
+            self._extractor, self._sparse, self._convolutions = None, None, []
             if net.precision == "int8":
                 self._extractor = int8.Extractor(
                     [_int8_layer(block, at=i) for i, block in enumerate(blocks)], sizes, self._lif
@@ -59,12 +60,15 @@ class Engine:
                 self._project = int8.Projection(_int8_projection(network, net.channels[-1], *sizes[-1]))
             else:
                 self._project = _projection(network, net.channels[-1], *sizes[-1])
+                self._sparse = self._over_lists(blocks, sizes)
             self._readout = Folded(*(tensor.detach().clone() for tensor in network.outputs()))
             self._kappa = float(torch.sigmoid(network.kappa_logit))
             cells = [cell for cell in network.cells if isinstance(cell, ASLSTM)]
             self._params = [_copied(cell.params()) for cell in cells]
             self._d_space = network.d_space.detach().clone()
-        self._weights = _flattened(self._project, self._params, self._d_space, self._readout)
+        inside = self._project if isinstance(self._project, Folded) and self._sparse is None else None
+        self._features_inside = inside.bias.numel() if inside else 0  # of a projection that `_cells` computes
+        self._weights = _flattened(inside, self._params, self._d_space, self._readout)
         self._constants = np.array([net.alpha, net.v_th, self._kappa], np.float32)
 
     @torch.inference_mode()
@@ -79,20 +83,18 @@ class Engine:
         Returns:
             twists (T, B, n, 6) in scaled units and the next state, as NeuroVE.forward.
         """
-        steps, batch = spikes.shape[:2]
         x, membranes = self._features(spikes, state)
-        rows = self._rows(x)
-        answers, cells, y = (self._plain_cells if is_plain() else self._fused_cells)(rows, steps, state)
-        twists = answers[..., : 6 * self._bins].reshape(steps, batch, self._bins, 6)
+        rows, steps = self._rows(x), spikes.shape[0]
+        twists, cells, y = (self._plain_cells if is_plain() else self._fused_cells)(rows, steps, state)
         return twists, NetworkState(membranes, cells, y)
 
     @torch.inference_mode()
     def together(self, spikes: Tensor, states: Sequence[NetworkState]) -> list[tuple[Tensor, NetworkState]]:
-        """One window of each of B streams: the same as a call for each, in half the time.
+        """One window of each of B streams: the same as a call for each, of eight in 0.8 of the time.
 
         The feature extractor takes all at once; cells and readout take each stream alone, so that no sum of a stream
-        is grouped by what another one does. An int8 network's answers are those of single calls bit for bit; in float32
-        a convolution of several maps may round otherwise than one of a single map.
+        is grouped by what another one does. Answers are those of single calls bit for bit in int8, and over spikes
+        alone (sparse.py); a dense convolution of several maps may round otherwise than one of a single map.
 
         Args:
             spikes: (1, B, 2n, H, W), as in a call.
@@ -108,8 +110,7 @@ class Engine:
         rows = self._rows(x)
         answers = []
         for b, state in enumerate(states):
-            found, cells, y = (self._plain_cells if is_plain() else self._fused_cells)(rows[b : b + 1], 1, state)
-            twists = found[..., : 6 * self._bins].reshape(1, 1, self._bins, 6)
+            twists, cells, y = (self._plain_cells if is_plain() else self._fused_cells)(rows[b : b + 1], 1, state)
             own = tuple(LIFState(membrane.v[b : b + 1].clone()) for membrane in membranes)  # a view would keep all
             answers.append((twists, NetworkState(own, cells, y)))
         return answers
@@ -118,11 +119,13 @@ class Engine:
     def features(self, spikes: Tensor, state: NetworkState) -> tuple[Tensor, tuple[LIFState, ...]]:
         """Spikes (T * B, C, H', W') of the last map of the feature extractor alone, and its membranes after them."""
         x, membranes = self._features(spikes, state)
-        return x.float(), membranes
+        return sparse.maps_of(x) if isinstance(x, sparse.Fired) else x.float(), membranes
 
-    def _features(self, spikes: Tensor, state: NetworkState) -> tuple[Tensor, tuple[LIFState, ...]]:
+    def _features(self, spikes: Tensor, state: NetworkState) -> tuple[Tensor | sparse.Fired, tuple[LIFState, ...]]:
         if self._extractor is not None:
             return self._extractor(spikes.flatten(0, 1), state.membranes)
+        if self._sparse is not None and not is_plain():
+            return self._sparse(spikes, state.membranes)
         x = spikes.flatten(0, 1).contiguous(memory_format=torch.channels_last)
         fire = self._plain_fire if is_plain() else self._fused_fire
         membranes = []
@@ -131,10 +134,20 @@ class Engine:
             membranes.append(LIFState(after))
         return x, tuple(membranes)
 
-    def _rows(self, x: Tensor) -> Tensor:
-        """What the cells are given of the last map (R, C, H, W): its spikes (R, I), in int8 their projection (R, F)."""
+    def _rows(self, x: Tensor | sparse.Fired) -> Tensor | Array:
+        """What the cells are given of the last map (R, C, H, W): its spikes (R, I), or their projection (R, F)."""
+        if isinstance(x, sparse.Fired):
+            assert self._sparse is not None  # it made them
+            return self._sparse.project(x)
         rows = x.permute(0, 2, 3, 1).flatten(1)  # as it lies in memory
         return self._project(rows) if isinstance(self._project, int8.Projection) else rows
+
+    def _over_lists(self, blocks: list[SpikingBlock], sizes: list[tuple[int, int]]) -> sparse.Extractor | None:
+        layers = [
+            sparse.Layer(*folded(block.conv.weight, block.norm), convolve, *size)
+            for block, convolve, size in zip(blocks, self._convolutions, sizes, strict=False)
+        ]
+        return sparse.extractor(layers, self._project, self._lif) if isinstance(self._project, Folded) else None
 
     def _fused_fire(self, currents: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         return scan.scan_in_place(currents, v, self._lif.decay, self._lif.v_th)
@@ -144,20 +157,21 @@ class Engine:
         return spikes.flatten(0, 1), after.v
 
     def _fused_cells(
-        self, rows: Tensor, steps: int, state: NetworkState
+        self, rows: Tensor | Array, steps: int, state: NetworkState
     ) -> tuple[Tensor, tuple[ASLSTMState, ...], Tensor]:
+        x: Array = rows.numpy() if isinstance(rows, Tensor) else rows
         carried = torch.stack([field for cell in state.cells for field in cell])  # (3 L, B, N): c, v, s of each layer
         y = state.readout.clone()
-        answers = torch.empty(steps, *y.shape)
-        features = self._project.bias.numel() if isinstance(self._project, Folded) else 0
-        _cells(rows.numpy(), self._weights, features, self._constants, carried.numpy(), y.numpy(), answers.numpy())
+        answers = np.empty((steps, *y.shape), np.float32)
+        _cells(x, self._weights, self._features_inside, self._constants, carried.numpy(), y.numpy(), answers)
         fields = carried.unbind()
-        return answers, tuple(ASLSTMState(*fields[i : i + 3]) for i in range(0, len(fields), 3)), y
+        cells = tuple([ASLSTMState(*fields[i : i + 3]) for i in range(0, len(fields), 3)])
+        return torch.from_numpy(answers[..., : 6 * self._bins].reshape(steps, -1, self._bins, 6)), cells, y
 
     def _plain_cells(
-        self, rows: Tensor, steps: int, state: NetworkState
+        self, rows: Tensor | Array, steps: int, state: NetworkState
     ) -> tuple[Tensor, tuple[ASLSTMState, ...], Tensor]:
-        y, cells, answers = state.readout, list(state.cells), []
+        y, cells, answers, rows = state.readout, list(state.cells), [], torch.as_tensor(rows)
         x = linear(rows, *self._project) if isinstance(self._project, Folded) else rows
         for z in x.view(steps, rows.shape[0] // steps, -1):
             for index, params in enumerate(self._params):
@@ -165,7 +179,8 @@ class Engine:
                 z = diffuse(cells[index].s, cells[index].v, self._d_space[index])
             y = readout_step(z, y, *self._readout, self._kappa)
             answers.append(y)
-        return torch.stack(answers), tuple(cells), y
+        twists = torch.stack(answers)[..., : 6 * self._bins].reshape(steps, -1, self._bins, 6)
+        return twists, tuple(cells), y
 
 
 def folded(weight: Tensor, norm: nn.BatchNorm1d | nn.BatchNorm2d) -> Folded:
@@ -215,13 +230,13 @@ def _copied(params: ASLSTMParams) -> ASLSTMParams:
     return ASLSTMParams(w_x, w_v, b, d_time, params.alpha, params.v_th)
 
 
-def _flattened(project: Folded | int8.Projection, cells: list[ASLSTMParams], d_space: Tensor, readout: Folded) -> Array:
+def _flattened(project: Folded | None, cells: list[ASLSTMParams], d_space: Tensor, readout: Folded) -> Array:
     """All weights of the compiled pass in one vector, in the order in which `_cells` takes them off it.
 
     Matrices are transposed, so that a row is what one input gives to all outputs; one array is handed over in a few
-    microseconds, twenty would take longer than a layer. A projection in int8 is none of it.
+    microseconds, twenty would take longer than a layer. A projection of its own is none of it.
     """
-    tensors = [project.weight.T, project.bias] if isinstance(project, Folded) else []
+    tensors = [project.weight.T, project.bias] if project else []
     for params, d in zip(cells, d_space, strict=True):
         tensors += [params.w_x.T, params.w_v.T, params.b, params.d_time, d]
     tensors += [readout.weight.T, readout.bias]

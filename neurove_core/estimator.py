@@ -127,7 +127,7 @@ class Estimator:
     def push_many(self, pushes: Sequence[Push]) -> list[Answer]:
         """Take a packet of each of several streams, and answer all windows that they complete, in common batches.
 
-        As `push` for each, in half the time where several streams complete a window; see Engine.together for when the
+        As `push` for each, in less time where several streams complete a window; see Engine.together for when the
         answers are the same bit for bit.
 
         Args:

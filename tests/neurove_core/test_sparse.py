@@ -1,0 +1,191 @@
+"""What is summed over those that fired alone equals what is summed over all, bit for bit."""
+
+import logging
+
+import numpy as np
+import pytest
+import torch
+
+from neurove_core import bundle, convolution, scan, sparse
+from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
+from neurove_core.engine import Engine
+from neurove_core.neurons import LIFParams, LIFState, plain
+
+DECAY, V_TH = 0.5, 0.7
+LIF = LIFParams(DECAY, V_TH)
+SMALL = ModelConfig(
+    window=WindowConfig(duration_us=10_000, bins=2),
+    canonical=CanonicalConfig(width=19, height=14),
+    network=NetworkConfig(channels=(16, 48, 32), features=80, hidden=11, v_th=0.4),
+)
+
+
+def spikes_of(count, channels, rows, columns, share, seed=0):
+    drawn = torch.rand(count, rows, columns, channels, generator=torch.Generator().manual_seed(seed))
+    return (drawn < share).float().permute(0, 3, 1, 2)
+
+
+def layer_of(inputs, outputs, rows, columns, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    weight = torch.randn(outputs, inputs, 3, 3, generator=generator) / (3 * inputs**0.5)
+    bias = torch.randn(outputs, generator=generator) / 4
+    return sparse.Layer(weight, bias, convolution.convolution(weight, bias, rows, columns), rows, columns)
+
+
+def fire_over(layer, spikes, v):
+    """Spikes and potentials of a layer over a list."""
+    cells = np.ascontiguousarray(v.numpy().transpose(0, 2, 3, 1))
+    fired, after = sparse.OverList(layer)(sparse.listed(spikes), cells, np.float32(DECAY), np.float32(V_TH))
+    return sparse.maps_of(fired), torch.from_numpy(after.transpose(0, 3, 1, 2))
+
+
+@pytest.mark.parametrize("share", [0, 0.02, 0.15, 0.39, 0.6, 1])
+@pytest.mark.parametrize(
+    ("inputs", "outputs", "rows", "columns"),
+    [
+        (1, 16, 1, 1),
+        (5, 48, 4, 7),
+        (20, 32, 9, 6),
+        (16, 96, 2, 3),
+        (64, 64, 9, 11),
+        (32, 256, 5, 8),
+        (130, 128, 7, 7),
+        (64, 16, 21, 19),
+    ],
+)
+@torch.inference_mode()
+def test_a_layer_over_a_list_fires_as_the_dense_one_bit_for_bit(inputs, outputs, rows, columns, share):
+    """Short lists and long ones, which are convolved dense: where a large map mostly fires."""
+    layer = layer_of(inputs, outputs, rows, columns)
+    size = (outputs, (rows + 1) // 2, (columns + 1) // 2)
+    for steps, batch in ((1, 1), (3, 1), (1, 3), (2, 2)):
+        spikes = spikes_of(steps * batch, inputs, rows, columns, share, seed=steps)
+        v = torch.rand(batch, *size).contiguous(memory_format=torch.channels_last) - 0.3
+        fired, after = fire_over(layer, spikes, v)
+        expected, expected_after = scan.scan_in_place(layer.dense(spikes), v, DECAY, V_TH)
+        assert torch.equal(fired, expected)
+        assert torch.equal(after, expected_after)
+
+
+@pytest.mark.parametrize("share", [0, 0.15, 1])
+def test_a_list_holds_what_its_maps_hold(share):
+    maps = spikes_of(3, 5, 4, 7, share)
+    fired = sparse.listed(maps)
+    assert torch.equal(sparse.maps_of(fired), maps)
+    assert fired.found == int(maps.sum())
+    assert fired.starts.size == 3 * 4 * 7 + 1
+
+
+@pytest.mark.parametrize("share", [0, 0.15, 1], ids=["no spike", "spikes", "all fire"])
+@pytest.mark.parametrize("size", [(16, 1, 1), (256, 9, 11), (700, 1, 3), (1, 5, 7)])
+@pytest.mark.parametrize("features", [16, 80, 256])
+def test_each_map_is_projected_as_alone_and_summed_in_the_order_of_its_neurons(features, size, share):
+    channels, rows, columns = size
+    generator = torch.Generator().manual_seed(1)
+    weight, bias = torch.randn(features, channels * rows * columns, generator=generator), torch.randn(features)
+    extractor = sparse.extractor([layer_of(4, 16, 5, 5)], (weight, bias), LIF)
+    assert extractor is not None
+    maps = spikes_of(4, *size, share)
+    found = torch.from_numpy(extractor.project(sparse.listed(maps)))
+    assert found.shape == (4, features)
+    for index in range(4):
+        alone = torch.from_numpy(extractor.project(sparse.listed(maps[index : index + 1])))
+        assert torch.equal(alone, found[index : index + 1])
+        expected = bias.clone()
+        for place in maps[index].permute(1, 2, 0).flatten().nonzero():
+            expected += weight[:, int(place)]
+        assert torch.equal(found[index], expected)
+
+
+def test_widths_that_suit_no_vector_are_left_to_the_dense_layers():
+    layers, wide = [layer_of(4, 16, 5, 5), layer_of(16, 24, 3, 3)], (torch.zeros(32, 24 * 2 * 2), torch.zeros(32))
+    assert sparse.extractor(layers, wide, LIF) is None
+    layers[1] = layer_of(16, 32, 3, 3)
+    assert sparse.extractor(layers, (torch.zeros(13, 32 * 2 * 2), torch.zeros(13)), LIF) is None
+    assert sparse.extractor(layers, (torch.zeros(32, 32 * 2 * 2), torch.zeros(32)), LIF) is not None
+
+
+@pytest.mark.parametrize("what", ["rounds otherwise", "is not finite", "raises"])
+def test_where_the_dense_layer_computes_something_else_it_serves_and_it_is_said_once(what, caplog):
+    first, layer = layer_of(4, 16, 5, 5), layer_of(16, 32, 3, 3)
+    if what == "is not finite":
+        layer.weight[3, 4, 1, 1] = float("nan")
+    weight, bias = layer.weight, layer.bias
+
+    def reordered(x):
+        if what == "raises":
+            raise RuntimeError("no such primitive")
+        return convolution.plain_convolution(weight.flip(1), bias)(x.flip(1))
+
+    convolution.forget_warnings()
+    with caplog.at_level(logging.WARNING):
+        for _ in range(2):
+            layers = [first, layer._replace(dense=reordered)]
+            assert sparse.extractor(layers, (torch.zeros(16, 128), torch.zeros(16)), LIF) is None
+    assert len(caplog.records) == 1
+    assert "convolutions over spikes alone are off" in caplog.text
+
+
+def network_of(seed=0):
+    return bundle.untrained(seed, SMALL).network.requires_grad_(requires_grad=False)
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.05, 0.4, 40.0])
+@pytest.mark.parametrize("batch", [1, 3])
+@pytest.mark.parametrize("steps", [1, 4])
+def test_whole_windows_of_few_and_of_many_spikes_fire_as_in_plain_steps_bit_for_bit(steps, batch, rate):
+    engine = Engine(network_of())
+    states = [network_of().initial_state(batch) for _ in range(2)]
+    shape = (steps, batch, 4, 14, 19)
+    for seed in range(3):
+        spikes = torch.poisson(torch.full(shape, rate), generator=torch.Generator().manual_seed(seed)).log1p()
+        fired, _ = engine.features(spikes, states[0])
+        twists, states[0] = engine(spikes, states[0])
+        with plain():
+            expected, _ = engine.features(spikes, states[1])
+            expected_twists, states[1] = engine(spikes, states[1])
+        assert torch.equal(fired, expected)
+        torch.testing.assert_close(twists, expected_twists, rtol=1e-4, atol=1e-5)
+        for one, other in zip(states[0].membranes, states[1].membranes, strict=True):
+            assert torch.equal(one.v, other.v)
+        for cell, other_cell in zip(states[0].cells, states[1].cells, strict=True):
+            assert torch.equal(cell.s, other_cell.s)
+
+
+def test_streams_together_answer_as_each_alone_bit_for_bit():
+    engine, starts = Engine(network_of()), [network_of().initial_state(1) for _ in range(3)]
+    spikes = torch.poisson(torch.full((1, 3, 4, 14, 19), 0.4), generator=torch.Generator().manual_seed(2)).log1p()
+    for b, (twists, state) in enumerate(engine.together(spikes, starts)):
+        expected, expected_state = engine(spikes[:, b : b + 1], starts[b])
+        assert torch.equal(twists, expected)
+        assert torch.equal(state.readout, expected_state.readout)
+        for one, other in zip(state.membranes, expected_state.membranes, strict=True):
+            assert torch.equal(one.v, other.v)
+
+
+@pytest.mark.parametrize("wrong", ["height", "channels", "batch", "potentials", "type"])
+def test_maps_that_do_not_fit_the_network_are_refused(wrong):
+    engine, start = Engine(network_of()), network_of().initial_state(2)
+    shape = {"height": (1, 2, 4, 17, 19), "channels": (1, 2, 5, 14, 19), "batch": (1, 3, 4, 14, 19)}
+    if wrong == "potentials":
+        start = start._replace(membranes=(start.membranes[0], *start.membranes[:2]))
+    if wrong == "type":
+        start = start._replace(membranes=tuple(LIFState(m.v.double()) for m in start.membranes))
+    with pytest.raises(ValueError, match="for each stream, potentials are"):
+        engine(torch.ones(shape.get(wrong, (1, 2, 4, 14, 19))), start)
+
+
+def test_a_number_that_is_not_finite_stays_in_the_state_where_a_check_finds_it():
+    spikes = torch.ones(2, 1, 4, 14, 19)
+    spikes[0, 0, 0, 0, 0] = float("nan")
+    assert not Engine(network_of())(spikes, network_of().initial_state(1))[1].finite()
+
+
+def test_running_changes_neither_the_state_that_was_given_nor_the_input():
+    engine, spikes = Engine(network_of()), torch.ones(3, 2, 4, 14, 19)
+    _, carried = engine(spikes, network_of().initial_state(2))
+    before = [carried.readout.clone(), *(membrane.v.clone() for membrane in carried.membranes), spikes.clone()]
+    once, again = engine(spikes, carried)[0], engine(spikes, carried)[0]
+    assert torch.equal(once, again)
+    after = [carried.readout, *(membrane.v for membrane in carried.membranes), spikes]
+    assert all(torch.equal(one, other) for one, other in zip(before, after, strict=True))
