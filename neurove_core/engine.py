@@ -137,6 +137,8 @@ class Engine:
     def _rows(self, x: Tensor | sparse.Fired) -> Tensor | Array:
         """What the cells are given of the last map (R, C, H, W): its spikes (R, I), or their projection (R, F)."""
         if isinstance(x, sparse.Fired):
+            if isinstance(self._project, int8.Projection):
+                return self._project(x)
             assert self._sparse is not None  # it made them
             return self._sparse.project(x)
         rows = x.permute(0, 2, 3, 1).flatten(1)  # as it lies in memory

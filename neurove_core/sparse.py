@@ -32,6 +32,9 @@ _MANY: Final = 0.4
 
 _FEW: Final = 1 << 14  # that fired: fewer are summed up sooner than a dense convolution of a small map has begun
 
+SPARE: Final = 2 * LANES
+"""Numbers behind those of a list that may be read and written, and mean nothing."""
+
 _CHUNK: Final = 512  # inputs of the projection whose weights, 512 KiB for 256 features, stay in the second cache
 
 
@@ -72,13 +75,13 @@ class Extractor:
     def __call__(self, spikes: Tensor, membranes: Sequence[LIFState]) -> tuple[Fired, tuple[LIFState, ...]]:
         """Input (T, B, 2n, H, W) to who fired in the last map, and the potentials after the last reset."""
         constants = self._decay, self._v_th
-        x = np.ascontiguousarray(_values(spikes).transpose(0, 1, 3, 4, 2))
-        fired, v = self._first(x.reshape(-1, *x.shape[2:]), _cells_of(membranes[0].v), *constants)
+        x = np.ascontiguousarray(values_of(spikes).transpose(0, 1, 3, 4, 2))
+        fired, v = self._first(x.reshape(-1, *x.shape[2:]), cells_of(membranes[0].v), *constants)
         after = [v]
         for layer, membrane in zip(self._layers, membranes[1:], strict=True):
-            fired, v = layer(fired, _cells_of(membrane.v), *constants)
+            fired, v = layer(fired, cells_of(membrane.v), *constants)
             after.append(v)
-        return fired, tuple([LIFState(_maps(v)) for v in after])
+        return fired, tuple([LIFState(in_maps(v)) for v in after])
 
     def project(self, fired: Fired) -> Array:
         """What the projection makes of each map (R, F)."""
@@ -103,21 +106,23 @@ def extractor(layers: Sequence[Layer], projection: tuple[Tensor, Tensor], lif: L
     return None
 
 
-def maps_of(fired: Fired) -> Tensor:
+def maps_of(fired: Fired, kind: type[np.generic] = np.float32) -> Tensor:
     """Spikes of 0 and 1 (R, C, H, W), channels last."""
-    maps = np.zeros((fired.shape[0], fired.shape[1] * fired.shape[2] * fired.shape[3]), np.float32)
+    maps = np.zeros((fired.shape[0], fired.shape[1] * fired.shape[2] * fired.shape[3]), kind)
     _mark(fired.places, fired.starts, maps)
-    return _maps(maps.reshape(fired.shape))
+    return in_maps(maps.reshape(fired.shape))
 
 
 def listed(maps: Tensor) -> Fired:
     """What `maps_of` undoes."""
-    rows = _cells_of(maps)
+    rows = cells_of(maps)
     flat = rows.reshape(rows.shape[0], -1)
-    places = np.nonzero(flat)[1].astype(np.int32)
+    found = np.nonzero(flat)[1]
+    places = np.zeros(found.size + SPARE, np.int32)
+    places[: found.size] = found
     cells = np.count_nonzero(rows.reshape(-1, rows.shape[3]), axis=1)
     starts = np.concatenate([[0], np.cumsum(cells)]).astype(np.int32)
-    return Fired(places, starts, rows.shape, places.size)
+    return Fired(places, starts, rows.shape, found.size)
 
 
 class OverValues:
@@ -130,8 +135,8 @@ class OverValues:
 
     def __call__(self, x: Array, v: Array, decay: np.float32, v_th: np.float32) -> tuple[Fired, Array]:
         """Potentials (B, H', W', C') before, to who fires and the potentials after."""
-        shape = _after(x.shape, self._widths, v)
-        (places, starts), after = _lists(shape), np.empty_like(v)
+        shape = shape_after(x.shape, self._widths, v)
+        (places, starts), after = room_for(shape), np.empty_like(v)
         given = self._tile, self._firing, x, self._weight, self._bias
         found = _convolve_values(*given, v, after, decay, v_th, places, starts)
         return Fired(places, starts, shape, found), after
@@ -149,20 +154,20 @@ class OverList:
     def __call__(self, fired: Fired, v: Array, decay: np.float32, v_th: np.float32) -> tuple[Fired, Array]:
         """Potentials (B, H', W', C') before, to who fires and the potentials after."""
         if fired.found > max(_FEW, _MANY * math.prod(fired.shape)):
-            _after(fired.shape, self._widths, v)
+            shape_after(fired.shape, self._widths, v)
             return _fired(self._dense(maps_of(fired)), v, decay, v_th)
         return self.over_list(fired, v, decay, v_th)
 
     def over_list(self, fired: Fired, v: Array, decay: np.float32, v_th: np.float32) -> tuple[Fired, Array]:
         """The same, however many fired."""
-        shape = _after(fired.shape, self._widths, v)
-        (places, starts), after = _lists(shape), np.empty_like(v)
+        shape = shape_after(fired.shape, self._widths, v)
+        (places, starts), after = room_for(shape), np.empty_like(v)
         given = self._tile, fired.places, fired.starts, fired.shape, self._weight, self._bias
         found = _convolve(*given, v, after, decay, v_th, places, starts)
         return Fired(places, starts, shape, found), after
 
 
-def _after(given: tuple[int, ...], weights: tuple[int, int], v: Array) -> tuple[int, int, int, int]:
+def shape_after(given: tuple[int, ...], weights: tuple[int, int], v: Array) -> tuple[int, int, int, int]:
     """Shape (R, H', W', C') after a layer of C and C' channels; compiled code asks no more whether all fits."""
     maps, rows, columns, inputs = given
     shape = (rows + 1) // 2, (columns + 1) // 2, weights[1]
@@ -177,32 +182,32 @@ def _by_input(weight: Tensor) -> Array:
     return weight.permute(2, 3, 1, 0).reshape(-1).numpy()
 
 
-def _values(x: Tensor) -> Array:
+def values_of(x: Tensor) -> NDArray[Any]:
     """Of a tensor, without its gradient; each call of torch takes as long as a small layer's kernel starts in."""
-    values: Array = (x.detach() if x.requires_grad else x).numpy()
+    values: NDArray[Any] = (x.detach() if x.requires_grad else x).numpy()
     return values
 
 
-def _cells_of(maps: Tensor) -> Array:
+def cells_of(maps: Tensor) -> NDArray[Any]:
     """Maps (R, C, H, W) as (R, H, W, C): their own memory, where they lie channels last."""
-    return np.ascontiguousarray(_values(maps).transpose(0, 2, 3, 1))
+    return np.ascontiguousarray(values_of(maps).transpose(0, 2, 3, 1))
 
 
-def _maps(cells: Array) -> Tensor:
-    """What `_cells_of` undoes."""
+def in_maps(cells: Array) -> Tensor:
+    """What `cells_of` undoes."""
     return torch.from_numpy(cells.transpose(0, 3, 1, 2))
 
 
-def _lists(shape: tuple[int, int, int, int]) -> tuple[Places, Places]:
+def room_for(shape: tuple[int, int, int, int]) -> tuple[Places, Places]:
     """Room for all of these maps to fire."""
     cells = shape[0] * shape[1] * shape[2]
-    return np.empty(cells * shape[3] + LANES, np.int32), np.empty(cells + 1, np.int32)
+    return np.empty(cells * shape[3] + SPARE, np.int32), np.empty(cells + 1, np.int32)
 
 
 def _fired(currents: Tensor, v: Array, decay: np.float32, v_th: np.float32) -> tuple[Fired, Array]:
     """Who fires of currents (R, C, H, W), and the potentials (B, H, W, C) after v."""
-    rows = _cells_of(currents)
-    (places, starts), after = _lists(rows.shape), np.empty_like(v)
+    rows = cells_of(currents)
+    (places, starts), after = room_for(rows.shape), np.empty_like(v)
     channels = rows.shape[3]
     found = _fire(tile_of(channels), rows.reshape(-1), channels, v, after, decay, v_th, places, starts)
     return Fired(places, starts, rows.shape, found), after
@@ -220,10 +225,10 @@ def _agrees(layer: Layer, *, first: bool) -> bool:
             x = ((drawn[0] < share) * (drawn[1] if first else 1.0)).permute(0, 3, 1, 2)
             v = np.zeros((count, (layer.rows + 1) // 2, (layer.columns + 1) // 2, outputs), np.float32)
             if first:
-                _, found = OverValues(layer)(_cells_of(x), v, *silent)
+                _, found = OverValues(layer)(cells_of(x), v, *silent)
             else:
                 _, found = OverList(layer).over_list(listed(x), v, *silent)
-            if not torch.equal(_maps(found), layer.dense(x)):
+            if not torch.equal(in_maps(found), layer.dense(x)):
                 return False
     return True
 
@@ -465,7 +470,7 @@ def _project(
 
 
 @compiled
-def _mark(given: Places, starts: Places, maps: Array) -> None:  # pragma: no cover (machine code)
+def _mark(given: Places, starts: Places, maps: NDArray[Any]) -> None:  # pragma: no cover (machine code)
     """Write 1 where someone fired; maps (R, H * W * C) are 0."""
     cells = (starts.size - 1) // maps.shape[0]
     for r in range(maps.shape[0]):

@@ -1,10 +1,12 @@
-"""Float vectors in compiled loops: sums that stay in registers, and lists of the neurons that fire.
+"""Vectors in compiled loops: sums that stay in registers, of floats or whole numbers, and lists of neurons that fire.
 
 numba's own vectors begin anew with every inner loop, and a loop over 64 channels is too short for that. Here a tile of
 up to 128 channels is one value of a compiled function. LLVM makes of it what the machine has, and nothing is reordered
 or fused but where it says so: each lane is rounded as the same lines on single numbers would be.
 
 A tile's width is told to compiled code by the type of `like`, a tuple of as many numbers as the tile has vectors of 16.
+
+Whole numbers wrap where they overflow, so a sum that fits in the end is right whatever lay between.
 """
 
 from typing import Any, Final
@@ -13,12 +15,13 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.core.datamodel import models
+from numba.core.registry import cpu_target
 from numba.extending import intrinsic, register_model
 
 LANES: Final = 16
 """Of one vector; widths of tiles are multiples of it."""
 
-_FLOAT, _INT = ir.FloatType(), ir.IntType(32)
+_FLOAT, _SHORT, _INT = ir.FloatType(), ir.IntType(16), ir.IntType(32)
 _function_of: Any = cgutils.get_or_insert_function
 instructions: Any = intrinsic  # for a type checker: compiled code calls what it gives without the first argument
 
@@ -48,6 +51,25 @@ class Vector(types.Type):
 class _VectorModel(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: Vector) -> None:  # pragma: no cover (compiler)
         super().__init__(manager, kind, ir.VectorType(_FLOAT, LANES * kind.count))  # type: ignore[no-untyped-call]  # numba's
+
+
+class Whole(types.Type):
+    """Some vectors of LANES whole numbers."""
+
+    def __init__(self, count: int, bits: int) -> None:  # pragma: no cover (compiler)
+        self.count, self.bits = count, bits
+        super().__init__(f"Whole({count}, {bits})")
+
+
+@register_model(Whole)
+class _WholeModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: Whole) -> None:  # pragma: no cover (compiler)
+        super().__init__(manager, kind, ir.VectorType(ir.IntType(kind.bits), LANES * kind.count))  # type: ignore[no-untyped-call]  # numba's
+
+
+def multiplies_bytes() -> bool:
+    """Whether `plus_dots` has its instruction in the machine code that numba writes here."""
+    return "+avx512vnni" in cpu_target.target_context.codegen().magic_tuple()[2]
 
 
 # What follows writes LLVM's instructions; numba calls it while it compiles, and never where its cache has the result.
@@ -92,6 +114,114 @@ def plus_product(typing, tile, values, i, numbers, at):  # type: ignore[no-untyp
 
 
 @instructions
+def no_shorts(typing, like):  # type: ignore[no-untyped-def]  # pragma: no cover (compiler)
+    """A tile of zeros, whole numbers of 16 bits."""
+
+    def write(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        return ir.Constant(ir.VectorType(_SHORT, LANES * like.count), [0] * LANES * like.count)
+
+    return Whole(like.count, 16)(like), write
+
+
+@instructions
+def no_sums(typing, like):  # type: ignore[no-untyped-def]  # pragma: no cover (compiler)
+    """A tile of zeros, whole numbers of 32 bits."""
+
+    def write(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        return ir.Constant(ir.VectorType(_INT, LANES * like.count), [0] * LANES * like.count)
+
+    return Whole(like.count, 32)(like), write
+
+
+@instructions
+def plus_shorts(typing, tile, numbers, at):  # type: ignore[no-untyped-def]  # pragma: no cover (compiler)
+    """A tile of 16 bits plus the int8 or int16 that begin at numbers[at], of a flat array."""
+
+    def write(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        kind = ir.VectorType(ir.IntType(signature.args[1].dtype.bitwidth), LANES * signature.args[0].count)
+        where = _address(context, builder, signature.args[1], args[1], args[2], kind)
+        numbers = builder.load(where, align=1)
+        return builder.add(args[0], builder.sext(numbers, args[0].type) if numbers.type != args[0].type else numbers)
+
+    return tile(tile, numbers, types.intp), write
+
+
+@instructions
+def plus_sums(typing, tile, numbers, at):  # type: ignore[no-untyped-def]  # pragma: no cover (compiler)
+    """A tile of 32 bits plus the int32 that begin at numbers[at], of a flat array."""
+
+    def write(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        where = _address(context, builder, signature.args[1], args[1], args[2], args[0].type)
+        return builder.add(args[0], builder.load(where, align=4))
+
+    return tile(tile, numbers, types.intp), write
+
+
+@instructions
+def scaled(typing, tile, factor, offset, at):  # type: ignore[no-untyped-def]  # pragma: no cover (compiler)
+    """A tile of float32 times factor[at] and what follows, plus offset[at]: rounded twice."""
+
+    def write(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        tile, factor, offset, at = args
+        factors = builder.load(_address(context, builder, signature.args[1], factor, at, tile.type), align=4)
+        offsets = builder.load(_address(context, builder, signature.args[2], offset, at, tile.type), align=4)
+        return builder.fadd(builder.fmul(tile, factors), offsets)
+
+    return tile(tile, factor, offset, types.intp), write
+
+
+@instructions
+def plus_wide(typing, tile, part):  # type: ignore[no-untyped-def]  # pragma: no cover (compiler)
+    """A tile of 32 bits plus one of 16."""
+
+    def write(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        return builder.add(args[0], builder.sext(args[1], args[0].type))
+
+    return tile(tile, part), write
+
+
+@instructions
+def plus_dots(typing, tile, values, i, numbers, at):  # type: ignore[no-untyped-def]  # pragma: no cover (compiler)
+    """A tile of 32 bits plus four products for each lane: of values[i : i + 4] and its own four of numbers[at :].
+
+    Args:
+        typing: numba's.
+        tile: to add to.
+        values: uint8, flat.
+        i: of the first of the four, whatever its alignment.
+        numbers: int8, flat; four for each lane.
+        at: of the first lane's.
+    """
+
+    def write(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        tile, values, i, numbers, at = args
+        four, one = ir.VectorType(_INT, 1), ir.VectorType(_INT, LANES)
+        where = _address(context, builder, signature.args[1], values, i, four)
+        value = _spread(builder, builder.extract_element(builder.load(where, align=1), ir.Constant(_INT, 0)), LANES)
+        dots = _function_of(builder.module, ir.FunctionType(one, [one] * 3), "llvm.x86.avx512.vpdpbusd.512")
+        parts, bytes_ = [], ir.VectorType(ir.IntType(8), 4 * LANES)
+        for start in range(0, tile.type.count, LANES):
+            own = _numbers(range(start, start + LANES))
+            own = builder.shuffle_vector(tile, ir.Constant(tile.type, ir.Undefined), own)
+            first = builder.add(at, ir.Constant(at.type, 4 * start))
+            weights = builder.load(_address(context, builder, signature.args[3], numbers, first, bytes_), align=1)
+            parts.append(builder.call(dots, [own, value, builder.bitcast(weights, one)]))
+        return _joined(builder, parts)
+
+    return tile(tile, values, types.intp, numbers, types.intp), write
+
+
+@instructions
+def in_float(typing, tile):  # type: ignore[no-untyped-def]  # pragma: no cover (compiler)
+    """A tile of 32 bits as float32, rounded where it is 2**24 or more."""
+
+    def write(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        return builder.sitofp(args[0], ir.VectorType(_FLOAT, args[0].type.count))
+
+    return Vector(tile.count)(tile), write
+
+
+@instructions
 def entry(typing, numbers, i):  # type: ignore[no-untyped-def]  # pragma: no cover (compiler)
     """numbers[i] of a flat array, i not negative: numba would ask each time whether it is."""
 
@@ -111,6 +241,36 @@ def put(typing, tile, numbers, at):  # type: ignore[no-untyped-def]  # pragma: n
         return context.get_dummy_value()
 
     return types.none(tile, numbers, types.intp), write
+
+
+@instructions
+def put_rows(typing, places, i, shift, factor, numbers, at):  # type: ignore[no-untyped-def]  # pragma: no cover (compiler)
+    """Write (places + shift) * factor of 2 * LANES int32 from places[i] on to numbers[at] and what follows."""
+
+    def write(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        places, i, shift, factor, numbers, at = args
+        kind = ir.VectorType(_INT, 2 * LANES)
+        given = builder.load(_address(context, builder, signature.args[0], places, i, kind), align=4)
+        shift, factor = (_spread(builder, builder.trunc(one, _INT), 2 * LANES) for one in (shift, factor))
+        rows = builder.mul(builder.add(given, shift), factor)
+        builder.store(rows, _address(context, builder, signature.args[4], numbers, at, kind), align=4)
+        return context.get_dummy_value()
+
+    whole = types.intp
+    return types.none(places, whole, whole, whole, numbers, whole), write
+
+
+@instructions
+def put_number(typing, number, numbers, at):  # type: ignore[no-untyped-def]  # pragma: no cover (compiler)
+    """Write LANES times one number to numbers[at] and what follows, int32."""
+
+    def write(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        kind = ir.VectorType(_INT, LANES)
+        where = _address(context, builder, signature.args[1], args[1], args[2], kind)
+        builder.store(_spread(builder, builder.trunc(args[0], _INT), LANES), where, align=4)
+        return context.get_dummy_value()
+
+    return types.none(types.intp, numbers, types.intp), write
 
 
 @instructions
@@ -170,6 +330,14 @@ def _spread(builder: Any, value: Any, lanes: int) -> Any:  # pragma: no cover (c
     single = builder.insert_element(ir.Constant(kind, ir.Undefined), value, ir.Constant(_INT, 0))
     everywhere = ir.Constant(ir.VectorType(_INT, lanes), [0] * lanes)
     return builder.shuffle_vector(single, ir.Constant(kind, ir.Undefined), everywhere)
+
+
+def _joined(builder: Any, parts: list[Any]) -> Any:  # pragma: no cover (compiler)
+    """One vector of two to the power of something."""
+    while len(parts) > 1:
+        lanes = _numbers(range(2 * parts[0].type.count))
+        parts = [builder.shuffle_vector(a, b, lanes) for a, b in zip(parts[::2], parts[1::2], strict=True)]
+    return parts[0]
 
 
 def _entry(context: Any, builder: Any, kind: Any, array: Any, at: Any) -> Any:  # pragma: no cover (compiler)
