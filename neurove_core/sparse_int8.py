@@ -36,6 +36,7 @@ from neurove_core.vectors import (
     plus_sums,
     plus_wide,
     put,
+    put_fours,
     put_number,
     put_rows,
     scaled,
@@ -83,8 +84,7 @@ class Extractor:
     def __call__(self, codes: Tensor, membranes: Sequence[LIFState]) -> tuple[Fired, tuple[LIFState, ...]]:
         """Input (T * B, 2n, H, W), uint8, to who fired in the last map, and the potentials after the last reset."""
         constants = self._decay, self._v_th
-        x: Codes = np.ascontiguousarray(codes.numpy().transpose(0, 2, 3, 1))
-        fired, v = self._first(x, cells_of(membranes[0].v), *constants)
+        fired, v = self._first(np.ascontiguousarray(codes.numpy()), cells_of(membranes[0].v), *constants)
         after = [v]
         for layer, membrane in zip(self._layers, membranes[1:], strict=True):
             fired, v = layer(fired, cells_of(membrane.v), *constants)
@@ -108,7 +108,7 @@ def extractor(layers: Sequence[Layer], lif: LIFParams) -> Extractor | None:
 
 
 class OverDense:
-    """A layer by its dense sums: maps (R, H, W, C) of codes to who fires in (R, H', W', C')."""
+    """A layer by its dense sums: maps (R, C, H, W) of codes, in any layout, to who fires in (R, H', W', C')."""
 
     def __init__(self, layer: Layer) -> None:
         self._dense, self._factor, self._offset = layer.dense, layer.factor.numpy(), layer.offset.numpy()
@@ -117,32 +117,38 @@ class OverDense:
 
     def __call__(self, x: Codes, v: Array, decay: np.float32, v_th: np.float32) -> tuple[Fired, Array]:
         """Potentials (B, H', W', C') before, to who fires and the potentials after."""
-        shape = shape_after(x.shape, self._widths, v)
-        sums = cells_of(self._dense(torch.from_numpy(x.transpose(0, 3, 1, 2))))
+        shape = shape_after(cells_shape(x), self._widths, v)
+        sums = cells_of(self._dense(torch.from_numpy(x).contiguous(memory_format=torch.channels_last)))
         (places, starts), after = room_for(shape), np.empty_like(v)
         given = self._tile, sums.reshape(-1), self._factor, self._offset
         return Fired(places, starts, shape, _fire(*given, v, after, decay, v_th, places, starts)), after
 
 
 class OverCodes:
-    """The first layer: maps (R, H, W, C) of codes to who fires in (R, H', W', C')."""
+    """The first layer: maps (R, C, H, W) of codes, contiguous, to who fires in (R, H', W', C')."""
 
     def __init__(self, layer: Layer) -> None:
         outputs, inputs = layer.q.shape[:2]
-        self._groups = -(-3 * inputs // 4)  # of four numbers in a row of the kernel
-        rows = torch.zeros(3, 4 * self._groups, outputs, dtype=torch.int8)
-        rows[:, : 3 * inputs] = layer.q.permute(2, 3, 1, 0).reshape(3, 3 * inputs, outputs)
-        self._weight = rows.view(3, self._groups, 4, outputs).transpose(2, 3).reshape(-1).numpy()
+        fours = -(-inputs // 4)
+        by_input = layer.q.new_zeros(3, fours * 4, 3, outputs)
+        by_input[:, :inputs] = layer.q.permute(2, 1, 3, 0)
+        self._weight = by_input.view(3, fours, 4, 3, outputs).permute(0, 1, 3, 4, 2).reshape(-1).numpy()
         self._factor, self._offset = layer.factor.numpy(), layer.offset.numpy()
         self._widths = inputs, outputs
         self._tile = tile_of(outputs, most=2)
 
     def __call__(self, x: Codes, v: Array, decay: np.float32, v_th: np.float32) -> tuple[Fired, Array]:
         """Potentials (B, H', W', C') before, to who fires and the potentials after."""
-        shape = shape_after(x.shape, self._widths, v)
+        shape = shape_after(cells_shape(x), self._widths, v)
         (places, starts), after = room_for(shape), np.empty_like(v)
-        given = self._tile, x, self._weight, self._groups, self._factor, self._offset
+        given = self._tile, x, self._weight, self._factor, self._offset
         return Fired(places, starts, shape, _convolve_codes(*given, v, after, decay, v_th, places, starts)), after
+
+
+def cells_shape(maps: Codes) -> tuple[int, int, int, int]:
+    """(R, H, W, C) of maps (R, C, H, W)."""
+    count, channels, rows, columns = maps.shape
+    return count, rows, columns, channels
 
 
 def over_codes(layer: Layer) -> OverCodes | OverDense:
@@ -167,7 +173,7 @@ class OverList:
     def __call__(self, fired: Fired, v: Array, decay: np.float32, v_th: np.float32) -> tuple[Fired, Array]:
         """Potentials (B, H', W', C') before, to who fires and the potentials after."""
         if fired.found > max(_FEW, _MANY * math.prod(fired.shape)):
-            return self._dense(cells_of(maps_of(fired, np.uint8)), v, decay, v_th)
+            return self._dense(maps_of(fired, np.uint8).numpy(), v, decay, v_th)
         return self.over_list(fired, v, decay, v_th)
 
     def over_list(self, fired: Fired, v: Array, decay: np.float32, v_th: np.float32) -> tuple[Fired, Array]:
@@ -211,7 +217,7 @@ def _agrees(layer: Layer, *, first: bool) -> bool:
             v = np.zeros((count, (layer.rows + 1) // 2, (layer.columns + 1) // 2, outputs), np.float32)
             maps = x.permute(0, 3, 1, 2)
             if first:
-                _, found = over_codes(layer)(x.numpy(), v, *silent)
+                _, found = over_codes(layer)(maps.contiguous().numpy(), v, *silent)
             else:
                 _, found = OverList(layer).over_list(listed(maps), v, *silent)
             if not torch.equal(in_maps(found), layer.dense(maps) * factor + offset):
@@ -227,7 +233,6 @@ def _convolve_codes(
     like: tuple[int, ...],
     x: Codes,
     weight: NDArray[np.int8],
-    groups: int,
     factor: Array,
     offset: Array,
     before: Array,
@@ -241,9 +246,8 @@ def _convolve_codes(
 
     Args:
         like: width of a tile of six cells.
-        x: R, H, W, C.
-        weight: 3, groups, C', 4; those of a row of the kernel one after the other, zeros at the end.
-        groups: of four.
+        x: R, C, H, W.
+        weight: 3, fours of channels, 3, C', 4; zeros for channels that fill up the last four.
         factor: C'.
         offset: C'.
         before: potentials (B, H', W', C').
@@ -256,15 +260,14 @@ def _convolve_codes(
     Returns:
         how many fire.
     """
-    maps, rows, columns, channels = x.shape
-    outputs, width, step = factor.size, LANES * len(like), 2 * channels
+    maps, channels, rows, columns = x.shape
+    outputs, width, plane = factor.size, LANES * len(like), rows * columns
     batch = before.shape[0]
     n = before.size // batch
     v, v_after, found, cell = before.reshape(-1), after.reshape(-1), 0, 0
-    row_of, line = x.reshape(-1), columns * channels
-    across = (columns + 1) // 2
-    wide = (2 * (across + _SIDE) + 3) * channels + 4  # zeros left and right
-    lines = np.zeros(3 * wide, np.uint8)  # of the kernel, each where its number is divided by three
+    codes, fours, across = x.reshape(-1), (channels + 3) // 4, (columns + 1) // 2
+    wide = 4 * (2 * (across + _SIDE) + 3)  # with zeros left and right
+    lines = np.zeros(3 * fours * wide, np.uint8)  # of the kernel, by number modulo three; columns of four channels each
     currents = np.empty(_SIDE * outputs, np.float32)
     for r in range(maps):
         if r == batch:
@@ -273,26 +276,25 @@ def _convolve_codes(
         for row in range(-1, rows - 1, 2):  # the kernel's first
             top, bottom = max(row, 0), min(row + 3, rows)
             for y in range(top if row < 0 else row + 1, bottom):
-                begin, source = y % 3 * wide + channels, (r * rows + y) * line
-                into, own = lines[begin : begin + line], row_of[source : source + line]
-                for i in range(line):
-                    into[i] = own[i]
+                begin = (r * channels * rows + y) * columns
+                _put_row(codes, begin, plane, channels, columns, lines, y % 3 * fours * wide + 4, wide)
             for first in range(0, across, _SIDE):
                 for tile in range(0, outputs, width):
                     a, b, c = no_sums(like), no_sums(like), no_sums(like)
                     d, e, f = no_sums(like), no_sums(like), no_sums(like)
                     for y in range(top, bottom):
-                        k = y % 3 * wide + first * step
-                        w = ((y - row) * groups * outputs + tile) * 4
-                        for _ in range(groups):
-                            a = plus_dots(a, lines, k, weight, w)
-                            b = plus_dots(b, lines, k + step, weight, w)
-                            c = plus_dots(c, lines, k + 2 * step, weight, w)
-                            d = plus_dots(d, lines, k + 3 * step, weight, w)
-                            e = plus_dots(e, lines, k + 4 * step, weight, w)
-                            f = plus_dots(f, lines, k + 5 * step, weight, w)
-                            k += 4
-                            w += 4 * outputs
+                        w = ((y - row) * fours * 3 * outputs + tile) * 4
+                        for q in range(fours):
+                            k = (y % 3 * fours + q) * wide + 8 * first
+                            for _ in range(3):
+                                a = plus_dots(a, lines, k, weight, w)
+                                b = plus_dots(b, lines, k + 8, weight, w)
+                                c = plus_dots(c, lines, k + 16, weight, w)
+                                d = plus_dots(d, lines, k + 24, weight, w)
+                                e = plus_dots(e, lines, k + 32, weight, w)
+                                f = plus_dots(f, lines, k + 40, weight, w)
+                                k += 4
+                                w += 4 * outputs
                     put(scaled(in_float(a), factor, offset, tile), currents, tile)
                     put(scaled(in_float(b), factor, offset, tile), currents, outputs + tile)
                     put(scaled(in_float(c), factor, offset, tile), currents, 2 * outputs + tile)
@@ -308,6 +310,37 @@ def _convolve_codes(
                         at += width
     starts[cell] = found
     return found
+
+
+@compiled
+def _put_row(
+    codes: Codes, begin: int, plane: int, channels: int, columns: int, lines: Codes, into: int, wide: int
+) -> None:  # pragma: no cover (machine code)
+    """Write a row of all channels, four of them side by side; what fills up the last four is any, its weights are 0.
+
+    Args:
+        codes: of the maps, flat.
+        begin: of the row in the first channel.
+        plane: from there to the next channel's.
+        channels: of the map.
+        columns: of the row.
+        lines: written.
+        into: where the first four channels' begin.
+        wide: from there to the next four's.
+    """
+    for first in range(0, channels, 4):
+        most = channels - 1 - first
+        a = begin + first * plane
+        b, c, d = a + min(1, most) * plane, a + min(2, most) * plane, a + min(3, most) * plane
+        if columns < LANES:
+            for i in range(columns):
+                four = lines[into + 4 * i : into + 4 * i + 4]
+                four[0], four[1], four[2], four[3] = codes[a + i], codes[b + i], codes[c + i], codes[d + i]
+        else:
+            for column in range(0, columns, LANES):
+                i = min(column, columns - LANES)
+                put_fours(codes, a + i, b + i, c + i, d + i, lines, into + 4 * i)
+        into += wide
 
 
 @compiled

@@ -21,6 +21,9 @@ from numba.extending import intrinsic, register_model
 LANES: Final = 16
 """Of one vector; widths of tiles are multiples of it."""
 
+BYTES: Final = 64
+"""Of one vector of bytes."""
+
 _FLOAT, _SHORT, _INT = ir.FloatType(), ir.IntType(16), ir.IntType(32)
 _function_of: Any = cgutils.get_or_insert_function
 instructions: Any = intrinsic  # for a type checker: compiled code calls what it gives without the first argument
@@ -111,6 +114,49 @@ def plus_product(typing, tile, values, i, numbers, at):  # type: ignore[no-untyp
         return builder.call(fused, [value, factors, tile])
 
     return tile(tile, values, types.intp, numbers, types.intp), write
+
+
+@instructions
+def put_entries(typing, table, numbers, i, out):  # type: ignore[no-untyped-def]  # pragma: no cover (compiler)
+    """Write table[numbers[i]] to out[i], of BYTES numbers from i on; all uint8 and flat, the table of 256."""
+
+    def write(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        table, numbers, i, out = args
+        kind = ir.VectorType(ir.IntType(8), BYTES)
+        given = builder.load(_address(context, builder, signature.args[1], numbers, i, kind), align=1)
+        if "+avx512vbmi" in context.codegen().magic_tuple()[2]:
+            found = _by_vectors(context, builder, signature.args[0], table, given)
+        else:
+            found = ir.Constant(kind, ir.Undefined)
+            for lane in range(BYTES):
+                at = builder.zext(builder.extract_element(given, ir.Constant(_INT, lane)), ir.IntType(64))
+                value = _entry(context, builder, signature.args[0], table, at)
+                found = builder.insert_element(found, value, ir.Constant(_INT, lane))
+        builder.store(found, _address(context, builder, signature.args[3], out, i, kind), align=1)
+        return context.get_dummy_value()
+
+    return types.none(table, numbers, types.intp, out), write
+
+
+@instructions
+def put_fours(typing, numbers, first, second, third, fourth, out, at):  # type: ignore[no-untyped-def]  # pragma: no cover (compiler)
+    """Write one number each of the four rows of LANES uint8 that begin there to out[at], then the next of each."""
+
+    def write(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        numbers, *begins, out, at = args
+        row, kind = (ir.VectorType(ir.IntType(8), count * LANES) for count in (1, 4))
+        rows = [
+            builder.load(_address(context, builder, signature.args[0], numbers, begin, row), align=1)
+            for begin in begins
+        ]
+        order = ir.Constant(ir.VectorType(_INT, 4 * LANES), [lane // 4 + lane % 4 * LANES for lane in range(4 * LANES)])
+        joined = _joined(builder, rows)
+        mixed = builder.shuffle_vector(joined, ir.Constant(joined.type, ir.Undefined), order)
+        builder.store(mixed, _address(context, builder, signature.args[5], out, at, kind), align=1)
+        return context.get_dummy_value()
+
+    whole = types.intp
+    return types.none(numbers, whole, whole, whole, whole, out, whole), write
 
 
 @instructions
@@ -338,6 +384,16 @@ def _joined(builder: Any, parts: list[Any]) -> Any:  # pragma: no cover (compile
         lanes = _numbers(range(2 * parts[0].type.count))
         parts = [builder.shuffle_vector(a, b, lanes) for a, b in zip(parts[::2], parts[1::2], strict=True)]
     return parts[0]
+
+
+def _by_vectors(context: Any, builder: Any, kind: Any, table: Any, given: Any) -> Any:  # pragma: no cover (compiler)
+    """Entries of a table of 256 bytes, two halves of which are looked up at once."""
+    vector = given.type
+    look_up = _function_of(builder.module, ir.FunctionType(vector, [vector] * 3), "llvm.x86.avx512.vpermi2var.qi.512")
+    begins = [ir.Constant(ir.IntType(64), begin) for begin in range(0, 256, BYTES)]
+    parts = [builder.load(_address(context, builder, kind, table, begin, vector), align=1) for begin in begins]
+    low, high = (builder.call(look_up, [parts[half], given, parts[half + 1]]) for half in (0, 2))
+    return builder.select(builder.icmp_signed("<", given, ir.Constant(vector, [0] * BYTES)), high, low)
 
 
 def _entry(context: Any, builder: Any, kind: Any, array: Any, at: Any) -> Any:  # pragma: no cover (compiler)

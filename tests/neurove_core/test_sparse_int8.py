@@ -78,7 +78,10 @@ def test_a_layer_over_a_list_fires_as_the_plain_one_bit_for_bit(inputs, outputs,
 
 @pytest.mark.parametrize("how", ["as this machine does", "dense"])
 @pytest.mark.parametrize("share", [0, 0.15, 1])
-@pytest.mark.parametrize(("inputs", "outputs", "rows", "columns"), [*SIZES, (4, 80, 12, 11), (10, 16, 13, 26)])
+@pytest.mark.parametrize(
+    ("inputs", "outputs", "rows", "columns"),
+    [*SIZES, (4, 80, 12, 11), (10, 16, 13, 26), (7, 32, 3, 16), (2, 16, 6, 49)],
+)
 @torch.inference_mode()
 def test_the_first_layer_fires_as_the_plain_one_bit_for_bit(inputs, outputs, rows, columns, share, how):
     layer = layer_of(inputs, outputs, rows, columns, top=255)
@@ -87,8 +90,7 @@ def test_the_first_layer_fires_as_the_plain_one_bit_for_bit(inputs, outputs, row
         maps = maps_of(steps * batch, inputs, rows, columns, share, top=255, seed=steps)
         v = torch.rand(batch, outputs, (rows + 1) // 2, (columns + 1) // 2) - 0.3
         cells = np.ascontiguousarray(v.numpy().transpose(0, 2, 3, 1))
-        x = np.ascontiguousarray(maps.numpy().transpose(0, 2, 3, 1))
-        assert_fires_alike(over(x, cells, *CONSTANTS), expected_of(layer, maps, v, top=255))
+        assert_fires_alike(over(maps.contiguous().numpy(), cells, *CONSTANTS), expected_of(layer, maps, v, top=255))
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
@@ -102,8 +104,8 @@ def test_the_largest_sums_are_exact(inputs, sign):
         if 9 * inputs * 127 * top >= 1 << 24:
             continue
         layer = layer_of(inputs, 16, 7, 5, top, q=q)
-        maps = torch.full((2, inputs, 7, 5), top, dtype=torch.uint8).contiguous(memory_format=torch.channels_last)
-        given = sparse.listed(maps) if top == 1 else maps.numpy().transpose(0, 2, 3, 1)
+        maps = torch.full((2, inputs, 7, 5), top, dtype=torch.uint8)
+        given = sparse.listed(maps) if top == 1 else maps.numpy()
         assert_fires_alike(over(layer)(given, v, *CONSTANTS), expected_of(layer, maps, torch.zeros(2, 16, 4, 3), top))
 
 
