@@ -9,6 +9,7 @@ from torch import Tensor
 
 from neurove_core import int8
 from neurove_core.kernels import compiled
+from neurove_core.sparse import Counts
 from neurove_core.vectors import BYTES, put_entries
 
 
@@ -45,6 +46,16 @@ def to_codes(counts: Tensor, encoding: str) -> Tensor:
     found = np.empty(given.shape, np.uint8)
     _look_up(given.reshape(-1), _CODES[encoding], found.reshape(-1))
     return torch.from_numpy(found)
+
+
+def to_counts(counts: Tensor, encoding: str) -> Counts:
+    """What `to_spikes` makes of counts, made where it is read: the input of an engine that `reads_counts`.
+
+    Args:
+        counts: (T, B, 2n, H, W) uint8, on the CPU.
+        encoding: of NetworkConfig.
+    """
+    return Counts(counts, _BINARY if encoding == "binary" else _LOG1P)
 
 
 def to_spikes_reference(counts: Tensor, encoding: str) -> Tensor:

@@ -71,13 +71,18 @@ class Engine:
         self._weights = _flattened(inside, self._params, self._d_space, self._readout)
         self._constants = np.array([net.alpha, net.v_th, self._kappa], np.float32)
 
+    @property
+    def reads_counts(self) -> bool:
+        """Whether it takes `encoding.to_counts` in less time than `to_spikes`."""
+        return self._sparse is not None
+
     @torch.inference_mode()
-    def __call__(self, spikes: Tensor, state: NetworkState) -> tuple[Tensor, NetworkState]:
+    def __call__(self, spikes: Tensor | sparse.Counts, state: NetworkState) -> tuple[Tensor, NetworkState]:
         """Velocities of T consecutive windows, and the state after them.
 
         Args:
             spikes: (T, B, 2n, H, W), any layout; channels last is read as it lies. An int8 network takes
-                `encoding.to_codes` too.
+                `encoding.to_codes` too, and one in float32 `encoding.to_counts`.
             state: of these B streams, the network's or the engine's.
 
         Returns:
@@ -89,7 +94,9 @@ class Engine:
         return twists, NetworkState(membranes, cells, y)
 
     @torch.inference_mode()
-    def together(self, spikes: Tensor, states: Sequence[NetworkState]) -> list[tuple[Tensor, NetworkState]]:
+    def together(
+        self, spikes: Tensor | sparse.Counts, states: Sequence[NetworkState]
+    ) -> list[tuple[Tensor, NetworkState]]:
         """One window of each of B streams: the same as a call for each, of eight in 0.8 of the time.
 
         The feature extractor takes all at once; cells and readout take each stream alone, so that no sum of a stream
@@ -116,16 +123,20 @@ class Engine:
         return answers
 
     @torch.inference_mode()
-    def features(self, spikes: Tensor, state: NetworkState) -> tuple[Tensor, tuple[LIFState, ...]]:
+    def features(self, spikes: Tensor | sparse.Counts, state: NetworkState) -> tuple[Tensor, tuple[LIFState, ...]]:
         """Spikes (T * B, C, H', W') of the last map of the feature extractor alone, and its membranes after them."""
         x, membranes = self._features(spikes, state)
         return sparse.maps_of(x) if isinstance(x, sparse.Fired) else x.float(), membranes
 
-    def _features(self, spikes: Tensor, state: NetworkState) -> tuple[Tensor | sparse.Fired, tuple[LIFState, ...]]:
-        if self._extractor is not None:
-            return self._extractor(spikes.flatten(0, 1), state.membranes)
+    def _features(
+        self, spikes: Tensor | sparse.Counts, state: NetworkState
+    ) -> tuple[Tensor | sparse.Fired, tuple[LIFState, ...]]:
         if self._sparse is not None and not is_plain():
             return self._sparse(spikes, state.membranes)
+        if isinstance(spikes, sparse.Counts):
+            spikes = spikes.spikes()
+        if self._extractor is not None:
+            return self._extractor(spikes.flatten(0, 1), state.membranes)
         x = spikes.flatten(0, 1).contiguous(memory_format=torch.channels_last)
         fire = self._plain_fire if is_plain() else self._fused_fire
         membranes = []

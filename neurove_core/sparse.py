@@ -22,7 +22,7 @@ from torch import Tensor
 from neurove_core.compiled import compiled
 from neurove_core.convolution import LARGE, Convolution, say_once
 from neurove_core.neurons import LIFParams, LIFState
-from neurove_core.vectors import LANES, entry, fire, nothing, plus, plus_product, put, tile_of
+from neurove_core.vectors import LANES, entry, fire, nothing, plus, plus_product, put, put_floats, tile_of
 
 Array = NDArray[np.float32]
 Places = NDArray[np.int32]
@@ -45,6 +45,29 @@ class Fired(NamedTuple):
     starts: Places  # (R * H * W + 1): where in `places` each cell begins
     shape: tuple[int, int, int, int]
     found: int  # of `places`; what lies behind means nothing
+
+
+class Counts(NamedTuple):
+    """Input as counts, each for its entry of a table: encoded row by row as the first layer reads it."""
+
+    counts: Tensor  # (T, B, 2n, H, W) uint8
+    table: Tensor  # (256) float32
+
+    @property
+    def shape(self) -> torch.Size:
+        """Of the input."""
+        return self.counts.shape
+
+    def spikes(self) -> Tensor:
+        """The input itself."""
+        return self.table[self.counts.to(torch.int64)]
+
+
+class Counted(NamedTuple):
+    """The same, of maps (R, C, H, W)."""
+
+    counts: NDArray[np.uint8]
+    table: Array
 
 
 class Layer(NamedTuple):
@@ -72,11 +95,16 @@ class Extractor:
         weight, bias = projection
         self._rows, self._bias, self._tile = weight.T.reshape(-1).numpy(), bias.numpy(), tile_of(bias.numel())
 
-    def __call__(self, spikes: Tensor, membranes: Sequence[LIFState]) -> tuple[Fired, tuple[LIFState, ...]]:
+    def __call__(self, spikes: Tensor | Counts, membranes: Sequence[LIFState]) -> tuple[Fired, tuple[LIFState, ...]]:
         """Input (T, B, 2n, H, W) to who fired in the last map, and the potentials after the last reset."""
         constants = self._decay, self._v_th
-        x = np.ascontiguousarray(values_of(spikes).transpose(0, 1, 3, 4, 2))
-        fired, v = self._first(x.reshape(-1, *x.shape[2:]), cells_of(membranes[0].v), *constants)
+        if isinstance(spikes, Counts):
+            counts = np.ascontiguousarray(values_of(spikes.counts))
+            given: Array | Counted = Counted(counts.reshape(-1, *counts.shape[2:]), spikes.table.numpy())
+        else:
+            x = np.ascontiguousarray(values_of(spikes).transpose(0, 1, 3, 4, 2))
+            given = x.reshape(-1, *x.shape[2:])
+        fired, v = self._first(given, cells_of(membranes[0].v), *constants)
         after = [v]
         for layer, membrane in zip(self._layers, membranes[1:], strict=True):
             fired, v = layer(fired, cells_of(membrane.v), *constants)
@@ -126,20 +154,28 @@ def listed(maps: Tensor) -> Fired:
 
 
 class OverValues:
-    """The first layer: maps (R, H, W, C) of any float32 to who fires in (R, H', W', C')."""
+    """The first layer: maps (R, H, W, C) of any float32, or counts, to who fires in (R, H', W', C')."""
 
     def __init__(self, layer: Layer) -> None:
         self._weight, self._bias = _by_input(layer.weight), layer.bias.numpy()
         self._widths = layer.weight.shape[1], layer.weight.shape[0]
         self._tile, self._firing = tile_of(self._bias.size, most=2), tile_of(self._bias.size)
 
-    def __call__(self, x: Array, v: Array, decay: np.float32, v_th: np.float32) -> tuple[Fired, Array]:
+    def __call__(self, x: Array | Counted, v: Array, decay: np.float32, v_th: np.float32) -> tuple[Fired, Array]:
         """Potentials (B, H', W', C') before, to who fires and the potentials after."""
-        shape = shape_after(x.shape, self._widths, v)
+        if isinstance(x, Counted):
+            maps, channels, rows, columns = x.counts.shape
+            whole, given = (maps, rows, columns, channels), (_NO_VALUES, x.counts.reshape(-1), x.table)
+        else:
+            whole, given = x.shape, (x.reshape(-1), _NO_COUNTS, _NO_VALUES)
+        shape = shape_after(whole, self._widths, v)
         (places, starts), after = room_for(shape), np.empty_like(v)
-        given = self._tile, self._firing, x, self._weight, self._bias
-        found = _convolve_values(*given, v, after, decay, v_th, places, starts)
+        layer = self._tile, self._firing, whole, *given, self._weight, self._bias
+        found = _convolve_values(*layer, v, after, decay, v_th, places, starts)
         return Fired(places, starts, shape, found), after
+
+
+_NO_VALUES, _NO_COUNTS = np.empty(0, np.float32), np.empty(0, np.uint8)
 
 
 class OverList:
@@ -240,7 +276,10 @@ def _agrees(layer: Layer, *, first: bool) -> bool:
 def _convolve_values(
     like: tuple[int, ...],
     firing: tuple[int, ...],
+    shape: tuple[int, int, int, int],
     x: Array,
+    counts: NDArray[np.uint8],
+    table: Array,
     weight: Array,
     bias: Array,
     before: Array,
@@ -257,7 +296,10 @@ def _convolve_values(
     Args:
         like: width of a tile of six cells; all twelve fit into registers with two vectors.
         firing: width of a tile that fires.
-        x: R, H, W, C.
+        shape: R, H, W, C.
+        x: R * H * W * C.
+        counts: R * C * H * W, or none; where there are some x is not read, but their entries of the table.
+        table: 256.
         weight: 3, 3, C, C'.
         bias: C'.
         before: potentials (B, H', W', C').
@@ -270,38 +312,46 @@ def _convolve_values(
     Returns:
         how many fire.
     """
-    maps, rows, columns, channels = x.shape
-    outputs, width, step = bias.size, LANES * len(like), 2 * channels
+    maps, rows, columns, channels = shape
+    outputs, width = bias.size, LANES * len(like)
     batch = before.shape[0]
     n = before.size // batch
-    values, v, v_after, found, cell = x.reshape(-1), before.reshape(-1), after.reshape(-1), 0, 0
-    currents = np.empty(6 * outputs, np.float32)
+    v, v_after, found, cell = before.reshape(-1), after.reshape(-1), 0, 0
+    line, encoded = channels * columns, counts.size > 0
+    values = np.empty(3 * line, np.float32) if encoded else x  # rows of the kernel, by number modulo three
+    aside, apart = (1, columns) if encoded else (channels, 1)  # from a cell to the next, from a channel to the next
+    step, currents = 2 * aside, np.empty(6 * outputs, np.float32)
     for r in range(maps):
         if r == batch:
             v = v_after
         at = 0  # in the new map
         for row in range(-1, rows - 1, 2):  # the kernel's first
             top, bottom = max(row, 0), min(row + 3, rows)
+            if encoded:
+                for y in range(top if row < 0 else row + 1, bottom):
+                    _encode_row(counts, (r * channels * rows + y) * columns, rows, columns, table, values, y % 3 * line)
             column = -1
             while column < columns - 1:
                 cells = 6 if column >= 0 and column + 13 <= columns else 1  # at an edge one by one
-                left, right = (max(column, 0) - column) * channels, (min(column + 3, columns) - column) * channels
+                left, right = max(column, 0), min(column + 3, columns)
                 for tile in range(0, outputs, width):
                     a, b, c = nothing(like), nothing(like), nothing(like)
                     d, e, f = nothing(like), nothing(like), nothing(like)
                     for y in range(top, bottom):
-                        k = ((r * rows + y) * columns + column) * channels + left
-                        w = ((y - row) * 3 * channels + left) * outputs + tile
-                        for _ in range(left, right):
-                            a = plus_product(a, values, k, weight, w)
-                            if cells == 6:
-                                b = plus_product(b, values, k + step, weight, w)
-                                c = plus_product(c, values, k + 2 * step, weight, w)
-                                d = plus_product(d, values, k + 3 * step, weight, w)
-                                e = plus_product(e, values, k + 4 * step, weight, w)
-                                f = plus_product(f, values, k + 5 * step, weight, w)
-                            k += 1
-                            w += outputs
+                        begin = y % 3 * line if encoded else (r * rows + y) * line
+                        w = ((y - row) * 3 + left - column) * channels * outputs + tile
+                        for i in range(left, right):
+                            k = begin + i * aside
+                            for _ in range(channels):
+                                a = plus_product(a, values, k, weight, w)
+                                if cells == 6:
+                                    b = plus_product(b, values, k + step, weight, w)
+                                    c = plus_product(c, values, k + 2 * step, weight, w)
+                                    d = plus_product(d, values, k + 3 * step, weight, w)
+                                    e = plus_product(e, values, k + 4 * step, weight, w)
+                                    f = plus_product(f, values, k + 5 * step, weight, w)
+                                k += apart
+                                w += outputs
                     put(plus(a, bias, tile), currents, tile)
                     if cells == 6:
                         put(plus(b, bias, tile), currents, outputs + tile)
@@ -319,6 +369,23 @@ def _convolve_values(
                 column += 2 * cells
     starts[cell] = found
     return found
+
+
+@compiled
+def _encode_row(
+    counts: NDArray[np.uint8], begin: int, rows: int, columns: int, table: Array, values: Array, into: int
+) -> None:  # pragma: no cover (machine code)
+    """Write the entries of a row of counts, channel after channel; the next channel's begins rows * columns later."""
+    for _ in range(into, into + values.size // 3, columns):
+        if columns < LANES:
+            for i in range(columns):
+                values[into + i] = table[counts[begin + i]]
+        else:
+            for column in range(0, columns, LANES):
+                i = min(column, columns - LANES)
+                put_floats(table, counts, begin + i, values, into + i)
+        begin += rows * columns
+        into += columns
 
 
 @compiled

@@ -139,6 +139,50 @@ def put_entries(typing, table, numbers, i, out):  # type: ignore[no-untyped-def]
 
 
 @instructions
+def put_floats(typing, table, numbers, i, out, at):  # type: ignore[no-untyped-def]  # pragma: no cover (compiler)
+    """Write table[numbers[i]] to out[at], and so on for LANES; a flat table of 256 float32, numbers uint8."""
+
+    def write(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        table, numbers, i, out, at = args
+        bytes_, kind = ir.VectorType(ir.IntType(8), LANES), ir.VectorType(_FLOAT, LANES)
+        given = builder.load(_address(context, builder, signature.args[1], numbers, i, bytes_), align=1)
+        given = builder.zext(given, ir.VectorType(_INT, LANES))
+        where = _address(context, builder, signature.args[3], out, at, kind)
+
+        def one_by_one() -> None:
+            found = ir.Constant(kind, ir.Undefined)
+            for lane in range(LANES):
+                entry = builder.zext(builder.extract_element(given, ir.Constant(_INT, lane)), ir.IntType(64))
+                value = _entry(context, builder, signature.args[0], table, entry)
+                found = builder.insert_element(found, value, ir.Constant(_INT, lane))
+            builder.store(found, where, align=4)
+
+        if "+avx512f" not in context.codegen().magic_tuple()[2]:
+            one_by_one()
+            return context.get_dummy_value()
+        few = builder.icmp_unsigned("<", given, ir.Constant(given.type, [2 * LANES] * LANES))
+        whole = ir.IntType(LANES)
+        every = builder.icmp_unsigned("==", builder.bitcast(few, whole), ir.Constant(whole, (1 << LANES) - 1))
+        with builder.if_else(every, likely=True) as (in_two_vectors, otherwise):
+            with in_two_vectors:
+                signature_ = ir.FunctionType(kind, [kind, given.type, kind])
+                look_up = _function_of(builder.module, signature_, "llvm.x86.avx512.vpermi2var.ps.512")
+                halves = [
+                    builder.load(
+                        _address(context, builder, signature.args[0], table, ir.Constant(ir.IntType(64), half), kind),
+                        align=4,
+                    )
+                    for half in (0, LANES)
+                ]
+                builder.store(builder.call(look_up, [halves[0], given, halves[1]]), where, align=4)
+            with otherwise:
+                one_by_one()
+        return context.get_dummy_value()
+
+    return types.none(table, numbers, types.intp, out, types.intp), write
+
+
+@instructions
 def put_fours(typing, numbers, first, second, third, fourth, out, at):  # type: ignore[no-untyped-def]  # pragma: no cover (compiler)
     """Write one number each of the four rows of LANES uint8 that begin there to out[at], then the next of each."""
 
