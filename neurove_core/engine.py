@@ -4,8 +4,8 @@
 
 is what the network in evaluation mode computes, up to rounding: folding a norm moves the last bits of a current, and a
 spike that hangs on them. What holds bit for bit is tested against the engine inside `neurons.plain()`: the same folded
-weights through `lif_step`, `aslstm_step` and `readout_step`. State goes to and fro between all of them. In float32 the
-convolutions and the projection are sums over the neurons that fired, where the widths allow it (sparse.py), else dense.
+weights through `lif_step`, `aslstm_step` and `readout_step`. State goes to and fro between all of them. Convolutions
+and projection are sums over the neurons that fired where widths allow it (sparse.py, sparse_int8.py), else dense.
 """
 
 from collections.abc import Sequence

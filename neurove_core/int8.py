@@ -6,7 +6,8 @@
 So a convolution or a projection is a sum of products of whole numbers, exact in any order and any arithmetic that can
 hold it: int32, or float32 below 2**24. The norm's factor and offset follow in float32, one product and one sum for each
 neuron, and then the LIF scan or the first cell. `neurons.plain()` computes the same with the public float32 operators;
-tests compare bit for bit. Training sees the rounding (`rounded`) and passes gradients through it.
+tests compare bit for bit. Training sees the rounding (`rounded`) and passes gradients through it. Where the widths suit
+its vectors sparse_int8.py sums over the neurons that fired alone; here are the dense forms.
 """
 
 from collections.abc import Callable
