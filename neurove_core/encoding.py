@@ -9,6 +9,8 @@ from torch import Tensor
 
 from neurove_core import int8
 from neurove_core.kernels import compiled
+from neurove_core.sparse import Counts
+from neurove_core.vectors import BYTES, put_entries
 
 
 def to_spikes(counts: Tensor, encoding: str) -> Tensor:
@@ -38,9 +40,22 @@ def to_codes(counts: Tensor, encoding: str) -> Tensor:
         encoding: of NetworkConfig.
 
     Returns:
-        uint8 tensor of the same shape, channels last in memory.
+        uint8 tensor of the same shape, contiguous.
     """
-    return _channels_last(counts, _CODES[encoding])
+    given = counts.numpy()
+    found = np.empty(given.shape, np.uint8)
+    _look_up(given.reshape(-1), _CODES[encoding], found.reshape(-1))
+    return torch.from_numpy(found)
+
+
+def to_counts(counts: Tensor, encoding: str) -> Counts:
+    """What `to_spikes` makes of counts, made where it is read: the input of an engine that `reads_counts`.
+
+    Args:
+        counts: (T, B, 2n, H, W) uint8, on the CPU.
+        encoding: of NetworkConfig.
+    """
+    return Counts(counts, _BINARY if encoding == "binary" else _LOG1P)
 
 
 def to_spikes_reference(counts: Tensor, encoding: str) -> Tensor:
@@ -51,13 +66,23 @@ def to_spikes_reference(counts: Tensor, encoding: str) -> Tensor:
 
 
 def _channels_last(counts: Tensor, table: Tensor) -> Tensor:
-    """Each count's entry of the table, in its type."""
-    planes = counts.numpy().reshape(-1, counts.shape[-3], counts.shape[-2] * counts.shape[-1])
-    entries = table.numpy()
-    spikes = np.empty((planes.shape[0], planes.shape[2], planes.shape[1]), entries.dtype)
-    _encode(planes, entries, spikes)
+    """Each count's entry of the table."""
     *before, channels, rows, columns = counts.shape
-    return torch.from_numpy(spikes).view(*before, rows, columns, channels).movedim(-1, -3)
+    planes = counts.numpy().reshape(-1, channels, rows * columns)
+    spikes = np.empty((*before, rows, columns, channels), np.float32)
+    _encode(planes, table.numpy(), spikes.reshape(-1, rows * columns, channels))
+    return torch.from_numpy(np.moveaxis(spikes, -1, -3))
+
+
+@compiled
+def _look_up(
+    counts: NDArray[np.uint8], table: NDArray[np.uint8], found: NDArray[np.uint8]
+) -> None:  # pragma: no cover (machine code)
+    whole = counts.size - counts.size % BYTES
+    for i in range(0, whole, BYTES):
+        put_entries(table, counts, i, found)
+    for i in range(whole, counts.size):
+        found[i] = table[counts[i]]
 
 
 @compiled
@@ -72,4 +97,4 @@ def _encode(
 
 _LOG1P = torch.log1p(torch.arange(256, dtype=torch.float32))
 _BINARY = (torch.arange(256) > 0).to(torch.float32)
-_CODES = {"binary": int8.codes(_BINARY), "log1p": int8.codes(_LOG1P)}
+_CODES = {"binary": int8.codes(_BINARY).numpy(), "log1p": int8.codes(_LOG1P).numpy()}

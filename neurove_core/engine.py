@@ -4,8 +4,8 @@
 
 is what the network in evaluation mode computes, up to rounding: folding a norm moves the last bits of a current, and a
 spike that hangs on them. What holds bit for bit is tested against the engine inside `neurons.plain()`: the same folded
-weights through `lif_step`, `aslstm_step` and `readout_step`. State goes to and fro between all of them. In float32 the
-convolutions and the projection are sums over the neurons that fired, where the widths allow it (sparse.py), else dense.
+weights through `lif_step`, `aslstm_step` and `readout_step`. State goes to and fro between all of them. Convolutions
+and projection are sums over the neurons that fired where widths allow it (sparse.py, sparse_int8.py), else dense.
 """
 
 from collections.abc import Sequence
@@ -71,13 +71,18 @@ class Engine:
         self._weights = _flattened(inside, self._params, self._d_space, self._readout)
         self._constants = np.array([net.alpha, net.v_th, self._kappa], np.float32)
 
+    @property
+    def reads_counts(self) -> bool:
+        """Whether it takes `encoding.to_counts` in less time than `to_spikes`."""
+        return self._sparse is not None
+
     @torch.inference_mode()
-    def __call__(self, spikes: Tensor, state: NetworkState) -> tuple[Tensor, NetworkState]:
+    def __call__(self, spikes: Tensor | sparse.Counts, state: NetworkState) -> tuple[Tensor, NetworkState]:
         """Velocities of T consecutive windows, and the state after them.
 
         Args:
             spikes: (T, B, 2n, H, W), any layout; channels last is read as it lies. An int8 network takes
-                `encoding.to_codes` too.
+                `encoding.to_codes` too, and one in float32 `encoding.to_counts`.
             state: of these B streams, the network's or the engine's.
 
         Returns:
@@ -89,7 +94,9 @@ class Engine:
         return twists, NetworkState(membranes, cells, y)
 
     @torch.inference_mode()
-    def together(self, spikes: Tensor, states: Sequence[NetworkState]) -> list[tuple[Tensor, NetworkState]]:
+    def together(
+        self, spikes: Tensor | sparse.Counts, states: Sequence[NetworkState]
+    ) -> list[tuple[Tensor, NetworkState]]:
         """One window of each of B streams: the same as a call for each, of eight in 0.8 of the time.
 
         The feature extractor takes all at once; cells and readout take each stream alone, so that no sum of a stream
@@ -116,16 +123,20 @@ class Engine:
         return answers
 
     @torch.inference_mode()
-    def features(self, spikes: Tensor, state: NetworkState) -> tuple[Tensor, tuple[LIFState, ...]]:
+    def features(self, spikes: Tensor | sparse.Counts, state: NetworkState) -> tuple[Tensor, tuple[LIFState, ...]]:
         """Spikes (T * B, C, H', W') of the last map of the feature extractor alone, and its membranes after them."""
         x, membranes = self._features(spikes, state)
         return sparse.maps_of(x) if isinstance(x, sparse.Fired) else x.float(), membranes
 
-    def _features(self, spikes: Tensor, state: NetworkState) -> tuple[Tensor | sparse.Fired, tuple[LIFState, ...]]:
-        if self._extractor is not None:
-            return self._extractor(spikes.flatten(0, 1), state.membranes)
+    def _features(
+        self, spikes: Tensor | sparse.Counts, state: NetworkState
+    ) -> tuple[Tensor | sparse.Fired, tuple[LIFState, ...]]:
         if self._sparse is not None and not is_plain():
             return self._sparse(spikes, state.membranes)
+        if isinstance(spikes, sparse.Counts):
+            spikes = spikes.spikes()
+        if self._extractor is not None:
+            return self._extractor(spikes.flatten(0, 1), state.membranes)
         x = spikes.flatten(0, 1).contiguous(memory_format=torch.channels_last)
         fire = self._plain_fire if is_plain() else self._fused_fire
         membranes = []
@@ -137,6 +148,8 @@ class Engine:
     def _rows(self, x: Tensor | sparse.Fired) -> Tensor | Array:
         """What the cells are given of the last map (R, C, H, W): its spikes (R, I), or their projection (R, F)."""
         if isinstance(x, sparse.Fired):
+            if isinstance(self._project, int8.Projection):
+                return self._project(x)
             assert self._sparse is not None  # it made them
             return self._sparse.project(x)
         rows = x.permute(0, 2, 3, 1).flatten(1)  # as it lies in memory

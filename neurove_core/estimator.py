@@ -11,7 +11,7 @@ from torch import Tensor
 
 from neurove_core import windows
 from neurove_core.bundle import PER_HEIGHT, Bundle
-from neurove_core.encoding import to_codes, to_spikes
+from neurove_core.encoding import to_codes, to_counts, to_spikes
 from neurove_core.engine import Engine
 from neurove_core.geometry import lookup_table
 from neurove_core.network import NetworkState, NeuroVE
@@ -92,7 +92,12 @@ class Estimator:
         self.network = bundle.network.eval().requires_grad_(requires_grad=False)
         # a baseline runs as it was trained: NeuroVE alone has a fast path
         fast = Engine(self.network) if isinstance(self.network, NeuroVE) else self.network
-        self._engine: Callable[[Tensor, Any], tuple[Tensor, Any]] = fast
+        self._engine: Callable[[Any, Any], tuple[Tensor, Any]] = fast
+        self._encode: Callable[[Tensor, str], Any] = to_spikes
+        if self.config.network.precision == "int8":
+            self._encode = to_codes
+        elif isinstance(fast, Engine) and fast.reads_counts:
+            self._encode = to_counts
         self._offset, self._scale = bundle.offset.double().numpy(), bundle.scale.double().numpy()
 
     def initial_state(self, sensor: Sensor, camera: CameraInfo | None = None) -> StreamState:
@@ -212,15 +217,16 @@ class Estimator:
     @torch.inference_mode()
     def _steps(self, counts: list[NDArray[np.uint8]], states: list[State]) -> list[tuple[NDArray[np.float64], State]]:
         """One window of each stream: its twists (n, 6) and its next state."""
-        encode = to_codes if self.config.network.precision == "int8" else to_spikes
         together = torch.from_numpy(counts[0] if len(counts) == 1 else np.stack(counts))
-        spikes = encode(together.view(1, len(counts), *counts[0].shape), self.config.network.encoding)
+        spikes = self._encode(together.view(1, len(counts), *counts[0].shape), self.config.network.encoding)
         answers = self._together(spikes, states)
         return [(twists[0, 0].double().numpy() * self._scale + self._offset, state) for twists, state in answers]
 
-    def _together(self, spikes: Tensor, states: list[Any]) -> list[tuple[Tensor, State]]:
+    def _together(self, spikes: Any, states: list[Any]) -> list[tuple[Tensor, State]]:
         if len(states) > 1 and isinstance(self._engine, Engine):
             return list(self._engine.together(spikes, states))
+        if len(states) == 1:
+            return [self._engine(spikes, states[0])]
         return [self._engine(spikes[:, b : b + 1], state) for b, state in enumerate(states)]
 
     def _covariance(self, state: State, metres: NDArray[np.float64]) -> NDArray[np.float64] | None:

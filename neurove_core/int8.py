@@ -6,7 +6,8 @@
 So a convolution or a projection is a sum of products of whole numbers, exact in any order and any arithmetic that can
 hold it: int32, or float32 below 2**24. The norm's factor and offset follow in float32, one product and one sum for each
 neuron, and then the LIF scan or the first cell. `neurons.plain()` computes the same with the public float32 operators;
-tests compare bit for bit. Training sees the rounding (`rounded`) and passes gradients through it.
+tests compare bit for bit. Training sees the rounding (`rounded`) and passes gradients through it. Where the widths suit
+its vectors sparse_int8.py sums over the neurons that fired alone; here are the dense forms.
 """
 
 from collections.abc import Callable
@@ -18,9 +19,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import conv2d, linear
 
+from neurove_core import sparse_int8
 from neurove_core.compiled import compiled
 from neurove_core.convolution import Convolution, say_once
 from neurove_core.neurons import LIFParams, LIFState, is_plain, lif_scan_reference
+from neurove_core.sparse import Fired, maps_of
+from neurove_core.vectors import LANES
 
 LEVELS: Final = 32
 """Of the input per unit; log1p of a saturated count, 5.5, becomes 177."""
@@ -96,10 +100,22 @@ class Extractor:
         tops = [255] + [1] * (len(layers) - 1)
         self._plain = [plain_sums(layer.weights.q, top) for layer, top in zip(layers, tops, strict=True)]
         self._fast = [sums(layer.weights.q, top, *size) for layer, top, size in zip(layers, tops, sizes, strict=False)]
+        over = [
+            sparse_int8.Layer(layer.weights.q, layer.factor, layer.offset, dense, *size)
+            for layer, dense, size in zip(layers, self._fast, sizes, strict=False)
+        ]
+        self._over_lists = sparse_int8.extractor(over, lif)
 
-    def __call__(self, spikes: Tensor, membranes: tuple[LIFState, ...]) -> tuple[Tensor, tuple[LIFState, ...]]:
-        """Input (T * B, 2n, H, W), as float32 or as uint8 codes, to uint8 spikes (T * B, C', H', W') and potentials."""
-        x = (spikes if spikes.dtype == torch.uint8 else codes(spikes)).contiguous(memory_format=torch.channels_last)
+    def __call__(self, spikes: Tensor, membranes: tuple[LIFState, ...]) -> tuple[Tensor | Fired, tuple[LIFState, ...]]:
+        """Input (T * B, 2n, H, W), as float32 or as uint8 codes, to spikes of the last map and potentials.
+
+        Returns:
+            who fired, or uint8 spikes (T * B, C', H', W') where layers are dense; and the potentials.
+        """
+        given = spikes if spikes.dtype == torch.uint8 else codes(spikes)
+        if self._over_lists is not None and not is_plain():
+            return self._over_lists(given, membranes)
+        x = given.contiguous(memory_format=torch.channels_last)
         after = []
         for index, (layer, membrane) in enumerate(zip(self._layers, membranes, strict=True)):
             if is_plain():
@@ -135,9 +151,13 @@ class Projection:
         self._largest = _largest_sum(layer.weights.q)
         self._rows = layer.weights.q.T.contiguous().numpy()  # (I, F): what one spike gives to all features
 
-    def __call__(self, spikes: Tensor) -> Tensor:
-        """Spikes (R, I), uint8 of 0 and 1, to currents (R, F)."""
+    def __call__(self, spikes: Tensor | Fired) -> Tensor:
+        """Spikes (R, I), uint8 of 0 and 1, or who fired, to currents (R, F)."""
         (q, _), factor, offset = self.layer
+        if isinstance(spikes, Fired):
+            if factor.numel() % LANES == 0 and self._largest < 1 << 31:
+                return torch.from_numpy(sparse_int8.project(spikes, self._rows, factor.numpy(), offset.numpy()))
+            spikes = maps_of(spikes, np.uint8).permute(0, 2, 3, 1).flatten(1)
         if is_plain() or self._largest >= 1 << 31:
             kind = torch.float32 if self._largest < _EXACT else torch.float64
             return linear(spikes.to(kind), q.to(kind)).to(torch.float32) * factor + offset

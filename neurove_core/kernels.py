@@ -81,18 +81,21 @@ def count_events_reference(
     return int((~seen).sum())
 
 
-_BLOCK: Final = 512  # events whose cells are looked up together: a loop that the compiler turns into vectors
+_BLOCK: Final = 512  # events whose pixels are numbered together: a loop that the compiler turns into vectors
 
 
 @compiled
 def _count(
     events: Events, start_us: int, bin_us: int, lut: NDArray[np.int32], cells: int, flat: NDArray[np.uint8]
 ) -> int:  # pragma: no cover (machine code)
-    """Bin by bin: its last event by bisection instead of a division per event, then looked up and added in blocks."""
+    """Bin by bin: its last event by bisection instead of a division per event, then numbered and added in blocks.
+
+    Cells are looked up one by one as they are added to: vectors that gather them take longer than the loop waits.
+    """
     t, x, y, p = events.t, events.x, events.y, events.p
     pixels, columns = lut.reshape(-1), np.uint32(lut.shape[1])
-    on, end = np.uint32(cells), np.uint32(2 * cells)
-    found = np.empty(_BLOCK, np.uint32)
+    on = np.uint32(cells)
+    found, plane = np.empty(_BLOCK, np.uint32), np.empty(_BLOCK, np.uint32)
     outside, first = 0, 0
     for bin_ in range(flat.size // (2 * cells)):
         last = first + int(np.searchsorted(t[first:], np.int64(start_us + (bin_ + 1) * bin_us)))
@@ -102,14 +105,13 @@ def _count(
             xs, ys, ps = x[i : i + m], y[i : i + m], p[i : i + m]
             for j in range(m):
                 found[j] = np.uint32(ys[j]) * columns + np.uint32(xs[j])
+                plane[j] = on * np.uint32(ps[j] != 0)
             for j in range(m):
-                cell = np.int32(pixels[found[j]])
-                found[j] = np.uint32(cell) + on * np.uint32(ps[j] != 0) * np.uint32(cell >= 0)
-            for j in range(m):
-                k = found[j]
-                if k >= end:  # OUTSIDE, -1, is the largest of all
+                cell = pixels[found[j]]
+                if cell < 0:
                     outside += 1
                     continue
+                k = np.uint32(cell) + plane[j]
                 pair[k] += np.uint8(pair[k] < 255)
         first = last
     return outside

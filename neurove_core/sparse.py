@@ -22,7 +22,7 @@ from torch import Tensor
 from neurove_core.compiled import compiled
 from neurove_core.convolution import LARGE, Convolution, say_once
 from neurove_core.neurons import LIFParams, LIFState
-from neurove_core.vectors import LANES, entry, fire, nothing, plus, plus_product, put, tile_of
+from neurove_core.vectors import LANES, entry, fire, nothing, plus, plus_product, put, put_floats, tile_of
 
 Array = NDArray[np.float32]
 Places = NDArray[np.int32]
@@ -31,6 +31,9 @@ _MANY: Final = 0.4
 """Share of spikes from which maps are convolved dense: with AVX-512 large ones take as long then (with AVX2 at 0.7)."""
 
 _FEW: Final = 1 << 14  # that fired: fewer are summed up sooner than a dense convolution of a small map has begun
+
+SPARE: Final = 2 * LANES
+"""Numbers behind those of a list that may be read and written, and mean nothing."""
 
 _CHUNK: Final = 512  # inputs of the projection whose weights, 512 KiB for 256 features, stay in the second cache
 
@@ -42,6 +45,29 @@ class Fired(NamedTuple):
     starts: Places  # (R * H * W + 1): where in `places` each cell begins
     shape: tuple[int, int, int, int]
     found: int  # of `places`; what lies behind means nothing
+
+
+class Counts(NamedTuple):
+    """Input as counts, each for its entry of a table: encoded row by row as the first layer reads it."""
+
+    counts: Tensor  # (T, B, 2n, H, W) uint8
+    table: Tensor  # (256) float32
+
+    @property
+    def shape(self) -> torch.Size:
+        """Of the input."""
+        return self.counts.shape
+
+    def spikes(self) -> Tensor:
+        """The input itself."""
+        return self.table[self.counts.to(torch.int64)]
+
+
+class Counted(NamedTuple):
+    """The same, of maps (R, C, H, W)."""
+
+    counts: NDArray[np.uint8]
+    table: Array
 
 
 class Layer(NamedTuple):
@@ -69,16 +95,21 @@ class Extractor:
         weight, bias = projection
         self._rows, self._bias, self._tile = weight.T.reshape(-1).numpy(), bias.numpy(), tile_of(bias.numel())
 
-    def __call__(self, spikes: Tensor, membranes: Sequence[LIFState]) -> tuple[Fired, tuple[LIFState, ...]]:
+    def __call__(self, spikes: Tensor | Counts, membranes: Sequence[LIFState]) -> tuple[Fired, tuple[LIFState, ...]]:
         """Input (T, B, 2n, H, W) to who fired in the last map, and the potentials after the last reset."""
         constants = self._decay, self._v_th
-        x = np.ascontiguousarray(_values(spikes).transpose(0, 1, 3, 4, 2))
-        fired, v = self._first(x.reshape(-1, *x.shape[2:]), _cells_of(membranes[0].v), *constants)
+        if isinstance(spikes, Counts):
+            counts = np.ascontiguousarray(values_of(spikes.counts))
+            given: Array | Counted = Counted(counts.reshape(-1, *counts.shape[2:]), spikes.table.numpy())
+        else:
+            x = np.ascontiguousarray(values_of(spikes).transpose(0, 1, 3, 4, 2))
+            given = x.reshape(-1, *x.shape[2:])
+        fired, v = self._first(given, cells_of(membranes[0].v), *constants)
         after = [v]
         for layer, membrane in zip(self._layers, membranes[1:], strict=True):
-            fired, v = layer(fired, _cells_of(membrane.v), *constants)
+            fired, v = layer(fired, cells_of(membrane.v), *constants)
             after.append(v)
-        return fired, tuple([LIFState(_maps(v)) for v in after])
+        return fired, tuple([LIFState(in_maps(v)) for v in after])
 
     def project(self, fired: Fired) -> Array:
         """What the projection makes of each map (R, F)."""
@@ -103,38 +134,48 @@ def extractor(layers: Sequence[Layer], projection: tuple[Tensor, Tensor], lif: L
     return None
 
 
-def maps_of(fired: Fired) -> Tensor:
+def maps_of(fired: Fired, kind: type[np.generic] = np.float32) -> Tensor:
     """Spikes of 0 and 1 (R, C, H, W), channels last."""
-    maps = np.zeros((fired.shape[0], fired.shape[1] * fired.shape[2] * fired.shape[3]), np.float32)
+    maps = np.zeros((fired.shape[0], fired.shape[1] * fired.shape[2] * fired.shape[3]), kind)
     _mark(fired.places, fired.starts, maps)
-    return _maps(maps.reshape(fired.shape))
+    return in_maps(maps.reshape(fired.shape))
 
 
 def listed(maps: Tensor) -> Fired:
     """What `maps_of` undoes."""
-    rows = _cells_of(maps)
+    rows = cells_of(maps)
     flat = rows.reshape(rows.shape[0], -1)
-    places = np.nonzero(flat)[1].astype(np.int32)
+    found = np.nonzero(flat)[1]
+    places = np.zeros(found.size + SPARE, np.int32)
+    places[: found.size] = found
     cells = np.count_nonzero(rows.reshape(-1, rows.shape[3]), axis=1)
     starts = np.concatenate([[0], np.cumsum(cells)]).astype(np.int32)
-    return Fired(places, starts, rows.shape, places.size)
+    return Fired(places, starts, rows.shape, found.size)
 
 
 class OverValues:
-    """The first layer: maps (R, H, W, C) of any float32 to who fires in (R, H', W', C')."""
+    """The first layer: maps (R, H, W, C) of any float32, or counts, to who fires in (R, H', W', C')."""
 
     def __init__(self, layer: Layer) -> None:
         self._weight, self._bias = _by_input(layer.weight), layer.bias.numpy()
         self._widths = layer.weight.shape[1], layer.weight.shape[0]
         self._tile, self._firing = tile_of(self._bias.size, most=2), tile_of(self._bias.size)
 
-    def __call__(self, x: Array, v: Array, decay: np.float32, v_th: np.float32) -> tuple[Fired, Array]:
+    def __call__(self, x: Array | Counted, v: Array, decay: np.float32, v_th: np.float32) -> tuple[Fired, Array]:
         """Potentials (B, H', W', C') before, to who fires and the potentials after."""
-        shape = _after(x.shape, self._widths, v)
-        (places, starts), after = _lists(shape), np.empty_like(v)
-        given = self._tile, self._firing, x, self._weight, self._bias
-        found = _convolve_values(*given, v, after, decay, v_th, places, starts)
+        if isinstance(x, Counted):
+            maps, channels, rows, columns = x.counts.shape
+            whole, given = (maps, rows, columns, channels), (_NO_VALUES, x.counts.reshape(-1), x.table)
+        else:
+            whole, given = x.shape, (x.reshape(-1), _NO_COUNTS, _NO_VALUES)
+        shape = shape_after(whole, self._widths, v)
+        (places, starts), after = room_for(shape), np.empty_like(v)
+        layer = self._tile, self._firing, whole, *given, self._weight, self._bias
+        found = _convolve_values(*layer, v, after, decay, v_th, places, starts)
         return Fired(places, starts, shape, found), after
+
+
+_NO_VALUES, _NO_COUNTS = np.empty(0, np.float32), np.empty(0, np.uint8)
 
 
 class OverList:
@@ -149,20 +190,20 @@ class OverList:
     def __call__(self, fired: Fired, v: Array, decay: np.float32, v_th: np.float32) -> tuple[Fired, Array]:
         """Potentials (B, H', W', C') before, to who fires and the potentials after."""
         if fired.found > max(_FEW, _MANY * math.prod(fired.shape)):
-            _after(fired.shape, self._widths, v)
+            shape_after(fired.shape, self._widths, v)
             return _fired(self._dense(maps_of(fired)), v, decay, v_th)
         return self.over_list(fired, v, decay, v_th)
 
     def over_list(self, fired: Fired, v: Array, decay: np.float32, v_th: np.float32) -> tuple[Fired, Array]:
         """The same, however many fired."""
-        shape = _after(fired.shape, self._widths, v)
-        (places, starts), after = _lists(shape), np.empty_like(v)
+        shape = shape_after(fired.shape, self._widths, v)
+        (places, starts), after = room_for(shape), np.empty_like(v)
         given = self._tile, fired.places, fired.starts, fired.shape, self._weight, self._bias
         found = _convolve(*given, v, after, decay, v_th, places, starts)
         return Fired(places, starts, shape, found), after
 
 
-def _after(given: tuple[int, ...], weights: tuple[int, int], v: Array) -> tuple[int, int, int, int]:
+def shape_after(given: tuple[int, ...], weights: tuple[int, int], v: Array) -> tuple[int, int, int, int]:
     """Shape (R, H', W', C') after a layer of C and C' channels; compiled code asks no more whether all fits."""
     maps, rows, columns, inputs = given
     shape = (rows + 1) // 2, (columns + 1) // 2, weights[1]
@@ -177,32 +218,32 @@ def _by_input(weight: Tensor) -> Array:
     return weight.permute(2, 3, 1, 0).reshape(-1).numpy()
 
 
-def _values(x: Tensor) -> Array:
+def values_of(x: Tensor) -> NDArray[Any]:
     """Of a tensor, without its gradient; each call of torch takes as long as a small layer's kernel starts in."""
-    values: Array = (x.detach() if x.requires_grad else x).numpy()
+    values: NDArray[Any] = (x.detach() if x.requires_grad else x).numpy()
     return values
 
 
-def _cells_of(maps: Tensor) -> Array:
+def cells_of(maps: Tensor) -> NDArray[Any]:
     """Maps (R, C, H, W) as (R, H, W, C): their own memory, where they lie channels last."""
-    return np.ascontiguousarray(_values(maps).transpose(0, 2, 3, 1))
+    return np.ascontiguousarray(values_of(maps).transpose(0, 2, 3, 1))
 
 
-def _maps(cells: Array) -> Tensor:
-    """What `_cells_of` undoes."""
+def in_maps(cells: Array) -> Tensor:
+    """What `cells_of` undoes."""
     return torch.from_numpy(cells.transpose(0, 3, 1, 2))
 
 
-def _lists(shape: tuple[int, int, int, int]) -> tuple[Places, Places]:
+def room_for(shape: tuple[int, int, int, int]) -> tuple[Places, Places]:
     """Room for all of these maps to fire."""
     cells = shape[0] * shape[1] * shape[2]
-    return np.empty(cells * shape[3] + LANES, np.int32), np.empty(cells + 1, np.int32)
+    return np.empty(cells * shape[3] + SPARE, np.int32), np.empty(cells + 1, np.int32)
 
 
 def _fired(currents: Tensor, v: Array, decay: np.float32, v_th: np.float32) -> tuple[Fired, Array]:
     """Who fires of currents (R, C, H, W), and the potentials (B, H, W, C) after v."""
-    rows = _cells_of(currents)
-    (places, starts), after = _lists(rows.shape), np.empty_like(v)
+    rows = cells_of(currents)
+    (places, starts), after = room_for(rows.shape), np.empty_like(v)
     channels = rows.shape[3]
     found = _fire(tile_of(channels), rows.reshape(-1), channels, v, after, decay, v_th, places, starts)
     return Fired(places, starts, rows.shape, found), after
@@ -220,10 +261,10 @@ def _agrees(layer: Layer, *, first: bool) -> bool:
             x = ((drawn[0] < share) * (drawn[1] if first else 1.0)).permute(0, 3, 1, 2)
             v = np.zeros((count, (layer.rows + 1) // 2, (layer.columns + 1) // 2, outputs), np.float32)
             if first:
-                _, found = OverValues(layer)(_cells_of(x), v, *silent)
+                _, found = OverValues(layer)(cells_of(x), v, *silent)
             else:
                 _, found = OverList(layer).over_list(listed(x), v, *silent)
-            if not torch.equal(_maps(found), layer.dense(x)):
+            if not torch.equal(in_maps(found), layer.dense(x)):
                 return False
     return True
 
@@ -235,7 +276,10 @@ def _agrees(layer: Layer, *, first: bool) -> bool:
 def _convolve_values(
     like: tuple[int, ...],
     firing: tuple[int, ...],
+    shape: tuple[int, int, int, int],
     x: Array,
+    counts: NDArray[np.uint8],
+    table: Array,
     weight: Array,
     bias: Array,
     before: Array,
@@ -252,7 +296,10 @@ def _convolve_values(
     Args:
         like: width of a tile of six cells; all twelve fit into registers with two vectors.
         firing: width of a tile that fires.
-        x: R, H, W, C.
+        shape: R, H, W, C.
+        x: R * H * W * C.
+        counts: R * C * H * W, or none; where there are some x is not read, but their entries of the table.
+        table: 256.
         weight: 3, 3, C, C'.
         bias: C'.
         before: potentials (B, H', W', C').
@@ -265,38 +312,46 @@ def _convolve_values(
     Returns:
         how many fire.
     """
-    maps, rows, columns, channels = x.shape
-    outputs, width, step = bias.size, LANES * len(like), 2 * channels
+    maps, rows, columns, channels = shape
+    outputs, width = bias.size, LANES * len(like)
     batch = before.shape[0]
     n = before.size // batch
-    values, v, v_after, found, cell = x.reshape(-1), before.reshape(-1), after.reshape(-1), 0, 0
-    currents = np.empty(6 * outputs, np.float32)
+    v, v_after, found, cell = before.reshape(-1), after.reshape(-1), 0, 0
+    line, encoded = channels * columns, counts.size > 0
+    values = np.empty(3 * line, np.float32) if encoded else x  # rows of the kernel, by number modulo three
+    aside, apart = (1, columns) if encoded else (channels, 1)  # from a cell to the next, from a channel to the next
+    step, currents = 2 * aside, np.empty(6 * outputs, np.float32)
     for r in range(maps):
         if r == batch:
             v = v_after
         at = 0  # in the new map
         for row in range(-1, rows - 1, 2):  # the kernel's first
             top, bottom = max(row, 0), min(row + 3, rows)
+            if encoded:
+                for y in range(top if row < 0 else row + 1, bottom):
+                    _encode_row(counts, (r * channels * rows + y) * columns, rows, columns, table, values, y % 3 * line)
             column = -1
             while column < columns - 1:
                 cells = 6 if column >= 0 and column + 13 <= columns else 1  # at an edge one by one
-                left, right = (max(column, 0) - column) * channels, (min(column + 3, columns) - column) * channels
+                left, right = max(column, 0), min(column + 3, columns)
                 for tile in range(0, outputs, width):
                     a, b, c = nothing(like), nothing(like), nothing(like)
                     d, e, f = nothing(like), nothing(like), nothing(like)
                     for y in range(top, bottom):
-                        k = ((r * rows + y) * columns + column) * channels + left
-                        w = ((y - row) * 3 * channels + left) * outputs + tile
-                        for _ in range(left, right):
-                            a = plus_product(a, values, k, weight, w)
-                            if cells == 6:
-                                b = plus_product(b, values, k + step, weight, w)
-                                c = plus_product(c, values, k + 2 * step, weight, w)
-                                d = plus_product(d, values, k + 3 * step, weight, w)
-                                e = plus_product(e, values, k + 4 * step, weight, w)
-                                f = plus_product(f, values, k + 5 * step, weight, w)
-                            k += 1
-                            w += outputs
+                        begin = y % 3 * line if encoded else (r * rows + y) * line
+                        w = ((y - row) * 3 + left - column) * channels * outputs + tile
+                        for i in range(left, right):
+                            k = begin + i * aside
+                            for _ in range(channels):
+                                a = plus_product(a, values, k, weight, w)
+                                if cells == 6:
+                                    b = plus_product(b, values, k + step, weight, w)
+                                    c = plus_product(c, values, k + 2 * step, weight, w)
+                                    d = plus_product(d, values, k + 3 * step, weight, w)
+                                    e = plus_product(e, values, k + 4 * step, weight, w)
+                                    f = plus_product(f, values, k + 5 * step, weight, w)
+                                k += apart
+                                w += outputs
                     put(plus(a, bias, tile), currents, tile)
                     if cells == 6:
                         put(plus(b, bias, tile), currents, outputs + tile)
@@ -314,6 +369,23 @@ def _convolve_values(
                 column += 2 * cells
     starts[cell] = found
     return found
+
+
+@compiled
+def _encode_row(
+    counts: NDArray[np.uint8], begin: int, rows: int, columns: int, table: Array, values: Array, into: int
+) -> None:  # pragma: no cover (machine code)
+    """Write the entries of a row of counts, channel after channel; the next channel's begins rows * columns later."""
+    for _ in range(into, into + values.size // 3, columns):
+        if columns < LANES:
+            for i in range(columns):
+                values[into + i] = table[counts[begin + i]]
+        else:
+            for column in range(0, columns, LANES):
+                i = min(column, columns - LANES)
+                put_floats(table, counts, begin + i, values, into + i)
+        begin += rows * columns
+        into += columns
 
 
 @compiled
@@ -465,7 +537,7 @@ def _project(
 
 
 @compiled
-def _mark(given: Places, starts: Places, maps: Array) -> None:  # pragma: no cover (machine code)
+def _mark(given: Places, starts: Places, maps: NDArray[Any]) -> None:  # pragma: no cover (machine code)
     """Write 1 where someone fired; maps (R, H * W * C) are 0."""
     cells = (starts.size - 1) // maps.shape[0]
     for r in range(maps.shape[0]):

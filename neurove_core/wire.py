@@ -222,8 +222,8 @@ def _count_columns(
     """As kernels._count."""
     pixels, columns, flat = lut.reshape(-1), np.uint32(lut.shape[1]), counts.reshape(-1)
     cells = counts.shape[1] * counts.shape[2]
-    on, end, rows = np.uint32(cells), np.uint32(2 * cells), np.uint16(0x7FFF)
-    found = np.empty(_BLOCK, np.uint32)
+    on, rows = np.uint32(cells), np.uint16(0x7FFF)
+    found, plane = np.empty(_BLOCK, np.uint32), np.empty(_BLOCK, np.uint32)
     outside, first = 0, 0
     for bin_ in range(counts.shape[0] // 2):
         stop = start + (bin_ + 1) * bin_us
@@ -240,14 +240,13 @@ def _count_columns(
             xs, ys = x[i : i + m], y_and_p[i : i + m]
             for j in range(m):
                 found[j] = np.uint32(ys[j] & rows) * columns + np.uint32(xs[j])
+                plane[j] = on * np.uint32(ys[j] >> np.uint16(15))
             for j in range(m):
-                cell = np.int32(pixels[found[j]])
-                found[j] = np.uint32(cell) + on * np.uint32(ys[j] >> np.uint16(15)) * np.uint32(cell >= 0)
-            for j in range(m):
-                k = found[j]
-                if k >= end:  # OUTSIDE, -1, is the largest of all
+                cell = pixels[found[j]]
+                if cell < 0:
                     outside += 1
                     continue
+                k = np.uint32(cell) + plane[j]
                 pair[k] += np.uint8(pair[k] < 255)
         first = last
     return outside

@@ -55,7 +55,7 @@ def _windows(
     quantised = config.network.precision == "int8"
     in_float32 = _network(with_precision(config, "float32")) if quantised else network
     spikes, rest = draw(config, steps), network.initial_state(1)
-    given = int8.codes(spikes) if quantised else spikes
+    given = int8.codes(spikes).contiguous() if quantised else spikes  # as the encoding lays them
     engine = Engine(network)
     others = peers.networks(in_float32, missing) if with_peers else {}
     runs: dict[str, Callable[[], object]] = {"ours": lambda: engine(given, rest)}

@@ -150,6 +150,7 @@ def test_counts_become_the_codes_of_their_spikes_and_a_network_may_be_given_eith
     counts = torch.arange(256, dtype=torch.uint8).repeat(2, 16).reshape(1, 1, 4, 32, 64)[..., :14, :19].contiguous()
     found, spikes = to_codes(counts, encoding), to_spikes(counts, encoding)
     assert torch.equal(found, int8.codes(spikes))
+    assert found.is_contiguous()
     engine = Engine(network_of(SMALL))
     state = network_of(SMALL).initial_state(1)
     assert torch.equal(engine(found, state)[0], engine(spikes, state)[0])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from neurove_core import bundle, convolution, scan, sparse
+from neurove_core import bundle, convolution, encoding, scan, sparse
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
 from neurove_core.engine import Engine
 from neurove_core.neurons import LIFParams, LIFState, plain
@@ -189,3 +189,30 @@ def test_running_changes_neither_the_state_that_was_given_nor_the_input():
     assert torch.equal(once, again)
     after = [carried.readout, *(membrane.v for membrane in carried.membranes), spikes]
     assert all(torch.equal(one, other) for one, other in zip(before, after, strict=True))
+
+
+@pytest.mark.parametrize("rate", [0.0, 0.4, 40.0, 300.0])
+@pytest.mark.parametrize("size", [(9, 8), (14, 19), (12, 16), (11, 47)])
+@pytest.mark.parametrize("name", ["log1p", "binary"])
+def test_counts_answer_as_the_spikes_that_they_stand_for_bit_for_bit(name, size, rate):
+    """Window after window and several at once, alone and together; rows shorter and longer than a vector."""
+    network = SMALL.network.model_copy(update={"encoding": name})
+    grid = CanonicalConfig(height=size[0], width=size[1])
+    config = SMALL.model_copy(update={"network": network, "canonical": grid})
+    network = bundle.untrained(0, config).network.requires_grad_(requires_grad=False)
+    engine, states = Engine(network), [network.initial_state(2) for _ in range(2)]
+    assert engine.reads_counts
+    for steps in (1, 3, 1):
+        drawn = torch.poisson(torch.full((steps, 2, 4, *size), rate), generator=torch.Generator().manual_seed(steps))
+        counts = drawn.clamp(max=255).to(torch.uint8)
+        found, states[0] = engine(encoding.to_counts(counts, name), states[0])
+        expected, states[1] = engine(encoding.to_spikes(counts, name), states[1])
+        assert torch.equal(found, expected)
+        for one, other in zip(states[0].membranes, states[1].membranes, strict=True):
+            assert torch.equal(one.v, other.v)
+    starts = [network.initial_state(1) for _ in range(2)]
+    for b, (twists, _) in enumerate(engine.together(encoding.to_counts(counts, name), starts)):
+        assert torch.equal(twists, engine(encoding.to_spikes(counts[:, b : b + 1], name), starts[b])[0])
+    with plain():
+        plainly = [engine(give(counts, name), states[0])[0] for give in (encoding.to_counts, encoding.to_spikes)]
+    assert torch.equal(*plainly)
