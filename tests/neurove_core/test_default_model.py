@@ -86,7 +86,6 @@ def test_over_a_ground_without_texture_it_is_unsure(drive):
     assert flagged[16:].mean() > 0.5
 
 
-@pytest.mark.xfail(reason="known: in a hole the default model is too sure, neurove_core/models/README.md", strict=True)
 def test_a_gap_makes_it_unsure(drive):
     counts = drive.copy()
     counts[30:40] = 0
@@ -94,7 +93,6 @@ def test_a_gap_makes_it_unsure(drive):
     assert sigma[36:41].mean() > 1.3 * usual[36:41].mean()
 
 
-@pytest.mark.xfail(reason="known: without events it is too sure, neurove_core/models/README.md", strict=True)
 def test_a_second_without_events_makes_it_uncertain(drive):
     counts = drive.copy()
     counts[30:] = 0
