@@ -1,4 +1,4 @@
-"""The commands of model bundles, which need no service: model new, inspect, keygen, sign, verify.
+"""The commands of model bundles, which need no service: model new, average, inspect, keygen, sign, verify.
 
 Exit codes: 0 fine; 1 the model or its signature does not hold; 2 wrong usage, such as a missing file.
 """
@@ -49,6 +49,27 @@ def new_model(args: argparse.Namespace) -> int:
     except OSError as error:
         raise InvalidField("model new", "FILE", str(path), error.strerror or str(error)) from None
     print(f"{path}: {made.name}, {made.digest[:12]}, untrained")
+    return 0
+
+
+@_judging
+def average_models(args: argparse.Namespace) -> int:
+    """Write the mean of several trainings of one model; calibrate it, for its errors are its own."""
+    from neurove_core import bundle
+    from neurove_core.training.averaging import average
+
+    path: Path = args.out
+    if path.suffix != bundle.SUFFIX:
+        raise InvalidField("model average", "out", str(path), f"its name must end in {bundle.SUFFIX}")
+    made = average([bundle.from_bytes(_bundle(file), file.name) for file in args.files])
+    try:
+        bundle.save(made, path)
+    except OSError as error:
+        raise InvalidField("model average", "out", str(path), error.strerror or str(error)) from None
+    if args.json:
+        print(json.dumps({"ok": True, "bundle": str(path), "digest": made.digest}))
+    else:
+        print(f"{path}: {made.name}, {made.digest[:12]}, not calibrated: neurove calibrate {path} --config CONFIG")
     return 0
 
 
@@ -191,6 +212,9 @@ def add(commands: Any) -> None:
     new = command(parser, "new", new_model, as_json=False)
     new.add_argument("file", type=Path, metavar="FILE", help="bundle to write, ending in .safetensors")
     new.add_argument("--seed", type=int, default=0, help="of the weights")
+    mean = command(parser, "average", average_models)
+    mean.add_argument("files", type=Path, nargs="+", metavar="FILE", help="bundles of one network, 2 to 8")
+    mean.add_argument("--out", type=Path, required=True, metavar="FILE", help="where to write the mean")
     inspect = command(parser, "inspect", inspect_model)
     inspect.add_argument("file", type=Path, metavar="BUNDLE", help="to read, and BUNDLE.sig where there is one")
     inspect.add_argument("--trust", type=Path, action="extend", nargs="+", default=[], metavar="PUB", help=trust)

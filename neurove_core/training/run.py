@@ -211,10 +211,19 @@ def check_start(start: Bundle, config: TrainingConfig) -> None:
     """
     if start.linear_unit != PER_HEIGHT:
         raise BadModel(start.name, f"linear_unit={start.linear_unit!r}: training goes on from {PER_HEIGHT!r} alone")
-    had, wanted = _shape(start.config), _shape(config.model)
+    check_same_network(start, config.model)
+
+
+def check_same_network(model: Bundle, config: ModelConfig) -> None:
+    """Refuse a model whose weights would mean something else in a network of this configuration.
+
+    Raises:
+        BadModel: a field that differs is named with both values.
+    """
+    had, wanted = _shape(model.config), _shape(config)
     for name, value in wanted.items():
         if had[name] != value:
-            raise BadModel(start.name, f"it has {name}={had[name]}, the configuration says {value}")
+            raise BadModel(model.name, f"it has {name}={had[name]}, the configuration says {value}")
 
 
 def _take_over(network: Network, start: Bundle) -> None:

@@ -20,7 +20,7 @@ def test_it_is_trained_small_and_says_how_it_was_made():
     found = models.find(models.DEFAULT)
     assert models.built_in()[0] is found
     assert found.trained
-    assert found.provenance.startswith("neurove train default, begun from ")
+    assert found.provenance.startswith("neurove model average of ")
     file = Path(models.__file__).with_name("default.safetensors")
     assert file.stat().st_size <= 8 << 20
     assert bundle.load(file).digest == found.digest

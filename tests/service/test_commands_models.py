@@ -266,3 +266,19 @@ def test_a_wrong_flag_is_explained_with_exit_code_2(capsys, arguments, telling):
         cli.main(["model", *arguments])
     assert raised.value.code == 2
     assert telling in capsys.readouterr().err
+
+
+def test_the_command_writes_a_bundle_and_says_that_it_is_not_calibrated(run, tmp_path):
+    files = []
+    for number in range(2):
+        files.append(tmp_path / f"{number}.safetensors")
+        bundle.save(replace(ORIGINAL, name=f"run {number}".replace(" ", "-")), files[-1])
+    code, out, _ = run("average", *files, "--out", tmp_path / "mean.safetensors")
+    assert code == 0
+    assert "not calibrated" in out
+    assert bundle.load(tmp_path / "mean.safetensors").provenance.startswith("neurove model average of ")
+    code, out, _ = run("average", files[0], "--out", tmp_path / "one.safetensors", "--json")
+    assert code == 2
+    assert not (tmp_path / "one.safetensors").exists()
+    code, out, _ = run("average", *files, "--out", tmp_path / "mean.safetensors", "--json")
+    assert (code, json.loads(out)["ok"]) == (0, True)

@@ -1,0 +1,59 @@
+"""The mean of models: of one network alone, with the mean of their weights, and with nothing that was only one's."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from neurove_core import bundle, golden
+from neurove_core.estimator import Estimator
+from neurove_core.training.averaging import average
+from protocol.errors import BadModel, InvalidField
+from tests.bundles import CONFIG, ORIGINAL
+
+
+def other(seed=3, config=CONFIG):
+    made = bundle.untrained(seed, config)
+    return replace(made, name="other", offset=ORIGINAL.offset, scale=ORIGINAL.scale, linear_unit=ORIGINAL.linear_unit)
+
+
+def test_every_weight_is_the_mean_and_the_rest_is_the_last_ones():
+    one, two = ORIGINAL, other().with_digest()
+    made = average([one, two])
+    a, b = one.network.state_dict(), two.network.state_dict()
+    for name, value in made.network.state_dict().items():
+        if value.is_floating_point():
+            torch.testing.assert_close(value, (a[name] + b[name]) / 2)
+    assert (made.name, made.uncertainty) == ("other", None)
+    assert one.digest[:12] in made.provenance
+    assert two.digest[:12] in made.provenance
+    assert made.digest not in ("", one.digest, two.digest)
+
+
+def test_a_model_averaged_with_itself_answers_as_it_did_and_has_a_golden_test_of_its_own():
+    counts = np.random.default_rng(0).poisson(0.3, (4, 4, 8, 10)).astype(np.uint8)
+    tested = replace(ORIGINAL, golden=golden.record(Estimator(ORIGINAL), counts)).with_digest()
+    made = average([tested, tested])
+    golden.check(Estimator(made))
+    np.testing.assert_array_equal(made.golden.twists, tested.golden.twists)
+
+
+@pytest.mark.parametrize(
+    ("models", "error", "says"),
+    [
+        ([ORIGINAL], InvalidField, "models=1"),
+        ([replace(ORIGINAL, scale=2 * ORIGINAL.scale), other()], BadModel, "scaled otherwise"),
+        (
+            [
+                ORIGINAL,
+                other(config=CONFIG.model_copy(update={"network": CONFIG.network.model_copy(update={"hidden": 5})})),
+            ],
+            BadModel,
+            "hidden",
+        ),
+    ],
+)
+def test_what_has_no_mean_is_refused(models, error, says):
+    with pytest.raises(error, match=says):
+        average(models)
