@@ -95,22 +95,27 @@ def plain_room(trajectory: Moving, seed: int) -> Scene:
         for side in (-1.0, 1.0):
             centre = middle + side * size[axis] / 2 * axes[axis]
             parts.append(panel(centre, u, v, sides, "paint", repeat_m=3.0, gain=light * rng.uniform(0.8, 1.0)))
-            parts += _shapes(rng, centre - 0.01 * side * axes[axis], u, v, sides)
+            parts += _shapes(rng, centre, -side * axes[axis], u, v, sides)
     return Fixed(Panels.join(parts), Sky(_flat(0.3), 0.3, 200.0))
 
 
 def _shapes(
     rng: np.random.Generator,
     centre: NDArray[np.float64],
+    inward: NDArray[np.float64],
     u: NDArray[np.float64],
     v: NDArray[np.float64],
     sides: tuple[float, float],
 ) -> list[Panels]:
-    """Rectangles, turned at random, on a wall of these sides: one on each square metre or so, at most forty."""
+    """Rectangles, turned at random, on a wall of these sides: one on each square metre or so, at most forty.
+
+    Each lies a little further from the wall than the one before: what overlaps is never in one plane.
+    """
     count = min(40, 1 + int(rng.poisson(sides[0] * sides[1] * rng.uniform(0.5, 1.5))))
     parts = []
-    for _ in range(count):
-        at = centre + rng.uniform(-0.45, 0.45) * sides[0] * u + rng.uniform(-0.45, 0.45) * sides[1] * v
+    for k in range(count):
+        on_wall = centre + (0.01 + 0.002 * k) * inward
+        at = on_wall + rng.uniform(-0.45, 0.45) * sides[0] * u + rng.uniform(-0.45, 0.45) * sides[1] * v
         angle = rng.uniform(0, np.pi)
         along, across = np.cos(angle) * u + np.sin(angle) * v, np.cos(angle) * v - np.sin(angle) * u
         wide, high = (float(length) for length in rng.uniform(0.08, 0.7, 2))

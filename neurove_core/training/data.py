@@ -147,7 +147,10 @@ class Cache:
 
     def __init__(self, folder: Path, config: TrainingConfig) -> None:
         self._config = config
-        kind = [FORMAT, config.data.model_dump(exclude={"sequences", "recordings"})]
+        data = config.data.model_dump(exclude={"sequences", "recordings"})
+        if config.data.spun_axis == DataConfig().spun_axis:
+            del data["spun_axis"]  # older than this setting is what was simulated as its default says
+        kind: list[Any] = [FORMAT, data]
         kind += [config.model.window.model_dump(), config.model.canonical.model_dump()]
         self.folder = folder / hashlib.sha256(json.dumps(kind, sort_keys=True).encode()).hexdigest()[:16]
 
