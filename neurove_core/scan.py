@@ -121,18 +121,19 @@ class _GradedScan(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, None, None, None, None]:  # torch's own type
-        kernel = _backward_arctan if ctx.arctan else _backward_triangle
-        return *_back(kernel, ctx, grads, ctx.decay, ctx.width), None, None, None, None
+        return *_back(_backward_graded, ctx, grads, ctx.decay, ctx.width, arctan=ctx.arctan), None, None, None, None
 
 
-def _back(kernel: Callable[..., None], ctx: Any, grads: tuple[Tensor, ...], *constants: float) -> tuple[Tensor, Tensor]:
+def _back(
+    kernel: Callable[..., None], ctx: Any, grads: tuple[Tensor, ...], *constants: float, **flags: bool
+) -> tuple[Tensor, Tensor]:
     """Gradients by the currents and by the potentials of the start, by a kernel that reads the tape of ctx."""
     (tape,) = ctx.saved_tensors
     by_spikes = _rows(grads[0], ctx.channels_last)
     by_v = _flat(grads[1], ctx.channels_last).clone()  # becomes the gradient by v of the start
     by_currents = torch.empty_like(by_spikes)
     kind = by_spikes.numpy().dtype.type
-    kernel(by_spikes.numpy(), tape.numpy(), by_currents.numpy(), by_v.numpy(), *map(kind, constants))
+    kernel(by_spikes.numpy(), tape.numpy(), by_currents.numpy(), by_v.numpy(), *map(kind, constants), *flags.values())
     shape = grads[0].shape
     return _shaped(by_currents, shape, ctx.channels_last), _shaped(by_v, shape[1:], ctx.channels_last)
 
@@ -240,8 +241,8 @@ def _forward_graded(
 
 
 @compiled
-def _backward_arctan(
-    by_spikes: Array, distances: Array, by_currents: Array, by_v: Array, decay: Any, width: Any
+def _backward_graded(
+    by_spikes: Array, distances: Array, by_currents: Array, by_v: Array, decay: Any, width: Any, arctan: bool
 ) -> None:  # pragma: no cover (machine code)
     steps, n = by_spikes.shape
     one, none = by_v.dtype.type(1), by_v.dtype.type(0)
@@ -252,27 +253,11 @@ def _backward_arctan(
         for t in range(steps - 1, -1, -1):
             pull, distance, out = by_spikes[t, start:stop], distances[t, start:stop], by_currents[t, start:stop]
             for i in range(stop - start):
-                far = per_width * distance[i]
-                kept = none if distance[i] >= none else one
-                u = pull[i] / (width * (one + far * far)) + carried[i] * kept
-                out[i] = u
-                carried[i] = decay * u
-
-
-@compiled
-def _backward_triangle(
-    by_spikes: Array, distances: Array, by_currents: Array, by_v: Array, decay: Any, width: Any
-) -> None:  # pragma: no cover (machine code)
-    steps, n = by_spikes.shape
-    one, none = by_v.dtype.type(1), by_v.dtype.type(0)
-    for start in range(0, n, _BLOCK):
-        stop = min(start + _BLOCK, n)
-        carried = by_v[start:stop]
-        for t in range(steps - 1, -1, -1):
-            pull, distance, out = by_spikes[t, start:stop], distances[t, start:stop], by_currents[t, start:stop]
-            for i in range(stop - start):
-                near = one - abs(distance[i]) / width
-                slope = near / width if near > none else none
+                if arctan:
+                    far = per_width * distance[i]
+                    slope = one / (width * (one + far * far))
+                else:
+                    slope = max(one - abs(distance[i]) / width, none) / width
                 kept = none if distance[i] >= none else one
                 u = pull[i] * slope + carried[i] * kept
                 out[i] = u
