@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import chain, pairwise
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -383,8 +384,10 @@ def test_the_paper_map_of_the_readme_names_only_what_exists():
     names = {name for row in rows for name in re.findall(r"`([a-z]+\.[\w.]+)`", row)}
     assert len(names) > 15
     for name in names:
-        module, *attributes = name.split(".")
-        found: object = importlib.import_module(f"neurove_core.{module}")
-        for attribute in attributes:
-            found = getattr(found, attribute, None) or getattr(found, "model_fields", {}).get(attribute)
+        found: object = neurove_core
+        for part in name.split("."):
+            if isinstance(found, ModuleType) and not hasattr(found, part):
+                found = importlib.import_module(f"{found.__name__}.{part}")
+            else:
+                found = getattr(found, part, None) or getattr(found, "model_fields", {}).get(part)
         assert found is not None, name
