@@ -8,8 +8,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from neurove_core.cells import ASLSTM, SLSTM, Readout
-    from neurove_core.neurons import ALIF, LIF, LTC
+    from neurove_core.spiking.aslstm import ASLSTM, SLSTM, Readout
+    from neurove_core.spiking.lif import ALIF, LIF, LTC
 
 __all__ = ["ALIF", "ASLSTM", "LIF", "LTC", "SLSTM", "Readout"]
 

@@ -9,18 +9,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from neurove_core import windows
-from neurove_core.bundle import PER_HEIGHT, Bundle
-from neurove_core.encoding import to_codes, to_counts, to_spikes
-from neurove_core.engine import Engine
-from neurove_core.geometry import lookup_table
-from neurove_core.network import NetworkState, NeuroVE
-from neurove_core.networks import State
-from neurove_core.windows import Pushed, Window, WindowsState
-from neurove_core.wire import read_packet
-from protocol import CameraInfo, Events, Sensor
-from protocol.errors import BadModel
-from protocol.events import EventPacket, Limits, WireEvents, encode_packet
+from neurove_core.engine.engine import Engine
+from neurove_core.geometry.camera import lookup_table
+from neurove_core.ingest import windows
+from neurove_core.ingest.windows import Pushed, Window, WindowsState
+from neurove_core.ingest.wire import read_packet
+from neurove_core.models.bundle import PER_HEIGHT, Bundle
+from neurove_core.networks.encoding import to_codes, to_counts, to_spikes
+from neurove_core.networks.kinds import State
+from neurove_core.networks.neurove import NetworkState, NeuroVE
+from neurove_protocol import CameraInfo, Events, Sensor
+from neurove_protocol.errors import BadModel
+from neurove_protocol.events import EventPacket, Limits, WireEvents, encode_packet
 
 
 class StreamState(NamedTuple):

@@ -1,6 +1,6 @@
 """What only an extra of this package brings, and how its absence is told."""
 
-from protocol.errors import NeuroVEError
+from neurove_protocol.errors import NeuroVEError
 
 
 class MissingExtra(NeuroVEError):

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from neurove_core.extras import MissingExtra
 from neurove_core.files import written_whole
-from protocol.errors import InvalidField
+from neurove_protocol.errors import InvalidField
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

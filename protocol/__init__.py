@@ -4,10 +4,10 @@ A driver or a consumer needs this package alone (numpy, msgpack, pydantic): impo
 zenoh. README.md beside this file is the contract.
 """
 
-from protocol.camera import CameraInfo
-from protocol.errors import NeuroVEError
-from protocol.events import EVENT_DTYPE, EventPacket, Events, Sensor
-from protocol.velocity import Flag, Trace, Twist, TwistEstimate
+from neurove_protocol.camera import CameraInfo
+from neurove_protocol.errors import NeuroVEError
+from neurove_protocol.events import EVENT_DTYPE, EventPacket, Events, Sensor
+from neurove_protocol.velocity import Flag, Trace, Twist, TwistEstimate
 
 __all__ = [
     "EVENT_DTYPE",

@@ -4,9 +4,9 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from protocol.codec import Message, Name
-from protocol.errors import InvalidField
-from protocol.events import Sensor
+from neurove_protocol.codec import Message, Name
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import Sensor
 
 SCHEMA = "application/msgpack;neurove.camera.1"
 """Zenoh Encoding of a CameraInfo."""

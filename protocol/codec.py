@@ -6,9 +6,9 @@ import msgpack
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import PydanticCustomError
 
-from protocol.errors import InvalidField, Malformed, UnsupportedVersion
-from protocol.fields import WrongField
-from protocol.keys import NAME_RULE, is_name
+from neurove_protocol.errors import InvalidField, Malformed, UnsupportedVersion
+from neurove_protocol.fields import WrongField
+from neurove_protocol.keys import NAME_RULE, is_name
 
 PROTOCOL_VERSION: Final = 1
 """Major version on the wire. Fields may be added within a version; readers of data messages ignore unknown ones."""

@@ -4,8 +4,8 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import ConfigDict, Field
 
-from protocol.codec import Count, Message, Name, Part
-from protocol.errors import NeuroVEError
+from neurove_protocol.codec import Count, Message, Name, Part
+from neurove_protocol.errors import NeuroVEError
 
 Verdict = Literal["ok", "lossy", "stalled", "idle"]
 

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from protocol.codec import Count, Message, Name, unpack, validate
-from protocol.errors import BlobLength, EventOutsideSensor, InvalidField, TimeBackwards, UnknownFormat
+from neurove_protocol.codec import Count, Message, Name, unpack, validate
+from neurove_protocol.errors import BlobLength, EventOutsideSensor, InvalidField, TimeBackwards, UnknownFormat
 
 EVENT_DTYPE = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1")])
 """One event as a record, for files and tables: t sensor clock [us], x and y [px], p polarity (1 ON, 0 OFF)."""

@@ -4,7 +4,7 @@ from typing import NamedTuple, Self
 
 from pydantic import ValidationError
 
-from protocol.errors import shown
+from neurove_protocol.errors import shown
 
 _MOST = 80  # characters of a field's name: an unknown one is the sender's, of any length
 

@@ -6,7 +6,7 @@ The `@node` chunk is what Zenoh calls verbatim: a wildcard never matches it, so 
 import re
 from dataclasses import dataclass
 
-from protocol.errors import InvalidField
+from neurove_protocol.errors import InvalidField
 
 DEFAULT_PREFIX = "neurove/v1"
 NAME_RULE = "1 to 64 characters of A-Z a-z 0-9 _ . - and no dot or dash first"

@@ -7,8 +7,8 @@ from typing import Annotated, ClassVar, NamedTuple, Self
 from pydantic import AfterValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from protocol.codec import Count, Int64, Message, Name, Part
-from protocol.errors import InvalidField
+from neurove_protocol.codec import Count, Int64, Message, Name, Part
+from neurove_protocol.errors import InvalidField
 
 SCHEMA = "application/msgpack;neurove.velocity.1"
 """Zenoh Encoding of a TwistEstimate."""

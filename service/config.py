@@ -17,10 +17,10 @@ from pydantic_settings import (
     TomlConfigSettingsSource,
 )
 
-from protocol.errors import NeuroVEError
-from protocol.events import Limits
-from protocol.fields import WrongField
-from protocol.keys import DEFAULT_PREFIX, Keys, check_name
+from neurove_protocol.errors import NeuroVEError
+from neurove_protocol.events import Limits
+from neurove_protocol.fields import WrongField
+from neurove_protocol.keys import DEFAULT_PREFIX, Keys, check_name
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 ENVIRONMENT = "NEUROVE_"

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from protocol.control import Latency
+from neurove_protocol.control import Latency
 
 
 def latency(latencies_ms: list[float]) -> Latency | None:

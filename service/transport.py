@@ -16,9 +16,9 @@ from typing import Any, NamedTuple, Self
 
 import zenoh
 
-from protocol.control import CONTROL_SCHEMA, PROGRESS_SCHEMA, ErrorReply, PeerError
-from protocol.errors import Busy, InternalError, NeuroVEError
-from service import logs
+from neurove_protocol.control import CONTROL_SCHEMA, PROGRESS_SCHEMA, ErrorReply, PeerError
+from neurove_protocol.errors import Busy, InternalError, NeuroVEError
+from neurove_service import logs
 
 log = logs.get(__name__)
 

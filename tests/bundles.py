@@ -9,10 +9,10 @@ import pytest
 import safetensors.torch
 import torch
 
-from neurove_core import bundle
-from neurove_core.bundle import Bundle
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from protocol.errors import BadModel
+from neurove_core.models import bundle
+from neurove_core.models.bundle import Bundle
+from neurove_protocol.errors import BadModel
 
 CONFIG = ModelConfig(
     window=WindowConfig(duration_us=10_000, bins=2),

@@ -10,7 +10,7 @@ import structlog
 import torch
 from hypothesis import settings
 
-from service import cli
+from neurove_service.cli import main
 
 torch.set_num_threads(1)
 
@@ -60,7 +60,7 @@ def run(capsys, logging_as_before, signals_as_before):
     """Runs one command in this process: its exit code, output and errors."""
 
     def call(*arguments):
-        code = cli.main([str(argument) for argument in arguments])
+        code = main.main([str(argument) for argument in arguments])
         return Ran(code, *capsys.readouterr())
 
     return call

@@ -8,10 +8,10 @@ import hdf5plugin
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core import rotations
-from neurove_core.geometry import Poses
+from neurove_core.geometry import rotations
+from neurove_core.geometry.camera import Poses
 from neurove_core.io import Imu, open_source, write_dsec
-from protocol import Events
+from neurove_protocol import Events
 from tests.builders import SENSOR, make_events
 
 DAY_US = 1_506_117_902_000_000

@@ -22,7 +22,7 @@ APART = ("neurove_core.training", "neurove_core.experiments")
 
 
 class Import(NamedTuple):
-    """One name that a module imports, such as `neurove_core.bundle.load`."""
+    """One name that a module imports, such as `neurove_core.models.bundle.load`."""
 
     line: int
     name: str
@@ -80,9 +80,11 @@ def why_not(path: Path, found: Import) -> str | None:
         if found.of(*APART) and not module.of(*APART):
             return "training and experiments are imported from inside themselves alone"
         return None
-    if found.lazy and (module.name == "service.cli" or module.name.startswith("service.commands_")):
+    if found.lazy and (
+        module.name == "neurove_service.cli.main" or module.name.startswith("neurove_service.commands_")
+    ):
         return None
-    if found.of("zenoh") and module.name != "service.transport":
+    if found.of("zenoh") and module.name != "neurove_service.transport":
         return "service imports zenoh in transport.py alone"
     if found.of(*APART):
         return "service imports neither training nor experiments; cli.py and its commands may, inside their functions"
@@ -108,7 +110,7 @@ def test_the_check_sees_the_whole_tree():
     seen = {path.parent.name for package in PRODUCT for path in (ROOT / package).rglob("*.py")}
     assert {"protocol", "neurove_core", "service"} <= seen
     bundle = (ROOT / "neurove_core" / "bundle.py").read_text()
-    assert {"torch", "neurove_core.networks.Network"} <= {one.name for one in imports_of(bundle, "neurove_core")}
+    assert {"torch", "neurove_core.networks.kinds.Network"} <= {one.name for one in imports_of(bundle, "neurove_core")}
 
 
 @pytest.mark.parametrize(
@@ -117,8 +119,8 @@ def test_the_check_sees_the_whole_tree():
         ("protocol/a.py", "import torch", "torch"),
         ("protocol/a.py", "import zenoh", "zenoh"),
         ("protocol/a.py", "from torch.nn import Module", "torch.nn.Module"),
-        ("protocol/a.py", "from neurove_core import bundle", "neurove_core.bundle"),
-        ("protocol/deep/er.py", "from service import stream", "service.stream"),
+        ("protocol/a.py", "from neurove_core import bundle", "neurove_core.models.bundle"),
+        ("protocol/deep/er.py", "from service import stream", "neurove_service.streams.stream"),
         ("protocol/a.py", "def f():\n    import torch  # here", "torch"),
         ("protocol/a.py", "if TYPE_CHECKING:\n    import torch  # here", "torch"),
         ("protocol/a.py", "try:\n    import scipy  # here\nexcept ImportError:\n    pass", "scipy"),
@@ -127,23 +129,35 @@ def test_the_check_sees_the_whole_tree():
         ("protocol/a.py", "from tests import builders", "tests.builders"),
         ("neurove_core/a.py", "import zenoh as z", "zenoh"),
         ("neurove_core/io/a.py", "from zenoh import Session", "zenoh.Session"),
-        ("neurove_core/a.py", "from service.stream import Stream", "service.stream.Stream"),
+        (
+            "neurove_core/a.py",
+            "from neurove_service.streams.stream import Stream",
+            "neurove_service.streams.stream.Stream",
+        ),
         ("neurove_core/a.py", "from neurove_core import training", "neurove_core.training"),
         ("neurove_core/a.py", "from . import experiments", "neurove_core.experiments"),
         ("neurove_core/io/a.py", "from ..training import loop", "neurove_core.training.loop"),
         ("neurove_core/a.py", "from .training.loop import fit", "neurove_core.training.loop.fit"),
-        ("neurove_core/trainings.py", "import neurove_core.experiments.sine", "neurove_core.experiments.sine"),
-        ("service/app.py", "import zenoh", "zenoh"),
-        ("service/app.py", "def f():\n    from zenoh import Config  # here", "zenoh.Config"),
+        (
+            "neurove_core/trainings.py",
+            "import neurove_core.experiments.sine.data",
+            "neurove_core.experiments.sine.data",
+        ),
+        ("service/node/app.py", "import zenoh", "zenoh"),
+        ("service/node/app.py", "def f():\n    from zenoh import Config  # here", "zenoh.Config"),
         ("service/dashboard/transport.py", "import zenoh", "zenoh"),
-        ("service/app.py", "from neurove_core.training import loop", "neurove_core.training.loop"),
+        ("service/node/app.py", "from neurove_core.training import loop", "neurove_core.training.loop"),
         ("service/transport.py", "def f():\n    import neurove_core.experiments  # here", "neurove_core.experiments"),
-        ("service/cli.py", "import zenoh", "zenoh"),
-        ("service/commands_asking.py", "import zenoh", "zenoh"),
+        ("service/cli/main.py", "import zenoh", "zenoh"),
+        ("service/cli/asking.py", "import zenoh", "zenoh"),
         ("service/commands/asking.py", "def f():\n    import zenoh  # here", "zenoh"),
-        ("service/cli.py", "class A:\n    from neurove_core import training  # here", "neurove_core.training"),
-        ("tests/service/test_a.py", "from service.stream import _Sequence", "service.stream._Sequence"),
-        ("tests/test_a.py", "import protocol._private", "protocol._private"),
+        ("service/cli/main.py", "class A:\n    from neurove_core import training  # here", "neurove_core.training"),
+        (
+            "tests/service/test_a.py",
+            "from neurove_service.streams.stream import _Sequence",
+            "neurove_service.streams.stream._Sequence",
+        ),
+        ("tests/test_a.py", "import neurove_protocol._private", "neurove_protocol._private"),
     ],
 )
 def test_a_planted_violation_is_caught_with_its_file_and_line(tmp_path, path, line, name):
@@ -159,16 +173,28 @@ def test_a_planted_violation_is_caught_with_its_file_and_line(tmp_path, path, li
 @pytest.mark.parametrize(
     ("path", "line"),
     [
-        ("protocol/a.py", "import json, numpy as np, msgpack, pydantic\nfrom protocol.errors import NeuroVEError"),
+        (
+            "protocol/a.py",
+            "import json, numpy as np, msgpack, pydantic\nfrom neurove_protocol.errors import NeuroVEError",
+        ),
         ("protocol/a.py", "from . import errors\nfrom .errors import shown"),
-        ("neurove_core/a.py", "import torch, numba\nfrom protocol import Events\nfrom neurove_core.bundle import _x"),
+        (
+            "neurove_core/a.py",
+            "import torch, numba\nfrom protocol import Events\nfrom neurove_core.models.bundle import _x",
+        ),
         ("neurove_core/training/loop.py", "from neurove_core.training import dataset\nfrom . import dataset as d"),
-        ("neurove_core/experiments/sine.py", "from neurove_core.training import loop"),
+        ("neurove_core/experiments/sine/data.py", "from neurove_core.training import loop"),
         ("service/transport.py", "import zenoh\nfrom protocol import Twist"),
-        ("service/app.py", "from neurove_core.estimator import Estimator\nfrom service.transport import Transport"),
-        ("service/commands_experiments.py", "def train():\n    from neurove_core.training import loop"),
-        ("service/cli.py", "def train():\n    import zenoh\n    from neurove_core.training import loop"),
-        ("tests/live/test_a.py", "import zenoh, torch, service.cli\nfrom neurove_core.training import loop"),
+        (
+            "service/node/app.py",
+            "from neurove_core.estimator import Estimator\nfrom neurove_service.transport import Transport",
+        ),
+        ("service/cli/experiments.py", "def train():\n    from neurove_core.training import loop"),
+        ("service/cli/main.py", "def train():\n    import zenoh\n    from neurove_core.training import loop"),
+        (
+            "tests/live/test_a.py",
+            "import zenoh, torch, neurove_service.cli.main\nfrom neurove_core.training import loop",
+        ),
         ("tests/test_a.py", "from __future__ import annotations\nfrom protocol import __doc__\nimport _pytest"),
     ],
 )

@@ -16,7 +16,7 @@ def main() -> None:
         subprocess.run([*pip, "wheel", "--no-deps", "--wheel-dir", str(built), "."], check=True)
         (wheel,) = built.glob("neurove-*.whl")
         subprocess.run([*pip, "install", "--no-deps", "--target", str(unpacked), str(wheel)], check=True)
-        check = "import service.cli as cli; print(cli.__file__); cli.main(['--help'])"
+        check = "import neurove_service.cli.main as cli; print(cli.__file__); cli.main(['--help'])"
         told = subprocess.run(
             [sys.executable, "-c", check],
             cwd=folder,

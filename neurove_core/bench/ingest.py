@@ -9,16 +9,17 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neurove_core import bundle, io
+from neurove_core import io
 from neurove_core.bench import Row, interleaved, peers, rows, window
 from neurove_core.config import ModelConfig
-from neurove_core.encoding import to_spikes_reference
 from neurove_core.estimator import Estimator
-from neurove_core.geometry import lookup_table
-from neurove_core.kernels import compiled, count_events, count_events_reference
-from neurove_core.network import NeuroVE
-from neurove_core.neurons import plain
-from protocol import Events, Sensor
+from neurove_core.geometry.camera import lookup_table
+from neurove_core.ingest.counting import compiled, count_events, count_events_reference
+from neurove_core.models import bundle
+from neurove_core.networks.encoding import to_spikes_reference
+from neurove_core.networks.neurove import NeuroVE
+from neurove_core.spiking.lif import plain
+from neurove_protocol import Events, Sensor
 
 SENSOR = Sensor(346, 260)
 BINS, DURATION_US = 10, 50_000

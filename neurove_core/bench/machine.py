@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from neurove_core.config import ModelConfig
-from neurove_core.network import NeuroVE
+from neurove_core.networks.neurove import NeuroVE
 
 _SIDE = 1024
 

@@ -14,8 +14,8 @@ from typing import Any, Final
 import torch
 from torch import Tensor, nn
 
-from neurove_core.network import NeuroVE, SpikingBlock
-from neurove_core.neurons import LIFState
+from neurove_core.networks.neurove import NeuroVE, SpikingBlock
+from neurove_core.spiking.lif import LIFState
 
 Missing = list[str]
 """Names of peers that could not be loaded, and why."""

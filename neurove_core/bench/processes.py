@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neurove_core import bundle
 from neurove_core.bench import Row
 from neurove_core.bench.window import SHIPPED, TINY, draw
-from neurove_core.engine import Engine
-from neurove_core.network import NetworkState, NeuroVE
+from neurove_core.engine.engine import Engine
+from neurove_core.models import bundle
+from neurove_core.networks.neurove import NetworkState, NeuroVE
 
 PROCESSES: Final = 2
 WINDOWS: Final = 300  # of one process in one run

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neurove_core.bench import Row, interleaved
-from neurove_core.sim.camera import as_image, named_camera, rays_of
-from neurove_core.sim.generated import driving
-from neurove_core.sim.pixels import QUIET, at_rest, events_of, make_pixels
+from neurove_core.sim.motion.generated import driving
+from neurove_core.sim.render.camera import as_image, named_camera, rays_of
+from neurove_core.sim.render.pixels import QUIET, at_rest, events_of, make_pixels
 from neurove_core.sim.simulate import Simulation, simulate
 
 FRAME_US: Final = 2_000

@@ -4,10 +4,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neurove_core import recurrence
 from neurove_core.bench import Row, interleaved
-from neurove_core.cells import ASLSTMParams, ASLSTMState, aslstm_step, readout_step
-from neurove_core.neurons import diffuse
+from neurove_core.spiking.aslstm import ASLSTMParams, ASLSTMState, aslstm_step, readout_step
+from neurove_core.spiking.fused import recurrence
+from neurove_core.spiking.lif import diffuse
 
 HIDDEN, BATCH, STEPS = 51, 16, 100
 V_TH = 0.3

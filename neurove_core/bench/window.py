@@ -7,12 +7,13 @@ from typing import Final, cast
 import torch
 from torch import Tensor
 
-from neurove_core import bundle, int8
 from neurove_core.bench import Row, interleaved, machine, peers, rows
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from neurove_core.engine import Engine
-from neurove_core.network import NetworkState, NeuroVE
-from neurove_core.neurons import plain
+from neurove_core.engine import int8
+from neurove_core.engine.engine import Engine
+from neurove_core.models import bundle
+from neurove_core.networks.neurove import NetworkState, NeuroVE
+from neurove_core.spiking.lif import plain
 
 REFERENCE = ModelConfig(
     window=WindowConfig(bins=10),

@@ -17,12 +17,13 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
-from neurove_core import int8, scan, sparse
-from neurove_core.activations import fused, sigmoid, tanh
-from neurove_core.cells import ASLSTM, ASLSTMParams, ASLSTMState, aslstm_step, readout_step
-from neurove_core.convolution import Convolution, convolution
-from neurove_core.network import NetworkState, NeuroVE, SpikingBlock
-from neurove_core.neurons import LIFParams, LIFState, diffuse, is_plain, lif_scan_reference
+from neurove_core.engine import int8, sparse
+from neurove_core.engine.convolution import Convolution, convolution
+from neurove_core.networks.neurove import NetworkState, NeuroVE, SpikingBlock
+from neurove_core.spiking.aslstm import ASLSTM, ASLSTMParams, ASLSTMState, aslstm_step, readout_step
+from neurove_core.spiking.fused import scan
+from neurove_core.spiking.fused.activations import fused, sigmoid, tanh
+from neurove_core.spiking.lif import LIFParams, LIFState, diffuse, is_plain, lif_scan_reference
 
 Array = NDArray[np.float32]
 

@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import conv2d, linear
 
-from neurove_core import sparse_int8
 from neurove_core.compiled import compiled
-from neurove_core.convolution import Convolution, say_once
-from neurove_core.neurons import LIFParams, LIFState, is_plain, lif_scan_reference
-from neurove_core.sparse import Fired, maps_of
-from neurove_core.vectors import LANES
+from neurove_core.engine import sparse_int8
+from neurove_core.engine.convolution import Convolution, say_once
+from neurove_core.engine.sparse import Fired, maps_of
+from neurove_core.engine.vectors import LANES
+from neurove_core.spiking.lif import LIFParams, LIFState, is_plain, lif_scan_reference
 
 LEVELS: Final = 32
 """Of the input per unit; log1p of a saturated count, 5.5, becomes 177."""

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neurove_core.compiled import compiled
-from neurove_core.convolution import LARGE, Convolution, say_once
-from neurove_core.neurons import LIFParams, LIFState
-from neurove_core.vectors import LANES, entry, fire, nothing, plus, plus_product, put, put_floats, tile_of
+from neurove_core.engine.convolution import LARGE, Convolution, say_once
+from neurove_core.engine.vectors import LANES, entry, fire, nothing, plus, plus_product, put, put_floats, tile_of
+from neurove_core.spiking.lif import LIFParams, LIFState
 
 Array = NDArray[np.float32]
 Places = NDArray[np.int32]

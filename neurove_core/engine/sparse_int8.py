@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neurove_core.compiled import compiled
-from neurove_core.convolution import LARGE, Convolution, say_once
-from neurove_core.neurons import LIFParams, LIFState
-from neurove_core.sparse import Array, Fired, Places, cells_of, in_maps, listed, maps_of, room_for, shape_after
-from neurove_core.vectors import (
+from neurove_core.engine.convolution import LARGE, Convolution, say_once
+from neurove_core.engine.sparse import Array, Fired, Places, cells_of, in_maps, listed, maps_of, room_for, shape_after
+from neurove_core.engine.vectors import (
     LANES,
     entry,
     fire,
@@ -42,6 +41,7 @@ from neurove_core.vectors import (
     scaled,
     tile_of,
 )
+from neurove_core.spiking.lif import LIFParams, LIFState
 
 Codes = NDArray[np.uint8]
 

@@ -10,10 +10,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.geometry import undistort
-from neurove_core.kernels import compiled
-from protocol import CameraInfo, Events
-from protocol.errors import InvalidField
+from neurove_core.geometry.camera import undistort
+from neurove_core.ingest.counting import compiled
+from neurove_protocol import CameraInfo, Events
+from neurove_protocol.errors import InvalidField
 
 Array = NDArray[np.float64]
 
@@ -253,7 +253,7 @@ def accumulate(
 
 def accumulate_reference(xs: Array, ys: Array, times: Array, rate: Array, grid: Grid, image: Array) -> None:
     """What accumulate computes, in plain numpy."""
-    from neurove_core import rotations
+    from neurove_core.geometry import rotations
 
     rays = np.stack([xs, ys, np.ones_like(xs)], axis=1)
     turned = rotations.turn(rotations.exp(times[:, None] * rate), rays)

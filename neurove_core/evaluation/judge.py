@@ -8,15 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.estimator import Estimator, WindowEstimate
-from neurove_core.geometry import Twists
+from neurove_core.evaluation.metrics import ANGULAR_FLOOR_RAD_S, LINEAR_FLOOR_M_S, SKIP_S, figures
+from neurove_core.geometry.camera import Twists
 from neurove_core.io.packets import slices
 from neurove_core.io.recording import Recording
-from neurove_core.metrics import ANGULAR_FLOOR_RAD_S, LINEAR_FLOOR_M_S, SKIP_S, figures
-from neurove_core.networks import State, fired
-from neurove_core.uncertainty import LEVEL, LEVELS, coverage
-from protocol.camera import CameraInfo
-from protocol.errors import NeuroVEError
-from protocol.velocity import AXES
+from neurove_core.models.uncertainty import LEVEL, LEVELS, coverage
+from neurove_core.networks.kinds import State, fired
+from neurove_protocol.camera import CameraInfo
+from neurove_protocol.errors import NeuroVEError
+from neurove_protocol.velocity import AXES
 
 _SAMPLES = 4  # of the truth in each bin, whose mean is the bin's
 _STREAM = "evaluate"

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.velocity import AXES
+from neurove_protocol.velocity import AXES
 
 LINEAR, ANGULAR = slice(0, 3), slice(3, 6)
 

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from neurove_core.evaluation import Judged
+from neurove_core.evaluation.judge import Judged
 from neurove_core.figures import blank_figure, save_figure
-from neurove_core.uncertainty import LEVEL, half_width
-from protocol.velocity import AXES
+from neurove_core.models.uncertainty import LEVEL, half_width
+from neurove_protocol.velocity import AXES
 
 _GAP_S = 0.2  # lines are broken where windows are missing for so long
 

@@ -18,8 +18,8 @@ from torch import Tensor
 
 from neurove_core.experiments import save_text
 from neurove_core.figures import blank_figure, save_figure
-from neurove_core.layers import require
-from neurove_core.neurons import (
+from neurove_core.spiking.layers import require
+from neurove_core.spiking.lif import (
     LIF,
     ALIFParams,
     LIFParams,

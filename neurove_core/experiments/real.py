@@ -13,17 +13,17 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.baselines import angular
 from neurove_core.estimator import Estimator
-from neurove_core.evaluation import NoTruth, answer
+from neurove_core.evaluation.contrast import angular
+from neurove_core.evaluation.judge import NoTruth, answer
+from neurove_core.evaluation.metrics import SKIP_S
 from neurove_core.experiments import save_text
 from neurove_core.io import open_source
 from neurove_core.io.recording import Recording
-from neurove_core.metrics import SKIP_S
-from neurove_core.sim.camera import CAMERAS
-from protocol import CameraInfo
-from protocol.errors import NeuroVEError
-from protocol.events import Events
+from neurove_core.sim.render.camera import CAMERAS
+from neurove_protocol import CameraInfo
+from neurove_protocol.errors import NeuroVEError
+from neurove_protocol.events import Events
 
 Array = NDArray[np.float64]
 

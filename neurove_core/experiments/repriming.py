@@ -18,16 +18,16 @@ import torch
 from numpy.typing import NDArray
 
 from neurove_core import models
-from neurove_core.bundle import Bundle, from_bytes
 from neurove_core.estimator import Estimator, StreamState
 from neurove_core.experiments import save_text
 from neurove_core.figures import blank_figure, save_figure
-from neurove_core.layers import require
+from neurove_core.ingest.windows import Window, WindowsState, push
+from neurove_core.models.bundle import Bundle, from_bytes
 from neurove_core.sim.simulate import Simulation
 from neurove_core.sim.source import simulation_of
+from neurove_core.spiking.layers import require
 from neurove_core.training.data import true_twists
-from neurove_core.windows import Window, WindowsState, push
-from protocol import Sensor
+from neurove_protocol import Sensor
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -6,10 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core import rotations
 from neurove_core.config import CanonicalConfig
-from protocol import CameraInfo, Sensor
-from protocol.errors import InvalidField
+from neurove_core.geometry import rotations
+from neurove_protocol import CameraInfo, Sensor
+from neurove_protocol.errors import InvalidField
 
 OUTSIDE = -1
 """Entry of a look-up table for a pixel that looks past the canonical camera's field of view."""

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.compiled import compiled
-from neurove_core.evt import (
+from neurove_core.geometry.camera import OUTSIDE as NO_CELL
+from neurove_core.io.formats.prophesee.evt import (
     ILLEGAL,
     OK,
     OUTSIDE,
@@ -26,9 +27,8 @@ from neurove_core.evt import (
     evt3_decode,
     evt3_reference,
 )
-from neurove_core.geometry import OUTSIDE as NO_CELL
-from neurove_core.triggers import TriggerState, evt2_triggers, evt3_triggers
-from protocol.events import Events
+from neurove_core.io.formats.prophesee.triggers import TriggerState, evt2_triggers, evt3_triggers
+from neurove_protocol.events import Events
 
 __all__ = [
     "ILLEGAL",

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.config import CanonicalConfig, WindowConfig
-from neurove_core.kernels import count_events
-from neurove_core.wire import count_wire
-from protocol import Events
-from protocol.events import WireEvents
+from neurove_core.ingest.counting import count_events
+from neurove_core.ingest.wire import count_wire
+from neurove_protocol import Events
+from neurove_protocol.events import WireEvents
 
 
 class Window(NamedTuple):

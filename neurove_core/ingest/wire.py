@@ -1,6 +1,6 @@
 """From a packet's bytes to a window's counts without columns in between: the service's way in.
 
-`protocol.decode_packet` and `kernels.count_events` are the plain twin: they refuse the same packets by the same
+`neurove_protocol.decode_packet` and `kernels.count_events` are the plain twin: they refuse the same packets by the same
 sentences and count the same, bit for bit.
 """
 
@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.compiled import compiled
-from protocol.events import DEFAULT_LIMITS, Limits, Sensor, WireEvents, WirePacket, decode_packet, open_packet
-from protocol.keys import is_name
+from neurove_protocol.events import DEFAULT_LIMITS, Limits, Sensor, WireEvents, WirePacket, decode_packet, open_packet
+from neurove_protocol.keys import is_name
 
 _BLOCK: Final = 512  # as in kernels
 

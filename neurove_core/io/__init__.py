@@ -2,26 +2,26 @@
 
 from pathlib import Path
 
-from neurove_core.io.aedat2 import Aedat2Recording
-from neurove_core.io.aedat4 import Aedat4Recording
-from neurove_core.io.carla import CarlaRecording
-from neurove_core.io.dat import DatRecording
-from neurove_core.io.datasets import open_hdf5
-from neurove_core.io.dsec_write import write_dsec
-from neurove_core.io.ecd import EcdRecording
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
-from neurove_core.io.evbench import EvbenchRecording
-from neurove_core.io.eventstream import EventStreamRecording
-from neurove_core.io.mcap_file import McapFile
-from neurove_core.io.mcap_layout import PROFILE
-from neurove_core.io.mcap_recording import McapRecording, RecordedPacket
-from neurove_core.io.mcap_write import PacketWriter, write_mcap
-from neurove_core.io.pattern import Pattern
+from neurove_core.io.formats.aedat.aedat2 import Aedat2Recording
+from neurove_core.io.formats.aedat.aedat4 import Aedat4Recording
+from neurove_core.io.formats.carla import CarlaRecording
+from neurove_core.io.formats.containers.mcap import McapFile
+from neurove_core.io.formats.ecd import EcdRecording
+from neurove_core.io.formats.evbench import EvbenchRecording
+from neurove_core.io.formats.eventstream import EventStreamRecording
+from neurove_core.io.formats.hdf5.datasets import open_hdf5
+from neurove_core.io.formats.hdf5.dsec_write import write_dsec
+from neurove_core.io.formats.packet_log.layout import PROFILE
+from neurove_core.io.formats.packet_log.reader import McapRecording, RecordedPacket
+from neurove_core.io.formats.packet_log.writer import PacketWriter, write_mcap
+from neurove_core.io.formats.pattern import Pattern
+from neurove_core.io.formats.prophesee.dat import DatRecording
+from neurove_core.io.formats.prophesee.raw import PropheseeRecording
+from neurove_core.io.formats.ros.recording import RosbagRecording
 from neurove_core.io.poses import read_poses
-from neurove_core.io.prophesee import PropheseeRecording
 from neurove_core.io.recording import SUPPORTED, EventsOnly, Frame, Imu, Recording, Triggers, refuse_topic
-from neurove_core.io.rosbag import RosbagRecording
-from protocol.events import Sensor
+from neurove_protocol.events import Sensor
 
 __all__ = [
     "SUPPORTED",

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from protocol.errors import NeuroVEError
+from neurove_protocol.errors import NeuroVEError
 
 
 class UnknownSource(NeuroVEError):

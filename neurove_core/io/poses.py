@@ -12,12 +12,12 @@ from typing import Any, Final, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core import rotations
-from neurove_core.geometry import Poses
-from neurove_core.io import hdf5
+from neurove_core.geometry import rotations
+from neurove_core.geometry.camera import Poses
 from neurove_core.io.errors import UnknownSource
+from neurove_core.io.formats.hdf5 import file as hdf5
 from neurove_core.io.recording import SUPPORTED
-from protocol.errors import InvalidField
+from neurove_protocol.errors import InvalidField
 
 MAX_POSES: Final = 1 << 22
 """Most poses that a file may have: 250 MB of them, as 5.8 hours at 200 Hz."""

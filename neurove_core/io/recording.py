@@ -8,10 +8,10 @@ from typing import Final, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.geometry import Poses, Twists
+from neurove_core.geometry.camera import Poses, Twists
 from neurove_core.io.errors import UnknownSource
-from protocol.camera import CameraInfo
-from protocol.events import Events, Sensor
+from neurove_protocol.camera import CameraInfo
+from neurove_protocol.events import Events, Sensor
 
 CHUNK_EVENTS: Final = 1 << 18
 """Most events in one chunk; 13 bytes each, so 3.4 MB."""

@@ -4,8 +4,8 @@ import functools
 from pathlib import Path
 from typing import Final
 
-from neurove_core import bundle
-from neurove_core.bundle import Bundle
+from neurove_core.models import bundle
+from neurove_core.models.bundle import Bundle
 
 DEFAULT: Final = "default"
 """The model that serves where no other is named: how it was trained is in README.md."""

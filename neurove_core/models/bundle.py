@@ -17,17 +17,18 @@ from pydantic import Field, ValidationError, ValidationInfo, field_validator
 from safetensors import SafetensorError
 from torch import Tensor, nn
 
-from neurove_core import golden, networks
-from neurove_core.about import About, Limits
 from neurove_core.config import Config, ModelConfig
 from neurove_core.files import write_whole
-from neurove_core.golden import Golden
-from neurove_core.network import NeuroVE
-from neurove_core.networks import Network
-from neurove_core.uncertainty import Uncertainty, why_no_correlation
-from protocol.control import ModelInfo
-from protocol.errors import BadModel, shown
-from protocol.fields import WrongField
+from neurove_core.models import golden
+from neurove_core.models.about import About, Limits
+from neurove_core.models.golden import Golden
+from neurove_core.models.uncertainty import Uncertainty, why_no_correlation
+from neurove_core.networks import kinds
+from neurove_core.networks.kinds import Network
+from neurove_core.networks.neurove import NeuroVE
+from neurove_protocol.control import ModelInfo
+from neurove_protocol.errors import BadModel, shown
+from neurove_protocol.fields import WrongField
 
 BUNDLE_VERSION: Final = 1
 SUFFIX = ".safetensors"
@@ -254,13 +255,13 @@ def untrained(seed: int = 0, config: ModelConfig | None = None, name: str = "unt
     config = config or ModelConfig()
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        network = networks.make(config)
+        network = kinds.make(config)
         shape = (8, 4, 2 * config.window.bins, config.canonical.height, config.canonical.width)
         _take_statistics(network, torch.poisson(torch.full(shape, 0.3)).log1p())
     return Bundle(
         name=name,
         trained=False,
-        provenance=f"random weights, neurove_core.bundle.untrained(seed={seed}), torch {torch.__version__}",
+        provenance=f"random weights, neurove_core.models.bundle.untrained(seed={seed}), torch {torch.__version__}",
         config=config,
         network=network.eval(),
         offset=torch.zeros(6),
@@ -281,7 +282,7 @@ def _take_statistics(network: Network, spikes: Tensor) -> None:
 
 
 def _network(header: Header) -> Network:
-    network = networks.make(header.config)
+    network = kinds.make(header.config)
     if header.uncertainty is not None and isinstance(network, NeuroVE):
         network.add_spread()
     return network

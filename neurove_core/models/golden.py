@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from protocol import Events, Sensor
-from protocol.errors import BadModel
+from neurove_protocol import Events, Sensor
+from neurove_protocol.errors import BadModel
 
 if TYPE_CHECKING:  # an estimator has a bundle, and a bundle a golden test
     from neurove_core.config import ModelConfig

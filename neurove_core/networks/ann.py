@@ -6,9 +6,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from neurove_core import carried
-from neurove_core.cells import readout_step
 from neurove_core.config import ModelConfig
+from neurove_core.networks import state as carried
+from neurove_core.spiking.aslstm import readout_step
 
 
 class AnnState(NamedTuple):

@@ -7,10 +7,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from neurove_core import int8
-from neurove_core.kernels import compiled
-from neurove_core.sparse import Counts
-from neurove_core.vectors import BYTES, put_entries
+from neurove_core.engine import int8
+from neurove_core.engine.sparse import Counts
+from neurove_core.engine.vectors import BYTES, put_entries
+from neurove_core.ingest.counting import compiled
 
 
 def to_spikes(counts: Tensor, encoding: str) -> Tensor:

@@ -13,10 +13,10 @@ from typing import Final
 
 from torch import Tensor
 
-from neurove_core.ann import Ann, AnnState
 from neurove_core.config import ModelConfig
-from neurove_core.network import NetworkState, NeuroVE
-from neurove_core.snn_ang import SnnAng, SnnAngState
+from neurove_core.networks.ann import Ann, AnnState
+from neurove_core.networks.neurove import NetworkState, NeuroVE
+from neurove_core.networks.snn_ang import SnnAng, SnnAngState
 
 Network = NeuroVE | Ann | SnnAng
 State = NetworkState | AnnState | SnnAngState

@@ -7,11 +7,11 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, linear
 
-from neurove_core import carried
-from neurove_core.cells import ASLSTM, ASLSTMState, readout_step
 from neurove_core.config import ModelConfig
-from neurove_core.int8 import rounded, rounded_input
-from neurove_core.neurons import LIFParams, LIFState, diffuse, lif_scan
+from neurove_core.engine.int8 import rounded, rounded_input
+from neurove_core.networks import state as carried
+from neurove_core.spiking.aslstm import ASLSTM, ASLSTMState, readout_step
+from neurove_core.spiking.lif import LIFParams, LIFState, diffuse, lif_scan
 
 
 class NetworkState(NamedTuple):

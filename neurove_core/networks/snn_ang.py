@@ -13,10 +13,10 @@ from typing import Final, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from neurove_core import carried
-from neurove_core.cells import readout_step
 from neurove_core.config import ModelConfig
-from neurove_core.neurons import LIFParams, LIFState, lif_scan
+from neurove_core.networks import state as carried
+from neurove_core.spiking.aslstm import readout_step
+from neurove_core.spiking.lif import LIFParams, LIFState, lif_scan
 
 CHANNELS: Final = (16, 32, 64, 128, 256)
 """Of its five layers."""

@@ -13,7 +13,7 @@ S = TypeVar("S")
 def tensors_of(state: Any) -> Iterator[Tensor]:
     """All tensors of a state, in its order.
 
-    >>> from neurove_core.neurons import LIFState
+    >>> from neurove_core.spiking.lif import LIFState
     >>> [float(one) for one in tensors_of((LIFState(torch.tensor(1.0)), torch.tensor(2.0)))]
     [1.0, 2.0]
     """

@@ -9,13 +9,13 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.geometry import Twists
+from neurove_core.geometry.camera import Twists
 from neurove_core.io.recording import EventsOnly, in_chunks
-from neurove_core.sim.camera import Camera, Rays, rays_of
-from neurove_core.sim.cull import Candidates, candidates_of
-from neurove_core.sim.interval import GRIDS, run_tiles, tile_speeds
-from neurove_core.sim.path import Moving
-from neurove_core.sim.pixels import (
+from neurove_core.sim.motion.trajectory import Mounted, Trajectory
+from neurove_core.sim.render.camera import Camera, Rays, rays_of
+from neurove_core.sim.render.cull import Candidates, candidates_of
+from neurove_core.sim.render.interval import GRIDS, run_tiles, tile_speeds
+from neurove_core.sim.render.pixels import (
     USUAL,
     PixelConfig,
     Pixels,
@@ -26,14 +26,14 @@ from neurove_core.sim.pixels import (
     make_pixels,
     put_in_order,
 )
-from neurove_core.sim.render import render_all
-from neurove_core.sim.scene import Scene, named_scene
-from neurove_core.sim.textures import make_textures
-from neurove_core.sim.trajectory import Mounted, Trajectory
-from neurove_core.sim.views import Backdrop, World, views_of
-from protocol.camera import CameraInfo
-from protocol.errors import InvalidField
-from protocol.events import Events, Sensor
+from neurove_core.sim.render.render import render_all
+from neurove_core.sim.render.views import Backdrop, World, views_of
+from neurove_core.sim.world.path import Moving
+from neurove_core.sim.world.scene import Scene, named_scene
+from neurove_core.sim.world.textures import make_textures
+from neurove_protocol.camera import CameraInfo
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import Events, Sensor
 
 INTERVAL_US: Final = 20_000
 """How much time is simulated at once; a chunk of events."""

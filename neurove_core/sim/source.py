@@ -6,14 +6,14 @@ from urllib.parse import parse_qsl, urlsplit
 
 from neurove_core.io.errors import UnknownSource
 from neurove_core.io.recording import SUPPORTED
-from neurove_core.sim.camera import DEFAULT_CAMERA, DEFAULT_HEIGHT_M, named_camera
-from neurove_core.sim.curves import Mounted, Trajectory
-from neurove_core.sim.pixels import PixelConfig
-from neurove_core.sim.scene import named_scene
+from neurove_core.sim.motion.curves import Mounted, Trajectory
+from neurove_core.sim.motion.trajectory import parse_trajectory
+from neurove_core.sim.render.camera import DEFAULT_CAMERA, DEFAULT_HEIGHT_M, named_camera
+from neurove_core.sim.render.pixels import PixelConfig
 from neurove_core.sim.simulate import Simulation
-from neurove_core.sim.trajectory import parse_trajectory
-from protocol.errors import InvalidField
-from protocol.events import Sensor
+from neurove_core.sim.world.scene import named_scene
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import Sensor
 
 DEFAULT_SCENE: Final = "street"
 TRAJECTORY_OF: Final = {

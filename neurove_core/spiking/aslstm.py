@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from neurove_core.layers import (
+from neurove_core.spiking.layers import (
     drawn_weights,
     require,
     require_sequence,
@@ -15,7 +15,7 @@ from neurove_core.layers import (
     require_width,
     scan_of,
 )
-from neurove_core.surrogate import Surrogate, spike
+from neurove_core.spiking.surrogate import Surrogate, spike
 
 
 class ASLSTMState(NamedTuple):

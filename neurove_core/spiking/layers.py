@@ -7,8 +7,8 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, nn
 
-from neurove_core.surrogate import SURROGATES
-from protocol.errors import InvalidField
+from neurove_core.spiking.surrogate import SURROGATES
+from neurove_protocol.errors import InvalidField
 
 StateT = TypeVar("StateT", bound=tuple[Any, ...])
 ParamsT = TypeVar("ParamsT")

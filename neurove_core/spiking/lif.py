@@ -14,8 +14,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
-from neurove_core import scan
-from neurove_core.layers import (
+from neurove_core.spiking.fused import scan
+from neurove_core.spiking.layers import (
     drawn_weights,
     require,
     require_sequence,
@@ -24,7 +24,7 @@ from neurove_core.layers import (
     require_width,
     scan_of,
 )
-from neurove_core.surrogate import Surrogate, spike
+from neurove_core.spiking.surrogate import Surrogate, spike
 
 
 class LIFParams(NamedTuple):

@@ -6,7 +6,7 @@ from typing import Any, Literal, get_args
 import torch
 from torch import Tensor
 
-from protocol.errors import InvalidField
+from neurove_protocol.errors import InvalidField
 
 Surrogate = Literal["rectangular", "arctan", "triangle"]
 SURROGATES: tuple[str, ...] = get_args(Surrogate)

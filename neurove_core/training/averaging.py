@@ -7,13 +7,14 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from neurove_core import golden, networks
-from neurove_core.about import About, MadeBy
-from neurove_core.bundle import Bundle
 from neurove_core.estimator import Estimator
+from neurove_core.models import golden
+from neurove_core.models.about import About, MadeBy
+from neurove_core.models.bundle import Bundle
+from neurove_core.networks import kinds
 from neurove_core.training.loop import commit
 from neurove_core.training.run import check_same_network
-from protocol.errors import BadModel, InvalidField
+from neurove_protocol.errors import BadModel, InvalidField
 
 _PROVENANCE_CHARS: Final = 1000
 _MOST: Final = 8
@@ -41,7 +42,7 @@ def average(bundles: Sequence[Bundle]) -> Bundle:
             torch.equal(one.offset, last.offset) and torch.equal(one.scale, last.scale)
         ):
             raise BadModel(one.name, f"its outputs are scaled otherwise than those of {last.digest[:12]}")
-    network = networks.make(last.config)
+    network = kinds.make(last.config)
     network.load_state_dict({name: _mean(bundles, name) for name in network.state_dict()})
     of = ", ".join(one.digest[:12] for one in bundles)
     made = replace(

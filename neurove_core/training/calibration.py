@@ -21,19 +21,19 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from neurove_core import golden
-from neurove_core.bundle import PER_HEIGHT, Bundle
-from neurove_core.encoding import to_spikes
-from neurove_core.engine import Engine
+from neurove_core.engine.engine import Engine
 from neurove_core.estimator import Estimator
-from neurove_core.network import NeuroVE
+from neurove_core.models import golden
+from neurove_core.models.bundle import PER_HEIGHT, Bundle
+from neurove_core.models.uncertainty import LEVEL, LEVELS, Uncertainty, half_width
+from neurove_core.networks.encoding import to_spikes
+from neurove_core.networks.neurove import NeuroVE
 from neurove_core.training.batches import mirrored, noisy, regained
 from neurove_core.training.config import DataConfig, TrainingConfig
 from neurove_core.training.data import Cache, Sequences
 from neurove_core.training.loop import commit
-from neurove_core.uncertainty import LEVEL, LEVELS, Uncertainty, half_width
-from protocol.errors import BadModel, InvalidField
-from protocol.velocity import AXES
+from neurove_protocol.errors import BadModel, InvalidField
+from neurove_protocol.velocity import AXES
 
 SEQUENCES: Final = 96
 UNCERTAIN_ABOVE: Final = 0.3

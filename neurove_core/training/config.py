@@ -7,8 +7,8 @@ from typing import Annotated, Final, Self
 from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
 from neurove_core.config import Config, ModelConfig
-from protocol.errors import InvalidField
-from protocol.fields import WrongField
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.fields import WrongField
 
 CONFIGS: Final = Path(__file__).parent / "configs"
 """The configurations that come with the package, by name."""

@@ -19,19 +19,19 @@ import safetensors
 import safetensors.numpy
 from numpy.typing import ArrayLike, NDArray
 
-from neurove_core import windows
 from neurove_core.config import ModelConfig
 from neurove_core.files import write_whole
-from neurove_core.geometry import lookup_table
+from neurove_core.geometry.camera import lookup_table
+from neurove_core.ingest import windows
+from neurove_core.ingest.windows import WindowsState
 from neurove_core.io.errors import BrokenRecording
-from neurove_core.sim.camera import Camera, named_camera
-from neurove_core.sim.path import Moving
-from neurove_core.sim.pixels import PixelConfig
-from neurove_core.sim.scene import named_scene
+from neurove_core.sim.motion.trajectory import Mounted, Trajectory, driving, hand_held, rotation
+from neurove_core.sim.render.camera import Camera, named_camera
+from neurove_core.sim.render.pixels import PixelConfig
 from neurove_core.sim.simulate import Simulation
-from neurove_core.sim.trajectory import Mounted, Trajectory, driving, hand_held, rotation
+from neurove_core.sim.world.path import Moving
+from neurove_core.sim.world.scene import named_scene
 from neurove_core.training.config import DataConfig, Span, TrainingConfig
-from neurove_core.windows import WindowsState
 
 FORMAT: Final = 1
 """Of the files; part of their folder's name."""

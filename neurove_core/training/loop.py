@@ -14,18 +14,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from neurove_core import bundle, golden
-from neurove_core.about import About, MadeBy
-from neurove_core.bundle import Bundle
-from neurove_core.carried import detached
-from neurove_core.encoding import to_spikes
 from neurove_core.estimator import Estimator
 from neurove_core.files import write_whole
-from neurove_core.loss import group_loss, scaled_sum
+from neurove_core.models import bundle, golden
+from neurove_core.models.about import About, MadeBy
+from neurove_core.models.bundle import Bundle
+from neurove_core.networks.encoding import to_spikes
+from neurove_core.networks.state import detached
 from neurove_core.training.batches import Segment, draw
 from neurove_core.training.config import RecipeConfig, TrainingConfig
 from neurove_core.training.curve import Scalars, draw_curve
 from neurove_core.training.data import Cache, Sequences
+from neurove_core.training.loss import group_loss, scaled_sum
 from neurove_core.training.ranks import Ranks, together
 from neurove_core.training.recorded import Recorded
 from neurove_core.training.run import Run

@@ -21,7 +21,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
-from protocol.errors import InvalidField, NeuroVEError
+from neurove_protocol.errors import InvalidField, NeuroVEError
 
 _TIMEOUT: Final = timedelta(minutes=10)  # of one exchange; a rank that died is noticed at once
 

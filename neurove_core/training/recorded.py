@@ -14,15 +14,15 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core import windows
 from neurove_core.files import write_whole
-from neurove_core.geometry import Twists, lookup_table, twists
+from neurove_core.geometry.camera import Twists, lookup_table, twists
+from neurove_core.ingest import windows
+from neurove_core.ingest.windows import Window, WindowsState
 from neurove_core.io import Recording, UnknownSource, open_source, read_poses
 from neurove_core.io.recording import SUPPORTED
 from neurove_core.training.config import RecordedConfig, TrainingConfig
 from neurove_core.training.data import FORMAT, Sequence, save
-from neurove_core.windows import Window, WindowsState
-from protocol.errors import InvalidField
+from neurove_protocol.errors import InvalidField
 
 INDEX: Final = "index.json"
 """Written last: how many windows each sequence of a recording has."""

@@ -17,18 +17,18 @@ import torch
 from pydantic import ValidationError
 from torch import Tensor, nn
 
-from neurove_core import networks
-from neurove_core.about import About
-from neurove_core.bundle import PER_HEIGHT, Bundle
 from neurove_core.config import ModelConfig
 from neurove_core.files import write_whole
-from neurove_core.loss import Balance
-from neurove_core.networks import Network
+from neurove_core.models.about import About
+from neurove_core.models.bundle import PER_HEIGHT, Bundle
+from neurove_core.networks import kinds
+from neurove_core.networks.kinds import Network
 from neurove_core.training.config import RecipeConfig, TrainingConfig
 from neurove_core.training.data import Sequences
+from neurove_core.training.loss import Balance
 from neurove_core.training.ranks import ALONE, Ranks, share_norms
-from protocol.errors import BadModel, InvalidField
-from protocol.fields import WrongField
+from neurove_protocol.errors import BadModel, InvalidField
+from neurove_protocol.fields import WrongField
 
 _KEY = "neurove_run"
 _SYMMETRIC = [0, 4, 5]  # vx wy wz: as often to one side as to the other, for half of what is seen is mirrored
@@ -86,7 +86,7 @@ class Run:
 
     def bundle(self, provenance: str, about: About | None = None) -> Bundle:
         """The model as it is now."""
-        network = networks.make(self.config.model)
+        network = kinds.make(self.config.model)
         network.load_state_dict(self.network.state_dict())
         return Bundle(
             name=self.config.name,
@@ -188,7 +188,7 @@ def _network(config: TrainingConfig, ranks: Ranks) -> tuple[Network, torch.optim
         raise InvalidField("training", "devices", ranks.count, bound)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.recipe.seed)
-        network = networks.make(config.model)
+        network = kinds.make(config.model)
     for norm in network.modules():
         if isinstance(norm, nn.BatchNorm1d | nn.BatchNorm2d):
             norm.momentum = config.recipe.norm_momentum

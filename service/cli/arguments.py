@@ -7,10 +7,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from protocol import Sensor
-from protocol.errors import NeuroVEError
-from service import logs
-from service.config import ClientConfig, ServiceConfig, load
+from neurove_protocol import Sensor
+from neurove_protocol.errors import NeuroVEError
+from neurove_service import logs
+from neurove_service.config import ClientConfig, ServiceConfig, load
 
 BAD_NEWS: Final = 1
 WRONG_USAGE: Final = 2

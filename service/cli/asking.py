@@ -8,17 +8,17 @@ import threading
 from collections.abc import Callable
 from typing import Any
 
-from protocol import TwistEstimate
-from protocol.codec import MessageT
-from protocol.control import StreamStatus
-from service.arguments import BAD_NEWS, add_client_flags, client_config, command
-from service.config import ClientConfig
-from service.lifecycle import stop_on_signals
+from neurove_protocol import TwistEstimate
+from neurove_protocol.codec import MessageT
+from neurove_protocol.control import StreamStatus
+from neurove_service.cli.arguments import BAD_NEWS, add_client_flags, client_config, command
+from neurove_service.config import ClientConfig
+from neurove_service.lifecycle import stop_on_signals
 
 
 def watch(args: argparse.Namespace) -> int:
     """Live estimates of all streams."""
-    from service import ask
+    from neurove_service.clients import ask
 
     stop = stop_on_signals()
     config = client_config(args)
@@ -34,7 +34,7 @@ def watch(args: argparse.Namespace) -> int:
 def _watch_lines(args: argparse.Namespace, config: ClientConfig, transport: Any, stop: threading.Event) -> int:
     import queue
 
-    from service import ask
+    from neurove_service.clients import ask
 
     estimates: queue.SimpleQueue[TwistEstimate] = queue.SimpleQueue()
     ask.listen(transport, config, estimates.put, _ignore_status)
@@ -61,8 +61,8 @@ def _line(estimate: TwistEstimate) -> str:
 def _watch_table(config: ClientConfig, transport: Any, stop: threading.Event) -> int:
     from rich.live import Live
 
-    from service import ask
-    from service.views import Board
+    from neurove_service.cli.views import Board
+    from neurove_service.clients import ask
 
     board = Board()
     ask.listen(transport, config, board.on_estimate, board.on_status)
@@ -73,7 +73,8 @@ def _watch_table(config: ClientConfig, transport: Any, stop: threading.Event) ->
 
 def health(args: argparse.Namespace) -> int:
     """How every node is."""
-    from service import ask, views
+    from neurove_service.cli import views
+    from neurove_service.clients import ask
 
     replies = _asked(args, ask.health, views.health_table)
     return 0 if all(reply.ok for reply in replies) else BAD_NEWS
@@ -81,7 +82,8 @@ def health(args: argparse.Namespace) -> int:
 
 def models(args: argparse.Namespace) -> int:
     """Which models every node has."""
-    from service import ask, views
+    from neurove_service.cli import views
+    from neurove_service.clients import ask
 
     _asked(args, ask.models, views.models_table)
     return 0
@@ -93,7 +95,7 @@ def _asked(
     table: Callable[[list[MessageT]], Any],
 ) -> list[MessageT]:
     """Every node's reply to a question, printed."""
-    from service import ask
+    from neurove_service.clients import ask
 
     config = client_config(args)
     with ask.connect(config) as transport:

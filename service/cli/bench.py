@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from protocol.errors import NeuroVEError
-from service.arguments import BAD_NEWS, command, commit
+from neurove_protocol.errors import NeuroVEError
+from neurove_service.cli.arguments import BAD_NEWS, command, commit
 
 if TYPE_CHECKING:
     from neurove_core.bench import Row
@@ -62,7 +62,7 @@ def bench(args: argparse.Namespace) -> int:
 
 def _rows(name: str, args: argparse.Namespace, missing: list[str]) -> Iterator["Row"]:
     from neurove_core.bench import ingest, processes, simulate, sine, window
-    from service import bench_wire
+    from neurove_service.clients import bench_wire
 
     options = {"quick": args.quick, "with_peers": args.peers}
     run: dict[str, Callable[[], list[Row]]] = {
@@ -93,7 +93,7 @@ def _narrow(args: argparse.Namespace, missing: list[str]) -> "list[Row]":
         missing.append(f"narrow (this machine is {platform.machine()}, AVX2 is x86-64's)")
         return []
     flags = [flag for flag, given in (("--peers", args.peers), ("--quick", args.quick)) if given]
-    command = [sys.executable, "-m", "service.cli", "bench", "window", "--json", *flags]
+    command = [sys.executable, "-m", "neurove_service.cli", "bench", "window", "--json", *flags]
     run = subprocess.run(command, env={**os.environ, **NARROW}, stdout=subprocess.PIPE, check=False)
     try:
         found = [Row(**row) for row in json.loads(run.stdout)]

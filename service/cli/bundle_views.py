@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from neurove_core.bundle import Bundle
+    from neurove_core.models.bundle import Bundle
 
 
 def about(found: "Bundle", data: bytes) -> dict[str, Any]:

@@ -11,9 +11,9 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from protocol.errors import BadModel, InvalidField, Untrusted
-from service.arguments import BAD_NEWS, Command, command
-from service.model_views import about, release_told, told
+from neurove_protocol.errors import BadModel, InvalidField, Untrusted
+from neurove_service.cli.arguments import BAD_NEWS, Command, command
+from neurove_service.cli.bundle_views import about, release_told, told
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
@@ -38,7 +38,7 @@ def _judging(run: Command) -> Command:
 
 def new_model(args: argparse.Namespace) -> int:
     """Write a bundle with random weights, to try a change of model with."""
-    from neurove_core import bundle
+    from neurove_core.models import bundle
 
     path: Path = args.file
     if path.suffix != bundle.SUFFIX:
@@ -55,7 +55,7 @@ def new_model(args: argparse.Namespace) -> int:
 @_judging
 def average_models(args: argparse.Namespace) -> int:
     """Write the mean of several trainings of one model; calibrate it, for its errors are its own."""
-    from neurove_core import bundle
+    from neurove_core.models import bundle
     from neurove_core.training.averaging import average
 
     path: Path = args.out
@@ -76,7 +76,7 @@ def average_models(args: argparse.Namespace) -> int:
 @_judging
 def inspect_model(args: argparse.Namespace) -> int:
     """What a bundle's file holds: header, tensors, digest, size, and who signed it."""
-    from neurove_core import bundle, manifest
+    from neurove_core.models import bundle, manifest
 
     data, signature = _bundle(args.file), _signature(args.file)
     trusted = [_public(path) for path in args.trust]
@@ -95,7 +95,7 @@ def inspect_model(args: argparse.Namespace) -> int:
 
 def keygen(args: argparse.Namespace) -> int:
     """Make a pair of keys: the private one signs models, nodes trust the public one."""
-    from neurove_core import signing_keys
+    from neurove_core.models import signing_keys
 
     key = signing_keys.new()
     private, public = args.out / f"{args.name}.key", args.out / f"{args.name}.pub"
@@ -121,8 +121,8 @@ def keygen(args: argparse.Namespace) -> int:
 @_judging
 def sign_model(args: argparse.Namespace) -> int:
     """Sign a bundle: writes BUNDLE.sig beside it."""
-    from neurove_core import bundle, manifest, signing_keys
     from neurove_core.files import write_whole
+    from neurove_core.models import bundle, manifest, signing_keys
 
     key = signing_keys.read_private(_read(args.key, signing_keys.MAX_KEY_BYTES), str(args.key))
     data, path = _bundle(args.bundle), args.bundle.with_name(args.bundle.name + manifest.SUFFIX)
@@ -143,8 +143,8 @@ def sign_model(args: argparse.Namespace) -> int:
 @_judging
 def verify_model(args: argparse.Namespace) -> int:
     """Whether a node that trusts these keys would take a bundle: signature, contents, golden test."""
-    from neurove_core import bundle, golden, manifest
     from neurove_core.estimator import Estimator
+    from neurove_core.models import bundle, golden, manifest
 
     data, name = _bundle(args.bundle), args.bundle.name
     trusted, signature = [_public(path) for path in args.trust], _signature(args.bundle)
@@ -171,7 +171,7 @@ def _read(path: Path, most: int) -> bytes:
 
 
 def _bundle(path: Path) -> bytes:
-    from neurove_core import bundle
+    from neurove_core.models import bundle
 
     data = _read(path, bundle.MAX_BYTES)
     if len(data) > bundle.MAX_BYTES:
@@ -181,7 +181,7 @@ def _bundle(path: Path) -> bytes:
 
 def _signature(path: Path) -> bytes | None:
     """The bytes of the signature file beside a bundle, or None; one byte more than allowed where it is too large."""
-    from neurove_core import manifest
+    from neurove_core.models import manifest
 
     try:
         with path.with_name(path.name + manifest.SUFFIX).open("rb") as file:
@@ -193,7 +193,7 @@ def _signature(path: Path) -> bytes | None:
 
 
 def _public(path: Path) -> "Ed25519PublicKey":
-    from neurove_core import signing_keys
+    from neurove_core.models import signing_keys
 
     return signing_keys.read_public(_read(path, signing_keys.MAX_KEY_BYTES), str(path))
 
@@ -234,7 +234,7 @@ def add(commands: Any) -> None:
 
 
 def _release(text: str) -> int:
-    from neurove_core.about import MAX_RELEASE
+    from neurove_core.models.about import MAX_RELEASE
 
     try:
         value = int(text)

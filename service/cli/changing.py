@@ -5,10 +5,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from protocol.control import CHUNK_SCHEMA, ActivateReply, ErrorReply, PeerError, ProgressReply, PushReply
-from protocol.errors import NeuroVEError
-from service.arguments import add_client_flags, client_config, command, seconds
-from service.config import ClientConfig
+from neurove_protocol.control import CHUNK_SCHEMA, ActivateReply, ErrorReply, PeerError, ProgressReply, PushReply
+from neurove_protocol.errors import NeuroVEError
+from neurove_service.cli.arguments import add_client_flags, client_config, command, seconds
+from neurove_service.config import ClientConfig
 
 Change = Callable[[Any, ClientConfig, str], None]
 """Changes one node over a transport, and prints how it goes."""
@@ -16,8 +16,8 @@ Change = Callable[[Any, ClientConfig, str], None]
 
 def push(args: argparse.Namespace) -> int:
     """Send a bundle to a node while it runs; with --activate it serves then."""
-    from service import ask
-    from service.push_source import PushSource
+    from neurove_service.clients import ask
+    from neurove_service.clients.push_source import PushSource
 
     with PushSource(args.bundle) as source:
 
@@ -35,7 +35,7 @@ def push(args: argparse.Namespace) -> int:
 
 def activate(args: argparse.Namespace) -> int:
     """Change the model of a node while it runs."""
-    from service import ask
+    from neurove_service.clients import ask
 
     def change(transport: Any, config: ClientConfig, node: str) -> None:
         wanted = {"expect": args.expect, "shadow_s": args.shadow, "canary": args.canary}
@@ -46,7 +46,7 @@ def activate(args: argparse.Namespace) -> int:
 
 def rollback(args: argparse.Namespace) -> int:
     """Put a node back to the model before, while it runs."""
-    from service import ask
+    from neurove_service.clients import ask
 
     def change(transport: Any, config: ClientConfig, node: str) -> None:
         _print(args, ask.rollback(transport, config, node, expect=args.expect, on_progress=_progress(args)))
@@ -56,7 +56,7 @@ def rollback(args: argparse.Namespace) -> int:
 
 def _each(args: argparse.Namespace, change: Change, prepare: Callable[[Any, Any], None] = lambda _, __: None) -> int:
     """Change one node after the other: what one refuses is not tried on the next."""
-    from service import ask
+    from neurove_service.clients import ask
 
     config = client_config(args)
     with ask.connect(config) as transport:

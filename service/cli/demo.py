@@ -18,14 +18,14 @@ from typing import Any
 from rich.console import Console
 from rich.live import Live
 
-from protocol import Flag
-from protocol.control import StreamStatus
-from protocol.errors import NeuroVEError
-from service import ask
-from service.config import ENVIRONMENT, ClientConfig
-from service.latency import latency
-from service.transport import Transport
-from service.views import Board
+from neurove_protocol import Flag
+from neurove_protocol.control import StreamStatus
+from neurove_protocol.errors import NeuroVEError
+from neurove_service.cli.views import Board
+from neurove_service.clients import ask
+from neurove_service.config import ENVIRONMENT, ClientConfig
+from neurove_service.latency import latency
+from neurove_service.transport import Transport
 
 STREAM = "cam0"
 _START_S = 90.0
@@ -101,7 +101,7 @@ def _free_port() -> int:
 @contextlib.contextmanager
 def _process(*arguments: str, stdout: int | None = None) -> Iterator[subprocess.Popen[str]]:
     """One of our commands as a child that ends with the block, and with us if we are killed."""
-    command = [sys.executable, "-m", "service.cli", *arguments, "--with-parent"]
+    command = [sys.executable, "-m", "neurove_service.cli", *arguments, "--with-parent"]
     quiet = {name: value for name, value in os.environ.items() if not name.startswith(ENVIRONMENT)}
     quiet |= {f"{ENVIRONMENT}LOG_LEVEL": "warning"}
     child = subprocess.Popen(

@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from service.arguments import command, commit
-from service.bars import progress
+from neurove_service.cli.arguments import command, commit
+from neurove_service.cli.bars import progress
 
 
 def reproduce_firing(args: argparse.Namespace) -> int:
@@ -46,7 +46,7 @@ def reproduce_sine(args: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    from neurove_core.experiments import sine_report
+    from neurove_core.experiments.sine import report as sine_report
 
     models, seeds = args.models.split(","), range(args.seed, args.seed + args.seeds)
     typed, made_by = shlex.join(["neurove", *sys.argv[1:]]), commit()
@@ -109,7 +109,9 @@ def reproduce_velocity(args: argparse.Namespace) -> int:
     """Tables III and IV: velocity by NeuroVE, NeuroVE w/o, its equal in ANN, SNN-ANG, and what learns nothing."""
     import torch
 
-    from neurove_core.experiments import velocity, velocity_figures, velocity_report
+    from neurove_core.experiments.velocity import figures as velocity_figures
+    from neurove_core.experiments.velocity import report as velocity_report
+    from neurove_core.experiments.velocity import run as velocity
 
     torch.set_num_threads(args.threads)
     config = velocity.base_config(args.config, args.steps, quick=args.quick)

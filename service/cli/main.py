@@ -11,19 +11,10 @@ import signal
 import sys
 from collections.abc import Sequence
 
-from protocol.control import PeerError
-from protocol.errors import NeuroVEError
-from service import (
-    commands_asking,
-    commands_bench,
-    commands_changing,
-    commands_experiments,
-    commands_models,
-    commands_recordings,
-    commands_running,
-    commands_training,
-)
-from service.arguments import BAD_NEWS, CONFLICT, WRONG_USAGE, Command
+from neurove_protocol.control import PeerError
+from neurove_protocol.errors import NeuroVEError
+from neurove_service.cli import asking, bench, bundles, changing, experiments, recordings, running, training
+from neurove_service.cli.arguments import BAD_NEWS, CONFLICT, WRONG_USAGE, Command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -57,14 +48,14 @@ def _parser() -> argparse.ArgumentParser:
         epilog="Settings come from defaults, then --config FILE (TOML), then NEUROVE_* variables, then flags.",
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    commands_running.add(commands)
-    commands_asking.add(commands)
-    commands_changing.add(commands)
-    commands_recordings.add(commands)
-    commands_training.add(commands)
-    commands_models.add(commands)
-    commands_experiments.add(commands)
-    commands_bench.add(commands)
+    running.add(commands)
+    asking.add(commands)
+    changing.add(commands)
+    recordings.add(commands)
+    training.add(commands)
+    bundles.add(commands)
+    experiments.add(commands)
+    bench.add(commands)
     return parser
 
 

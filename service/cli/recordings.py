@@ -11,10 +11,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from protocol.errors import InvalidField, NeuroVEError
-from protocol.keys import check_name
-from service.arguments import BAD_NEWS, add_client_flags, client_config, command, seconds, sensor_size
-from service.lifecycle import stop_on_signals
+from neurove_protocol.errors import InvalidField, NeuroVEError
+from neurove_protocol.keys import check_name
+from neurove_service.cli.arguments import BAD_NEWS, add_client_flags, client_config, command, seconds, sensor_size
+from neurove_service.lifecycle import stop_on_signals
 
 Progress = Callable[[int], None]
 """Events so far."""
@@ -29,8 +29,8 @@ class NothingRecorded(NeuroVEError):
 def record(args: argparse.Namespace) -> int:
     """Write what drivers publish into a file, until Ctrl-C."""
     from neurove_core.io import PacketWriter
-    from service import ask
-    from service.recorder import Recorder, as_json
+    from neurove_service.clients import ask
+    from neurove_service.clients.recorder import Recorder, as_json
 
     stop = stop_on_signals(with_parent=args.with_parent)
     config = client_config(args)
@@ -68,7 +68,7 @@ def _shown(path: Path) -> Iterator[Callable[[Any], None] | None]:
         return
     from rich.console import Console
 
-    from service.recorder import as_json
+    from neurove_service.clients.recorder import as_json
 
     with Console(stderr=True).status(f"recording {path}: waiting for packets") as status:
 
@@ -135,7 +135,7 @@ def info(args: argparse.Namespace) -> int:
     from rich.console import Console
 
     from neurove_core.io import open_source, summary
-    from service.views import survey_table
+    from neurove_service.cli.views import survey_table
 
     recording = open_source(args.source, args.sensor, args.topic)
     seconds = args.seconds if args.seconds is not None else (_ENDLESS_S if recording.endless else None)
@@ -173,7 +173,7 @@ def simulate(args: argparse.Namespace) -> int:
 
 def _simulate_carla(args: argparse.Namespace) -> int:
     """Record an event camera on a car of a running CARLA server, with its poses."""
-    from neurove_core.io.carla_server import record as record_carla
+    from neurove_core.io.formats.carla_server import record as record_carla
 
     host, _, port = args.server.rpartition(":")
     if not (host and port.isdecimal()):

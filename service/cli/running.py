@@ -7,9 +7,9 @@ import math
 import sys
 from typing import Any
 
-from protocol.errors import InvalidField
-from service import logs
-from service.arguments import (
+from neurove_protocol.errors import InvalidField
+from neurove_service import logs
+from neurove_service.cli.arguments import (
     BAD_NEWS,
     add_client_flags,
     add_service_flags,
@@ -20,8 +20,8 @@ from service.arguments import (
     seconds,
     speed,
 )
-from service.config import ServiceConfig, load
-from service.lifecycle import stop_on_signals
+from neurove_service.config import ServiceConfig, load
+from neurove_service.lifecycle import stop_on_signals
 
 DEFAULT_SOURCE = "sim://"
 _DEFAULT_DEMO_S = 20.0
@@ -36,7 +36,7 @@ def serve(args: argparse.Namespace) -> int:
 
     import torch  # late, for the clients' commands do without it
 
-    from service.app import Service
+    from neurove_service.node.app import Service
 
     torch.set_num_threads(1)
     sys.setswitchinterval(0.0005)  # Zenoh's threads wait for ours: 5 ms, the default, is a packet's period
@@ -55,7 +55,7 @@ def drive(args: argparse.Namespace) -> int:
     stop = stop_on_signals(with_parent=args.with_parent)
     config = client_config(args)
     recording = open_source(args.source, args.sensor, args.topic)
-    from service import ask
+    from neurove_service.clients import ask
 
     with ask.connect(config, patience_s=max(ask.CONNECT_S, args.wait), stop=stop) as transport:
         player = _player(args, recording, transport, config.keys)
@@ -78,8 +78,8 @@ def drive(args: argparse.Namespace) -> int:
 def _player(args: argparse.Namespace, recording: Any, transport: Any, keys: Any) -> Any:
     """A replay of packets for a recording of ours, a driver for every other; both are used alike."""
     from neurove_core.io import McapRecording
-    from service.driver import Driver
-    from service.replay import Replay
+    from neurove_service.clients.driver import Driver
+    from neurove_service.clients.replay import Replay
 
     if not isinstance(recording, McapRecording) or args.stream:  # another name stands in every packet: encoded anew
         return Driver(recording, args.stream or _STREAM, transport, keys)
@@ -94,7 +94,7 @@ def demo(args: argparse.Namespace) -> int:
     from rich.console import Console
 
     from neurove_core.io import open_source
-    from service import demo as demonstration
+    from neurove_service.cli import demo as demonstration
 
     stop = stop_on_signals()
     logs.configure("warning")

@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.arguments import command, sensor_size
-from service.bars import progress
+from neurove_service.cli.arguments import command, sensor_size
+from neurove_service.cli.bars import progress
 
 if TYPE_CHECKING:
-    from neurove_core.bundle import Bundle
+    from neurove_core.models.bundle import Bundle
 
 _CALIBRATION_SEQUENCES = 96
 
@@ -20,7 +20,8 @@ def train(args: argparse.Namespace) -> int:
     """Train a model on simulated sequences and recordings, from a configuration and its seed."""
     import torch
 
-    from neurove_core import bundle, models
+    from neurove_core import models
+    from neurove_core.models import bundle
     from neurove_core.training import config as configs
     from neurove_core.training import data, loop, ranks, recorded
     from neurove_core.training import run as runs
@@ -60,7 +61,8 @@ def calibrate(args: argparse.Namespace) -> int:
     """Give a trained model its uncertainty, fitted on simulated sequences that it never saw; its answers stay."""
     import torch
 
-    from neurove_core import bundle, models
+    from neurove_core import models
+    from neurove_core.models import bundle
     from neurove_core.training import config as configs
 
     torch.set_num_threads(1)
@@ -81,7 +83,7 @@ def calibrate(args: argparse.Namespace) -> int:
 
 def _calibrate(model: "Bundle", config: Any, folder: Path, count: int, workers: int, out: Path) -> Any:
     """Calibrate a model and write it; returns the report."""
-    from neurove_core import bundle
+    from neurove_core.models import bundle
     from neurove_core.training import calibration
 
     with progress() as show:
@@ -96,26 +98,28 @@ def evaluate(args: argparse.Namespace) -> int:
     """How far a model's estimates lie from the truth: RMSE and RE as in the paper, per axis and per group."""
     import torch
 
-    from neurove_core import evaluation, geometry, models
+    from neurove_core import models
     from neurove_core.estimator import Estimator
+    from neurove_core.evaluation import judge
+    from neurove_core.geometry import camera
     from neurove_core.io import open_source, read_poses
 
     torch.set_num_threads(1)
     estimator = Estimator(models.find(args.model))
     estimator.warm_up()
-    given = geometry.twists(read_poses(args.truth)) if args.truth else None
+    given = camera.twists(read_poses(args.truth)) if args.truth else None
     judged = []
     for source in args.recordings:
         recording = open_source(source, args.sensor, args.topic)
         truth = given or (None if recording.endless else recording.twists())
         if truth is None:
             why = "it never ends: say how many seconds" if recording.endless else "it holds no truth: give --truth FILE"
-            raise evaluation.NoTruth(f"{source}: {why}", source=source)
-        judged.append(evaluation.judge(evaluation.answer(estimator, recording), truth))
-    told = {"model": estimator.bundle.info.model_dump(), **evaluation.report(judged)}
+            raise judge.NoTruth(f"{source}: {why}", source=source)
+        judged.append(judge.judge(judge.answer(estimator, recording), truth))
+    told = {"model": estimator.bundle.info.model_dump(), **judge.report(judged)}
     print(json.dumps(told) if args.json else "\n".join(_table(told)))
     if args.plot:
-        from neurove_core.evaluation_plots import plot, plot_reliability
+        from neurove_core.evaluation.plots import plot, plot_reliability
 
         files = [file for one in judged for file in plot(one, args.plot)]
         if told["uncertainty"]:

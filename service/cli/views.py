@@ -12,10 +12,10 @@ from rich.table import Table
 from rich.text import Text
 
 from neurove_core.io.summary import Summary
-from protocol import Flag, Twist, TwistEstimate
-from protocol.control import HealthReply, ModelsReply, StreamStatus
-from protocol.velocity import AXES
-from service.latency import latency
+from neurove_protocol import Flag, Twist, TwistEstimate
+from neurove_protocol.control import HealthReply, ModelsReply, StreamStatus
+from neurove_protocol.velocity import AXES
+from neurove_service.latency import latency
 
 _VERDICT_STYLE = {"ok": "green", "lossy": "yellow", "stalled": "bold red", "idle": "dim"}
 _RATE_ESTIMATES = 40

@@ -4,9 +4,9 @@ import threading
 from collections.abc import Callable
 from typing import TypeVar
 
-from protocol import TwistEstimate
-from protocol.codec import Message
-from protocol.control import (
+from neurove_protocol import TwistEstimate
+from neurove_protocol.codec import Message
+from neurove_protocol.control import (
     PROGRESS_SCHEMA,
     ActivateReply,
     ActivateRequest,
@@ -22,10 +22,10 @@ from protocol.control import (
     RollbackRequest,
     StreamStatus,
 )
-from protocol.errors import NeuroVEError
-from service import logs
-from service.config import ClientConfig
-from service.transport import EndpointError, Transport, open_transport
+from neurove_protocol.errors import NeuroVEError
+from neurove_service import logs
+from neurove_service.config import ClientConfig
+from neurove_service.transport import EndpointError, Transport, open_transport
 
 log = logs.get(__name__)
 

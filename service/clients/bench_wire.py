@@ -15,15 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from neurove_core import windows
 from neurove_core.bench import Row
 from neurove_core.bench.ingest import DURATION_US, SENSOR, draw
 from neurove_core.config import ModelConfig
-from neurove_core.geometry import lookup_table
-from neurove_core.kernels import count_events_reference
-from neurove_core.wire import read_packet
-from protocol.events import SCHEMA, EventPacket, Events, encode_packet
-from service.transport import Transport, open_transport
+from neurove_core.geometry.camera import lookup_table
+from neurove_core.ingest import windows
+from neurove_core.ingest.counting import count_events_reference
+from neurove_core.ingest.wire import read_packet
+from neurove_protocol.events import SCHEMA, EventPacket, Events, encode_packet
+from neurove_service.transport import Transport, open_transport
 
 PACKET_US: Final = 1_000
 PATIENCE_S: Final = 20.0

@@ -8,12 +8,12 @@ from typing import NamedTuple
 
 from neurove_core.io import BrokenRecording, Recording
 from neurove_core.io.packets import Slice, slices
-from protocol import EventPacket, Events
-from protocol.camera import SCHEMA as CAMERA_SCHEMA
-from protocol.events import SCHEMA as EVENTS_SCHEMA
-from protocol.events import encode_packet
-from protocol.keys import Keys
-from service.transport import Transport
+from neurove_protocol import EventPacket, Events
+from neurove_protocol.camera import SCHEMA as CAMERA_SCHEMA
+from neurove_protocol.events import SCHEMA as EVENTS_SCHEMA
+from neurove_protocol.events import encode_packet
+from neurove_protocol.keys import Keys
+from neurove_service.transport import Transport
 
 POLL_S = 0.02
 

@@ -6,8 +6,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from protocol.control import MAX_SIGNATURE_BYTES, ChunkRequest, PushRequest
-from protocol.errors import BadModel, InvalidField
+from neurove_protocol.control import MAX_SIGNATURE_BYTES, ChunkRequest, PushRequest
+from neurove_protocol.errors import BadModel, InvalidField
 
 SIGNATURE = ".sig"
 

@@ -8,12 +8,12 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Final, NamedTuple
 
 from neurove_core.io import PacketWriter
-from neurove_core.io.mcap_recording import LIMITS
-from protocol.errors import NeuroVEError
-from protocol.events import decode_packet
-from protocol.keys import Keys
-from service import logs
-from service.transport import Transport
+from neurove_core.io.formats.packet_log.reader import LIMITS
+from neurove_protocol.errors import NeuroVEError
+from neurove_protocol.events import decode_packet
+from neurove_protocol.keys import Keys
+from neurove_service import logs
+from neurove_service.transport import Transport
 
 log = logs.get(__name__)
 

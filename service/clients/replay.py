@@ -6,14 +6,14 @@ import time
 from dataclasses import dataclass, field
 
 from neurove_core.io import BrokenRecording, McapRecording, RecordedPacket
-from neurove_core.io.mcap_recording import LIMITS
-from protocol.camera import SCHEMA as CAMERA_SCHEMA
-from protocol.errors import NeuroVEError
-from protocol.events import SCHEMA as EVENTS_SCHEMA
-from protocol.events import EventPacket, decode_packet
-from protocol.keys import Keys
-from service.driver import POLL_S, Summary
-from service.transport import Publisher, Transport
+from neurove_core.io.formats.packet_log.reader import LIMITS
+from neurove_protocol.camera import SCHEMA as CAMERA_SCHEMA
+from neurove_protocol.errors import NeuroVEError
+from neurove_protocol.events import SCHEMA as EVENTS_SCHEMA
+from neurove_protocol.events import EventPacket, decode_packet
+from neurove_protocol.keys import Keys
+from neurove_service.clients.driver import POLL_S, Summary
+from neurove_service.transport import Publisher, Transport
 
 
 @dataclass

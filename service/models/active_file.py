@@ -8,8 +8,8 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from neurove_core.files import write_whole
-from protocol.control import Digest
-from service import logs
+from neurove_protocol.control import Digest
+from neurove_service import logs
 
 log = logs.get(__name__)
 

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from neurove_core.bundle import Bundle
 from neurove_core.estimator import Estimator
-from neurove_core.windows import Window
-from protocol import Sensor
-from protocol.errors import NoMemory, TooSlow
+from neurove_core.ingest.windows import Window
+from neurove_core.models.bundle import Bundle
+from neurove_protocol import Sensor
+from neurove_protocol.errors import NoMemory, TooSlow
 
 COPIES = 2
 """A model takes its weights twice: as they were read, and laid out for the engine."""

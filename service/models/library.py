@@ -4,10 +4,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from neurove_core import bundle, models
-from neurove_core.bundle import Bundle
-from protocol.control import ModelInfo
-from protocol.errors import BadModel, UnknownModel
+from neurove_core import models
+from neurove_core.models import bundle
+from neurove_core.models.bundle import Bundle
+from neurove_protocol.control import ModelInfo
+from neurove_protocol.errors import BadModel, UnknownModel
 
 MIN_DIGEST = 8
 """So many digits of a digest name a model."""

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO
 
-from protocol.control import MAX_CHUNK_BYTES, ChunkRequest, PushRequest
-from protocol.errors import Cut, NeuroVEError
-from service.progress import OnProgress, Progress
+from neurove_protocol.control import MAX_CHUNK_BYTES, ChunkRequest, PushRequest
+from neurove_protocol.errors import Cut, NeuroVEError
+from neurove_service.models.progress import OnProgress, Progress
 
 Pull = Callable[[str, ChunkRequest], bytes | None]
 """Digest and what piece of it, to that piece; None where nobody answers. May raise NeuroVEError."""

@@ -4,9 +4,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from neurove_core import manifest, signing_keys
-from protocol.control import ModelInfo, SignatureState
-from protocol.errors import InvalidField, Untrusted
+from neurove_core.models import manifest, signing_keys
+from neurove_protocol.control import ModelInfo, SignatureState
+from neurove_protocol.errors import InvalidField, Untrusted
 
 
 class Signed(NamedTuple):

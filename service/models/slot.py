@@ -8,17 +8,18 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
-from neurove_core import golden
-from neurove_core.bundle import Bundle
 from neurove_core.estimator import Estimator
-from protocol.errors import BadModel, Conflict, InvalidField, NeuroVEError, NothingBefore, UnknownModel
-from service import admission, logs, swap
-from service.comparison import Limits
-from service.lane import Serving
-from service.lanes import Roles
-from service.library import MIN_DIGEST, Available, Files, Library, nothing_pushed
-from service.progress import OnProgress, Progress, Step, silent
-from service.swap import Plan, Subject
+from neurove_core.models import golden
+from neurove_core.models.bundle import Bundle
+from neurove_protocol.errors import BadModel, Conflict, InvalidField, NeuroVEError, NothingBefore, UnknownModel
+from neurove_service import logs
+from neurove_service.models import admission, swap
+from neurove_service.models.library import MIN_DIGEST, Available, Files, Library, nothing_pushed
+from neurove_service.models.progress import OnProgress, Progress, Step, silent
+from neurove_service.models.swap import Plan, Subject
+from neurove_service.streams.comparison import Limits
+from neurove_service.streams.lane import Serving
+from neurove_service.streams.lanes import Roles
 
 log = logs.get(__name__)
 

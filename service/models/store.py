@@ -17,15 +17,15 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from neurove_core import bundle
-from neurove_core.bundle import Bundle
 from neurove_core.files import move_folder, write_whole
-from protocol.control import ModelInfo, PushRequest
-from protocol.errors import BadModel, NeuroVEError, NoQuota, NoSpace, NoStore, TooLarge
-from service import logs
-from service.progress import OnProgress, Progress
-from service.pull import PATIENCE_S, Pull, pull_into
-from service.signatures import Signed, Verify, verify_nothing
+from neurove_core.models import bundle
+from neurove_core.models.bundle import Bundle
+from neurove_protocol.control import ModelInfo, PushRequest
+from neurove_protocol.errors import BadModel, NeuroVEError, NoQuota, NoSpace, NoStore, TooLarge
+from neurove_service import logs
+from neurove_service.models.progress import OnProgress, Progress
+from neurove_service.models.pull import PATIENCE_S, Pull, pull_into
+from neurove_service.models.signatures import Signed, Verify, verify_nothing
 
 log = logs.get(__name__)
 
@@ -118,7 +118,7 @@ class ModelStore:
 
         Args:
             wanted: digest, size and signature.
-            pull: asks for a chunk; see service.pull.
+            pull: asks for a chunk; see neurove_service.models.pull.
             stop: ends the waiting for chunks.
             on_progress: hears fetching, staged, verified.
             admit: refuses a model for what it says of itself, such as its release.

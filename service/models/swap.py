@@ -4,10 +4,10 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Literal, NamedTuple, Protocol
 
-from protocol.errors import Diverged
-from service.comparison import LEAST_WINDOWS, Finding, Limits, Measured, finding
-from service.lane import Primed, Serving, windows_to_prime
-from service.lanes import Lanes, Roles
+from neurove_protocol.errors import Diverged
+from neurove_service.streams.comparison import LEAST_WINDOWS, Finding, Limits, Measured, finding
+from neurove_service.streams.lane import Primed, Serving, windows_to_prime
+from neurove_service.streams.lanes import Lanes, Roles
 
 POLL_S = 0.05
 """How often streams are looked at."""

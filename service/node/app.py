@@ -5,25 +5,26 @@ import threading
 import time
 from collections.abc import Callable
 
-from neurove_core.bundle import Bundle
-from protocol import CameraInfo
-from protocol.control import STATUS_SCHEMA, ChunkRequest, StreamStatus
-from protocol.errors import NeuroVEError
-from protocol.velocity import SCHEMA as VELOCITY_SCHEMA
-from service import logs, memory
-from service.active_file import Active, ActiveFile
-from service.comparison import Limits
-from service.config import ServiceConfig
-from service.handlers import Handlers
-from service.health import stream_status
-from service.lanes import RingSize
-from service.lifecycle import notify
-from service.model_slot import ModelSlot, Rules
-from service.model_store import ModelStore
-from service.signatures import verifier
-from service.stream import Stream
-from service.transport import EndpointError, Publisher, Tell, Transport, open_transport
-from service.worker import Inbox, Outlet, StreamWorker
+from neurove_core.models.bundle import Bundle
+from neurove_protocol import CameraInfo
+from neurove_protocol.control import STATUS_SCHEMA, ChunkRequest, StreamStatus
+from neurove_protocol.errors import NeuroVEError
+from neurove_protocol.velocity import SCHEMA as VELOCITY_SCHEMA
+from neurove_service import logs
+from neurove_service.config import ServiceConfig
+from neurove_service.lifecycle import notify
+from neurove_service.models.active_file import Active, ActiveFile
+from neurove_service.models.signatures import verifier
+from neurove_service.models.slot import ModelSlot, Rules
+from neurove_service.models.store import ModelStore
+from neurove_service.node import memory
+from neurove_service.node.handlers import Handlers
+from neurove_service.node.health import stream_status
+from neurove_service.streams.comparison import Limits
+from neurove_service.streams.lanes import RingSize
+from neurove_service.streams.stream import Stream
+from neurove_service.streams.worker import Inbox, Outlet, StreamWorker
+from neurove_service.transport import EndpointError, Publisher, Tell, Transport, open_transport
 
 log = logs.get(__name__)
 

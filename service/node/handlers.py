@@ -9,9 +9,9 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 
-from neurove_core import manifest
-from neurove_core.bundle import Bundle
-from protocol.control import (
+from neurove_core.models import manifest
+from neurove_core.models.bundle import Bundle
+from neurove_protocol.control import (
     ActivateReply,
     ActivateRequest,
     HealthReply,
@@ -25,15 +25,15 @@ from protocol.control import (
     RollbackRequest,
     StreamStatus,
 )
-from protocol.errors import Downgrade, NeuroVEError, RolledBack
-from service.active_file import ActiveFile
-from service.health import node_verdict
-from service.lane import Serving
-from service.model_slot import ModelSlot
-from service.model_store import ModelStore
-from service.progress import OnProgress, Progress
-from service.pull import Pull
-from service.signatures import Signed
+from neurove_protocol.errors import Downgrade, NeuroVEError, RolledBack
+from neurove_service.models.active_file import ActiveFile
+from neurove_service.models.progress import OnProgress, Progress
+from neurove_service.models.pull import Pull
+from neurove_service.models.signatures import Signed
+from neurove_service.models.slot import ModelSlot
+from neurove_service.models.store import ModelStore
+from neurove_service.node.health import node_verdict
+from neurove_service.streams.lane import Serving
 
 VERSION = importlib.metadata.version("neurove")
 

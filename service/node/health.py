@@ -2,9 +2,9 @@
 
 import time
 
-from protocol.control import StreamStatus, Verdict
-from service.latency import latency
-from service.stream import IDLE_NS, Stream
+from neurove_protocol.control import StreamStatus, Verdict
+from neurove_service.latency import latency
+from neurove_service.streams.stream import IDLE_NS, Stream
 
 STALLED_S = 2.0
 """A stream whose packets flow, but without an estimate for so long, is stalled."""

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core import about
-from neurove_core.bundle import Bundle
+from neurove_core.models import about
+from neurove_core.models.bundle import Bundle
 
 FLOOR_M_S, FLOOR_RAD_S = 0.1, 0.05
 """At rest every difference is large beside the motion: below these, it is measured against these."""

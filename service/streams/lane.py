@@ -9,11 +9,11 @@ import numpy as np
 import torch
 
 from neurove_core.estimator import Estimator, StreamState, WindowEstimate
-from neurove_core.network import NetworkState
-from neurove_core.windows import Window
-from protocol.events import Packet
-from service.comparison import Answered
-from service.ring import Packed, Ring
+from neurove_core.ingest.windows import Window
+from neurove_core.networks.neurove import NetworkState
+from neurove_protocol.events import Packet
+from neurove_service.streams.comparison import Answered
+from neurove_service.streams.ring import Packed, Ring
 
 MOST_OWED_WINDOWS, MOST_OWED_PACKETS, MOST_OWED_EVENTS = 128, 4096, 4_000_000
 """A lane beside that owes more than this is given up: the node can not run two models."""

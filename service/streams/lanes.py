@@ -3,13 +3,13 @@
 from typing import NamedTuple
 
 from neurove_core.estimator import WindowEstimate
-from neurove_core.windows import Pushed, WindowsState
-from protocol import CameraInfo, Sensor
-from protocol.events import Packet
-from service import logs
-from service.comparison import Comparison
-from service.lane import Answer, Beside, Lane, Pace, Primed, Serving, replay, windows_to_prime
-from service.ring import Packed, Ring, packed
+from neurove_core.ingest.windows import Pushed, WindowsState
+from neurove_protocol import CameraInfo, Sensor
+from neurove_protocol.events import Packet
+from neurove_service import logs
+from neurove_service.streams.comparison import Comparison
+from neurove_service.streams.lane import Answer, Beside, Lane, Pace, Primed, Serving, replay, windows_to_prime
+from neurove_service.streams.ring import Packed, Ring, packed
 
 log = logs.get(__name__)
 

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.windows import Window
+from neurove_core.ingest.windows import Window
 
 _BYTES_PER_ENTRY = 256  # what an entry takes beside its counts
 

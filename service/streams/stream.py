@@ -7,14 +7,14 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from neurove_core.estimator import WindowEstimate
-from protocol import CameraInfo, Flag, Sensor, Trace, Twist, TwistEstimate
-from protocol.control import Losses
-from protocol.errors import InvalidField
-from protocol.events import Packet
-from service import logs
-from service.lane import Serving
-from service.lanes import Lanes, Pushing, RingSize, Unfit
-from service.model_slot import ModelSlot
+from neurove_protocol import CameraInfo, Flag, Sensor, Trace, Twist, TwistEstimate
+from neurove_protocol.control import Losses
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import Packet
+from neurove_service import logs
+from neurove_service.models.slot import ModelSlot
+from neurove_service.streams.lane import Serving
+from neurove_service.streams.lanes import Lanes, Pushing, RingSize, Unfit
 
 log = logs.get(__name__)
 

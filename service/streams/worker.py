@@ -6,13 +6,13 @@ from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
-from neurove_core.wire import read_packet
-from protocol import CameraInfo
-from protocol.errors import NeuroVEError
-from protocol.events import Limits
-from protocol.velocity import TwistEstimate
-from service import logs
-from service.stream import Arrival, Stream
+from neurove_core.ingest.wire import read_packet
+from neurove_protocol import CameraInfo
+from neurove_protocol.errors import NeuroVEError
+from neurove_protocol.events import Limits
+from neurove_protocol.velocity import TwistEstimate
+from neurove_service import logs
+from neurove_service.streams.stream import Arrival, Stream
 
 log = logs.get(__name__)
 

@@ -6,12 +6,12 @@ import re
 import pytest
 import zenoh
 
-from protocol import CameraInfo, Flag
-from protocol.control import ActivateRequest, HealthReply, HealthRequest, PeerError
-from protocol.events import encode_packet
-from protocol.keys import Keys
-from service import ask
-from service.config import ClientConfig
+from neurove_protocol import CameraInfo, Flag
+from neurove_protocol.control import ActivateRequest, HealthReply, HealthRequest, PeerError
+from neurove_protocol.events import encode_packet
+from neurove_protocol.keys import Keys
+from neurove_service.clients import ask
+from neurove_service.config import ClientConfig
 from tests.builders import make_packets
 from tests.deploy.secured import access_list, asked, bare, deployment, free_tls, joined
 from tests.live.conftest import START_S, Heard, Source, neurove, running, wait_until

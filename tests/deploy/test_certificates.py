@@ -8,7 +8,7 @@ import subprocess
 import pytest
 import zenoh
 
-from protocol.keys import Keys
+from neurove_protocol.keys import Keys
 from tests.deploy.secured import TLS, access_list, deployment, make_ca, make_configs
 
 NAMES = ("router-box=127.0.0.1,localhost", "node-edge1", "node-edge2=::1", "driver-cam0", "operator-alice")

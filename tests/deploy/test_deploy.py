@@ -19,8 +19,8 @@ from typing import get_args
 import pytest
 import zenoh
 
-from protocol.control import Losses, Verdict
-from service.config import ServiceConfig, load
+from neurove_protocol.control import Losses, Verdict
+from neurove_service.config import ServiceConfig, load
 from tests.live.conftest import client, free_endpoint, neurove, running, wait_until
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"

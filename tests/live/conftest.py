@@ -11,9 +11,9 @@ import time
 
 import pytest
 
-from service import ask
-from service.config import ClientConfig
-from service.transport import open_transport
+from neurove_service.clients import ask
+from neurove_service.config import ClientConfig
+from neurove_service.transport import open_transport
 
 START_S = 180
 
@@ -36,7 +36,7 @@ def wait_until(condition, timeout_s=30.0):
 class Process:
     """One of our commands as a child process."""
 
-    def __init__(self, *arguments, module="service.cli", **environment):
+    def __init__(self, *arguments, module="neurove_service.cli", **environment):
         self.child = subprocess.Popen(
             [sys.executable, "-m", module, *arguments],
             stdout=subprocess.PIPE,
@@ -70,7 +70,7 @@ def running(*arguments, **environment):
 def neurove(*arguments, timeout_s=60.0):
     """Run one command to its end."""
     return subprocess.run(
-        [sys.executable, "-m", "service.cli", *arguments],
+        [sys.executable, "-m", "neurove_service.cli", *arguments],
         capture_output=True,
         text=True,
         timeout=timeout_s,

@@ -5,13 +5,13 @@ import signal
 import threading
 import time
 
-from neurove_core import bundle
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
-from protocol.control import CHUNK_SCHEMA
-from protocol.errors import NeuroVEError
-from service import ask
-from service.config import ClientConfig
-from service.push_source import PushSource
+from neurove_core.models import bundle
+from neurove_protocol.control import CHUNK_SCHEMA
+from neurove_protocol.errors import NeuroVEError
+from neurove_service.clients import ask
+from neurove_service.clients.push_source import PushSource
+from neurove_service.config import ClientConfig
 from tests.live.conftest import START_S, free_endpoint, service
 
 CONFIG = ModelConfig(

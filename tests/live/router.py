@@ -3,7 +3,7 @@
 import sys
 import threading
 
-from service.transport import open_transport
+from neurove_service.transport import open_transport
 
 
 def main() -> None:

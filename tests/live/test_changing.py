@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from protocol.control import (
+from neurove_protocol.control import (
     ActivateReply,
     ActivateRequest,
     ModelInfo,
@@ -15,11 +15,11 @@ from protocol.control import (
     PushRequest,
     StreamStatus,
 )
-from protocol.errors import Conflict, NoStore, UnknownModel
-from protocol.keys import Keys
-from service import ask
-from service.config import ClientConfig
-from service.transport import open_transport
+from neurove_protocol.errors import Conflict, NoStore, UnknownModel
+from neurove_protocol.keys import Keys
+from neurove_service.clients import ask
+from neurove_service.config import ClientConfig
+from neurove_service.transport import open_transport
 from tests.live.conftest import client, free_endpoint, is_alive, wait_until
 from tests.protocol.messages import STATUS
 

@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from protocol import CameraInfo, Flag
-from protocol.control import HealthReply, HealthRequest
-from protocol.errors import NeuroVEError
-from protocol.events import decode_packet, encode_packet
-from service import ask
-from service.config import ClientConfig
-from service.transport import Transport
+from neurove_protocol import CameraInfo, Flag
+from neurove_protocol.control import HealthReply, HealthRequest
+from neurove_protocol.errors import NeuroVEError
+from neurove_protocol.events import decode_packet, encode_packet
+from neurove_service.clients import ask
+from neurove_service.config import ClientConfig
+from neurove_service.transport import Transport
 from tests.builders import SENSOR, make_packets
 from tests.live.conftest import START_S, Heard, Source, client, free_endpoint, is_alive, running, service, wait_until
 

@@ -3,13 +3,13 @@ import threading
 
 import pytest
 
-from neurove_core import bundle
-from protocol.control import CHUNK_SCHEMA, PeerError
-from protocol.errors import NeuroVEError
-from protocol.events import encode_packet
-from service import ask
-from service.push_source import PushSource
-from service.transport import open_transport
+from neurove_core.models import bundle
+from neurove_protocol.control import CHUNK_SCHEMA, PeerError
+from neurove_protocol.errors import NeuroVEError
+from neurove_protocol.events import encode_packet
+from neurove_service.clients import ask
+from neurove_service.clients.push_source import PushSource
+from neurove_service.transport import open_transport
 from tests.builders import make_packets
 from tests.live.conftest import Heard, Source, client, free_endpoint, service, wait_until
 from tests.live.killing import CONFIG, Node, slowly

@@ -5,10 +5,10 @@ import threading
 import pytest
 
 from neurove_core.io import McapRecording, PacketWriter, open_source
-from protocol import CameraInfo
-from protocol.events import decode_packet, encode_packet
-from protocol.keys import Keys
-from service.recorder import Recorder
+from neurove_protocol import CameraInfo
+from neurove_protocol.events import decode_packet, encode_packet
+from neurove_protocol.keys import Keys
+from neurove_service.clients.recorder import Recorder
 from tests.builders import make_packets
 from tests.live.conftest import client, free_endpoint, running, wait_until
 from tests.live.test_feed import start_router

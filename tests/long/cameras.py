@@ -9,8 +9,8 @@ import threading
 import time
 from dataclasses import replace
 
-from protocol.events import encode_packet
-from service.config import ClientConfig
+from neurove_protocol.events import encode_packet
+from neurove_service.config import ClientConfig
 from tests.builders import make_packets
 from tests.live.conftest import Source, client
 

@@ -22,12 +22,12 @@ from typing import Any
 
 import numpy as np
 
-from neurove_core import bundle
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from protocol import TwistEstimate
-from protocol.events import encode_packet
-from service import ask
-from service.config import ClientConfig
+from neurove_core.models import bundle
+from neurove_protocol import TwistEstimate
+from neurove_protocol.events import encode_packet
+from neurove_service.clients import ask
+from neurove_service.config import ClientConfig
 from tests.builders import make_packets
 from tests.live.conftest import START_S, Source, client, is_alive, neurove, wait_until
 
@@ -144,7 +144,18 @@ def measure(mbit: float, mib: float, quiet_s: float) -> dict[str, Any]:
         bundle.save(replace(model(0.1), name="small"), models / "small.safetensors")
         bundle.save(model(mib), Path(folder) / "pushed.safetensors")
         serve = ("serve", "--listen", endpoint, "--node", "n1", "--models-dir", str(models), "--model", "small")
-        command = ["ip", "netns", "exec", node, sys.executable, "-m", "service.cli", *serve, "--log-level", "warning"]
+        command = [
+            "ip",
+            "netns",
+            "exec",
+            node,
+            sys.executable,
+            "-m",
+            "neurove_service.cli",
+            *serve,
+            "--log-level",
+            "warning",
+        ]
         with subprocess.Popen(command) as service:
             try:
                 again = ("--inside", endpoint, f"{folder}/pushed.safetensors", "--quiet-s", str(quiet_s))

@@ -9,11 +9,11 @@ from pathlib import Path
 import safetensors.torch
 import torch
 
-from neurove_core import bundle, manifest, signing_keys
-from neurove_core.about import About
-from neurove_core.bundle import Bundle
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from neurove_core.network import NeuroVE
+from neurove_core.models import bundle, manifest, signing_keys
+from neurove_core.models.about import About
+from neurove_core.models.bundle import Bundle
+from neurove_core.networks.neurove import NeuroVE
 
 WINDOW_US = 20_000
 CONFIG = ModelConfig(

@@ -19,13 +19,13 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from neurove_core import bundle
 from neurove_core.config import CanonicalConfig, ModelConfig
 from neurove_core.estimator import Estimator
-from protocol import Events, Sensor
-from service import ask
-from service.config import ServiceConfig
-from service.ring import Ring, packed
+from neurove_core.models import bundle
+from neurove_protocol import Events, Sensor
+from neurove_service.clients import ask
+from neurove_service.config import ServiceConfig
+from neurove_service.streams.ring import Ring, packed
 from tests.live.conftest import Heard, client, free_endpoint, running, service, wait_until
 from tests.long.swaps import resident_kib
 

@@ -21,11 +21,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from protocol import TwistEstimate
-from protocol.control import PeerError
-from service import ask
-from service.config import ClientConfig
-from service.transport import Transport
+from neurove_protocol import TwistEstimate
+from neurove_protocol.control import PeerError
+from neurove_service.clients import ask
+from neurove_service.config import ClientConfig
+from neurove_service.transport import Transport
 from tests.live.conftest import Process, client, free_endpoint, service, wait_until
 from tests.long.models import GOOD, REASONS, WINDOW_US, Made
 

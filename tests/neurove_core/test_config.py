@@ -7,16 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from neurove_core import bundle
-from neurove_core.config import (
-    MAX_CANONICAL_CELLS,
-    CanonicalConfig,
-    Config,
-    ModelConfig,
-    NetworkConfig,
-    WindowConfig,
-)
+from neurove_core.config import MAX_CANONICAL_CELLS, CanonicalConfig, Config, ModelConfig, NetworkConfig, WindowConfig
 from neurove_core.estimator import Estimator
+from neurove_core.models import bundle
 
 WRONG = [
     (WindowConfig, "duration_us", 0, "greater than 0"),

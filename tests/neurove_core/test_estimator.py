@@ -13,12 +13,12 @@ import pytest
 import torch
 
 import neurove_core
-from neurove_core import bundle
-from neurove_core.bundle import Bundle
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
 from neurove_core.estimator import Answer, Estimator, Push, StreamState, WindowEstimate
-from protocol import CameraInfo, Events, Sensor
-from protocol.errors import BadModel, InvalidField
+from neurove_core.models import bundle
+from neurove_core.models.bundle import Bundle
+from neurove_protocol import CameraInfo, Events, Sensor
+from neurove_protocol.errors import BadModel, InvalidField
 from tests.builders import SENSOR, make_events
 
 README = Path(neurove_core.__file__).with_name("README.md")

@@ -4,7 +4,7 @@ import pytest
 
 from neurove_core.figures import blank_figure, save_figure
 from neurove_core.files import move_folder, write_whole, written_whole
-from protocol.errors import InvalidField
+from neurove_protocol.errors import InvalidField
 
 
 def test_a_file_is_what_it_was_until_all_is_written(tmp_path):

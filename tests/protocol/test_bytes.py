@@ -8,9 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from protocol import NeuroVEError
-from protocol.codec import MAX_ITEMS, MAX_MESSAGE_BYTES, MAX_STRING_BYTES
-from protocol.errors import InvalidField, Malformed
+from neurove_protocol import NeuroVEError
+from neurove_protocol.codec import MAX_ITEMS, MAX_MESSAGE_BYTES, MAX_STRING_BYTES
+from neurove_protocol.errors import InvalidField, Malformed
 from tests.protocol.messages import EVENT_PACKET, EXAMPLES, KINDS, Kind, bounded, pack
 
 V1 = b"\xa1v\x01"  # the key v and the value 1

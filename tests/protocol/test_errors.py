@@ -4,10 +4,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol import NeuroVEError, Sensor
-from protocol.codec import MAX_STRING_BYTES
-from protocol.control import ErrorReply, PeerError
-from protocol.errors import (
+from neurove_protocol import NeuroVEError, Sensor
+from neurove_protocol.codec import MAX_STRING_BYTES
+from neurove_protocol.control import ErrorReply, PeerError
+from neurove_protocol.errors import (
     MAX_TEXT_BYTES,
     BadModel,
     BlobLength,

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from protocol import EVENT_DTYPE, EventPacket, Events, NeuroVEError, Sensor
-from protocol.errors import (
+from neurove_protocol import EVENT_DTYPE, EventPacket, Events, NeuroVEError, Sensor
+from neurove_protocol.errors import (
     BlobLength,
     EventOutsideSensor,
     InvalidField,
@@ -16,7 +16,7 @@ from protocol.errors import (
     TimeBackwards,
     UnknownFormat,
 )
-from protocol.events import FORMATS, Limits, check_events, decode_packet, encode_packet
+from neurove_protocol.events import FORMATS, Limits, check_events, decode_packet, encode_packet
 from tests.builders import make_events, make_packet
 from tests.protocol.messages import (
     EVENT_PACKET,

@@ -5,7 +5,7 @@ from typing import Any, Self
 import pytest
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from protocol.fields import WrongField
+from neurove_protocol.fields import WrongField
 
 
 class Inner(BaseModel):

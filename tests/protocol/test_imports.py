@@ -5,8 +5,8 @@ import sys
 
 ASK = """
 import importlib, pkgutil, sys
-import protocol
-modules = [f"protocol.{module.name}" for module in pkgutil.iter_modules(protocol.__path__)]
+import neurove_protocol
+modules = [f"neurove_protocol.{module.name}" for module in pkgutil.iter_modules(neurove_protocol.__path__)]
 for module in modules:
     importlib.import_module(module)
 print(len(modules), *sorted({name.partition(".")[0] for name in sys.modules}))

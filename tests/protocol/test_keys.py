@@ -7,9 +7,9 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from protocol import NeuroVEError
-from protocol.errors import InvalidField
-from protocol.keys import DEFAULT_PREFIX, NAME_RULE, Keys, check_name, is_name
+from neurove_protocol import NeuroVEError
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.keys import DEFAULT_PREFIX, NAME_RULE, Keys, check_name, is_name
 from tests.protocol.messages import bounded, names
 
 STREAM_KEYS: list[Callable[..., str]] = [Keys.events, Keys.camera, Keys.velocity, Keys.status]

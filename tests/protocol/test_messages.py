@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol import CameraInfo, NeuroVEError, Sensor, Trace, Twist, TwistEstimate
-from protocol.control import Losses
-from protocol.errors import InvalidField, UnsupportedVersion
+from neurove_protocol import CameraInfo, NeuroVEError, Sensor, Trace, Twist, TwistEstimate
+from neurove_protocol.control import Losses
+from neurove_protocol.errors import InvalidField, UnsupportedVersion
 from tests.protocol.messages import (
     ANY,
     BY_NAME,

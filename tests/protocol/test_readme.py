@@ -17,18 +17,18 @@ import msgpack
 import pytest
 from pydantic import BaseModel
 
-import protocol
-from protocol import EventPacket, Events, Flag, Sensor, Trace, TwistEstimate, camera, control, events, velocity
-from protocol.codec import PROTOCOL_VERSION
-from protocol.control import Latency, Losses, ModelInfo, Verdict
-from protocol.events import FORMATS, decode_packet, encode_packet
-from protocol.keys import Keys
-from protocol.velocity import AXES
-from service.progress import Step
+import neurove_protocol
+from neurove_protocol import EventPacket, Events, Flag, Sensor, Trace, TwistEstimate, camera, control, events, velocity
+from neurove_protocol.codec import PROTOCOL_VERSION
+from neurove_protocol.control import Latency, Losses, ModelInfo, Verdict
+from neurove_protocol.events import FORMATS, decode_packet, encode_packet
+from neurove_protocol.keys import Keys
+from neurove_protocol.velocity import AXES
+from neurove_service.models.progress import Step
 from tests.protocol.messages import KINDS, MODELS, assert_same_packet
 from tests.protocol.test_errors import ERRORS
 
-README = Path(protocol.__file__).with_name("README.md").read_text(encoding="utf-8")
+README = Path(neurove_protocol.__file__).with_name("README.md").read_text(encoding="utf-8")
 DUMPS = re.findall(r"```hex (\w+)\n(.*?)```\n\n```json\n(.*?)```", README, re.DOTALL)
 EXAMPLES = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 BY_NAME = {model.__name__: model for model in MODELS}
@@ -187,7 +187,7 @@ def test_the_table_of_formats_has_all_formats_with_their_sizes() -> None:
 def test_the_caps_are_those_of_the_code() -> None:
     for name, value, _ in table("cap"):
         module, *path = code(name)[0].split(".")
-        found: object = importlib.import_module(f"protocol.{module}")
+        found: object = importlib.import_module(f"neurove_protocol.{module}")
         for part in path:
             found = getattr(found, part)
         assert found == int(value), name

@@ -1,6 +1,6 @@
 import pytest
 
-from service.config import ClientConfig, ConfigError, ServiceConfig, load
+from neurove_service.config import ClientConfig, ConfigError, ServiceConfig, load
 
 
 def test_each_layer_wins_over_the_one_before_and_says_so(tmp_path, monkeypatch):

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from neurove_core import recurrence
 from neurove_core.config import Config
-from neurove_core.recurrence import Array, LayerWeights, State, Weights
+from neurove_core.spiking.fused import recurrence
+from neurove_core.spiking.fused.recurrence import Array, LayerWeights, State, Weights
 
 LENGTH = 1000
 VALIDATION = 3

@@ -13,13 +13,13 @@ import safetensors.numpy
 from pydantic import ValidationError
 
 from neurove_core.experiments import save_text
-from neurove_core.experiments.sine import LENGTH, SKIP, VALIDATION, Recipe, evaluate, waves
-from neurove_core.experiments.sine_training import Trained, train
+from neurove_core.experiments.sine.data import LENGTH, SKIP, VALIDATION, Recipe, evaluate, waves
+from neurove_core.experiments.sine.training import Trained, train
 from neurove_core.extras import MissingExtra
 from neurove_core.figures import blank_figure, save_figure
-from neurove_core.recurrence import Array
-from protocol.errors import InvalidField
-from protocol.fields import WrongField
+from neurove_core.spiking.fused.recurrence import Array
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.fields import WrongField
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from neurove_core import recurrence
-from neurove_core.experiments.sine import LENGTH, SKIP, VALIDATION, Network, Recipe, waves
-from neurove_core.recurrence import Array, State
+from neurove_core.experiments.sine.data import LENGTH, SKIP, VALIDATION, Network, Recipe, waves
+from neurove_core.spiking.fused import recurrence
+from neurove_core.spiking.fused.recurrence import Array, State
 
 _BETAS, _EPSILON = (0.9, 0.99), 1e-8
 _LOG_FLOOR = 1e-9

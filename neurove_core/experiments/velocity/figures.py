@@ -4,8 +4,8 @@ import statistics
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from neurove_core.experiments.tracks import Track
-from neurove_core.experiments.velocity_report import methods_of, over_seeds
+from neurove_core.experiments.velocity.report import methods_of, over_seeds
+from neurove_core.experiments.velocity.tracks import Track
 from neurove_core.figures import blank_figure, save_figure
 
 if TYPE_CHECKING:

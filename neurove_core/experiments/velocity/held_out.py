@@ -12,16 +12,16 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from neurove_core.baselines import angular
 from neurove_core.config import ModelConfig
+from neurove_core.evaluation.contrast import angular
 from neurove_core.files import write_whole
-from neurove_core.sim.camera import named_camera
-from neurove_core.sim.pixels import USUAL, PixelConfig
+from neurove_core.sim.motion.trajectory import Trajectory, driving, hand_held, parse_trajectory
+from neurove_core.sim.render.camera import named_camera
+from neurove_core.sim.render.pixels import USUAL, PixelConfig
 from neurove_core.sim.simulate import Simulation, simulate
-from neurove_core.sim.trajectory import Trajectory, driving, hand_held, parse_trajectory
 from neurove_core.training.data import DRIVE_S, FORMAT, Part, log_uniform, save, sequence_of, turning_part
-from protocol.errors import InvalidField
-from protocol.events import Events
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import Events
 
 CAMERA: Final = "davis346-half"
 """MVSEC's equidistant lens and sensor, with pixels of twice the size."""

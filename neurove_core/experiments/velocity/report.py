@@ -5,10 +5,10 @@ import statistics
 from pathlib import Path
 from typing import Any, Final
 
+from neurove_core.evaluation.metrics import ANGULAR_FLOOR_RAD_S, LINEAR_FLOOR_M_S, SKIP_S
 from neurove_core.experiments import save_text
-from neurove_core.experiments.held_out import GROUPS
-from neurove_core.experiments.tracks import LEAST_RATE_DEG_S
-from neurove_core.metrics import ANGULAR_FLOOR_RAD_S, LINEAR_FLOOR_M_S, SKIP_S
+from neurove_core.experiments.velocity.held_out import GROUPS
+from neurove_core.experiments.velocity.tracks import LEAST_RATE_DEG_S
 
 Printed = dict[str, tuple[float, float, float, float]]
 

@@ -10,16 +10,17 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from neurove_core import bundle, models
-from neurove_core.bundle import Bundle
-from neurove_core.experiments.held_out import CM_GROUPS, Item, Kept, drives, items
-from neurove_core.experiments.tracks import Track, blind, follow, summaries, summary
-from neurove_core.snn_ang import CHANNELS
+from neurove_core import models
+from neurove_core.experiments.velocity.held_out import CM_GROUPS, Item, Kept, drives, items
+from neurove_core.experiments.velocity.tracks import Track, blind, follow, summaries, summary
+from neurove_core.models import bundle
+from neurove_core.models.bundle import Bundle
+from neurove_core.networks.snn_ang import CHANNELS
 from neurove_core.training import config as configs
 from neurove_core.training import data
 from neurove_core.training.config import TrainingConfig
 from neurove_core.training.loop import RUN_JSON, train
-from protocol.errors import InvalidField
+from neurove_protocol.errors import InvalidField
 
 METHODS: Final[dict[str, dict[str, Any]]] = {
     "nve": {},

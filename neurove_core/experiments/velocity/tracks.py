@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neurove_core.bundle import PER_HEIGHT, Bundle
-from neurove_core.encoding import to_spikes
-from neurove_core.engine import Engine
-from neurove_core.experiments.held_out import Item
-from neurove_core.metrics import SKIP_S, figures
-from neurove_core.network import NeuroVE
-from neurove_core.networks import fired
+from neurove_core.engine.engine import Engine
+from neurove_core.evaluation.metrics import SKIP_S, figures
+from neurove_core.experiments.velocity.held_out import Item
+from neurove_core.models.bundle import PER_HEIGHT, Bundle
+from neurove_core.networks.encoding import to_spikes
+from neurove_core.networks.kinds import fired
+from neurove_core.networks.neurove import NeuroVE
 from neurove_core.training.data import Sequences
 
 Array = NDArray[np.float64]

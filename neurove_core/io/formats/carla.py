@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.files import written_whole
-from neurove_core.geometry import Poses, Twists, twists
+from neurove_core.geometry.camera import Poses, Twists, twists
+from neurove_core.io.archive import BROKEN_ZIP
 from neurove_core.io.errors import BrokenRecording, UnknownSource
-from neurove_core.io.place import BROKEN_ZIP
 from neurove_core.io.recording import BLOCK_BYTES, SUPPORTED, EventsOnly, in_chunks, whole
-from protocol.camera import CameraInfo
-from protocol.errors import EventOutsideSensor, InvalidField, TimeBackwards
-from protocol.events import Events, Sensor, check_events
+from neurove_protocol.camera import CameraInfo
+from neurove_protocol.errors import EventOutsideSensor, InvalidField, TimeBackwards
+from neurove_protocol.events import Events, Sensor, check_events
 
 RECORD: Final = np.dtype([("x", "<u2"), ("y", "<u2"), ("t", "<i8"), ("pol", "u1")])
 """One event as CARLA packs it, 13 bytes: x and y [px], t simulated time [ns], pol 1 or 0."""

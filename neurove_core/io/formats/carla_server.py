@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.extras import MissingExtra
-from neurove_core.io.carla import RECORD, CarlaPoses, write
 from neurove_core.io.errors import NoCarlaServer
-from protocol.errors import InvalidField
-from protocol.events import Sensor
+from neurove_core.io.formats.carla import RECORD, CarlaPoses, write
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import Sensor
 
 STEP_S = 0.01
 """Simulated time of one step; CARLA makes events between the images of two steps."""

@@ -12,13 +12,13 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.geometry import Poses, Twists, twists
+from neurove_core.geometry.camera import Poses, Twists, twists
+from neurove_core.io.archive import Place, folder_in_zip, read_image
 from neurove_core.io.errors import BrokenRecording
-from neurove_core.io.place import Place, folder_in_zip, read_image
 from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Frame, Imu, in_chunks
-from protocol.camera import CameraInfo
-from protocol.errors import EventOutsideSensor, InvalidField, TimeBackwards
-from protocol.events import Events, Sensor, check_events
+from neurove_protocol.camera import CameraInfo
+from neurove_protocol.errors import EventOutsideSensor, InvalidField, TimeBackwards
+from neurove_protocol.events import Events, Sensor, check_events
 
 DAVIS240C = Sensor(240, 180)
 """What the data set was recorded with."""

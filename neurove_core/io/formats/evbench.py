@@ -9,12 +9,12 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.geometry import Twists
+from neurove_core.geometry.camera import Twists
 from neurove_core.io.errors import BrokenRecording, UnknownSource
-from neurove_core.io.mat5 import MatFault, read_columns
+from neurove_core.io.formats.mat5 import MatFault, read_columns
 from neurove_core.io.recording import SUPPORTED, EventsOnly, in_chunks, whole
-from protocol.errors import EventOutsideSensor, TimeBackwards
-from protocol.events import Events, Sensor, check_events
+from neurove_protocol.errors import EventOutsideSensor, TimeBackwards
+from neurove_protocol.events import Events, Sensor, check_events
 
 DAVIS240B = Sensor(240, 180)
 """What they were recorded with; of its columns 190 are used."""

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from neurove_core.compiled import compiled
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
 from neurove_core.io.recording import BLOCK_BYTES, CHUNK_EVENTS, SUPPORTED, EventsOnly, room
-from protocol.errors import InvalidField
-from protocol.events import Events, Sensor
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import Events, Sensor
 
 _MAGIC = b"Event Stream"
 _HEADER_BYTES = 20

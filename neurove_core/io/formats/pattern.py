@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from neurove_core.io.errors import UnknownSource
 from neurove_core.io.recording import SUPPORTED, EventsOnly, in_chunks
-from protocol.camera import CameraInfo
-from protocol.errors import InvalidField
-from protocol.events import Events, Sensor
+from neurove_protocol.camera import CameraInfo
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import Events, Sensor
 
 HALF_DAVIS346 = Sensor(173, 130)
 FRAME_US = 2500  # between two of these the brightness of a pixel is a straight line

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from neurove_core import rotations
-from neurove_core.geometry import Poses, Twists
-from protocol.errors import InvalidField
+from neurove_core.geometry import rotations
+from neurove_core.geometry.camera import Poses, Twists
+from neurove_protocol.errors import InvalidField
 
 Array = NDArray[np.float64]
 

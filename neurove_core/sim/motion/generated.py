@@ -6,8 +6,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core import rotations
-from neurove_core.sim.curves import SplineTrajectory
+from neurove_core.geometry import rotations
+from neurove_core.sim.motion.curves import SplineTrajectory
 
 Array = NDArray[np.float64]
 

@@ -8,12 +8,12 @@ from urllib.parse import parse_qsl
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core import rotations
-from neurove_core.geometry import Poses, check_poses, filter_for, interpolate_poses, smoothed
+from neurove_core.geometry import rotations
+from neurove_core.geometry.camera import Poses, check_poses, filter_for, interpolate_poses, smoothed
 from neurove_core.io.poses import read_poses
-from neurove_core.sim.curves import Mounted, ScrewTrajectory, SplineTrajectory, Trajectory
-from neurove_core.sim.generated import driving, hand_held
-from protocol.errors import InvalidField
+from neurove_core.sim.motion.curves import Mounted, ScrewTrajectory, SplineTrajectory, Trajectory
+from neurove_core.sim.motion.generated import driving, hand_held
+from neurove_protocol.errors import InvalidField
 
 __all__ = [
     "TRAJECTORIES",

@@ -8,10 +8,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.geometry import undistort
-from protocol.camera import CameraInfo
-from protocol.errors import InvalidField
-from protocol.events import Sensor
+from neurove_core.geometry.camera import undistort
+from neurove_protocol.camera import CameraInfo
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import Sensor
 
 STREAM: Final = "sim"
 TILE: Final = 8

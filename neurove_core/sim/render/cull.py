@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.sim.compile import fast
-from neurove_core.sim.views import NEAR_M
+from neurove_core.sim.render.compile import fast
+from neurove_core.sim.render.views import NEAR_M
 
 
 class Candidates(NamedTuple):

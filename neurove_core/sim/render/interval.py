@@ -11,13 +11,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.sim.camera import Rays
-from neurove_core.sim.compile import fast
-from neurove_core.sim.cull import Candidates
-from neurove_core.sim.lanes import DEPTH, LANES, LIGHT, ROWS, load_tile
-from neurove_core.sim.pixels import Found, Mismatch, PixelState, find_crossings
-from neurove_core.sim.tile import render_tile
-from neurove_core.sim.views import Backdrop
+from neurove_core.sim.render.camera import Rays
+from neurove_core.sim.render.compile import fast
+from neurove_core.sim.render.cull import Candidates
+from neurove_core.sim.render.pixels import Found, Mismatch, PixelState, find_crossings
+from neurove_core.sim.render.tile import render_tile
+from neurove_core.sim.render.tile_rows import DEPTH, LANES, LIGHT, ROWS, load_tile
+from neurove_core.sim.render.views import Backdrop
 
 GRIDS: Final = (60, 240, 960)
 """Into how many equal steps an interval may be cut; a tile is rendered after each or after some of them."""

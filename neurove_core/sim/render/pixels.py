@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from neurove_core.config import Config
-from neurove_core.sim.compile import exact
-from protocol.errors import InvalidField, TimeBackwards
-from protocol.events import Events, Sensor
+from neurove_core.sim.render.compile import exact
+from neurove_protocol.errors import InvalidField, TimeBackwards
+from neurove_protocol.events import Events, Sensor
 
 LEAST_THRESHOLD: Final = 0.01
 """Mismatch takes no threshold below this (ESIM) [log intensity]."""

@@ -3,11 +3,11 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.sim.camera import Rays
-from neurove_core.sim.panels import CLEAR2, SKY_COLUMNS, SKY_ROWS, SKY_TOP, Panels, Sky
-from neurove_core.sim.shade import TAPS
-from neurove_core.sim.textures import LEVELS, NAMES, Textures
-from neurove_core.sim.views import NEAR_M, World
+from neurove_core.sim.render.camera import Rays
+from neurove_core.sim.render.shade import TAPS
+from neurove_core.sim.render.views import NEAR_M, World
+from neurove_core.sim.world.panels import CLEAR2, SKY_COLUMNS, SKY_ROWS, SKY_TOP, Panels, Sky
+from neurove_core.sim.world.textures import LEVELS, NAMES, Textures
 
 Array = NDArray[np.float64]
 

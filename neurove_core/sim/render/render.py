@@ -3,12 +3,12 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.sim.camera import Rays
-from neurove_core.sim.compile import fast
-from neurove_core.sim.cull import Candidates
-from neurove_core.sim.lanes import DEPTH, LANES, LIGHT, ROWS, load_tile
-from neurove_core.sim.tile import render_tile
-from neurove_core.sim.views import Backdrop, World, views_of
+from neurove_core.sim.render.camera import Rays
+from neurove_core.sim.render.compile import fast
+from neurove_core.sim.render.cull import Candidates
+from neurove_core.sim.render.tile import render_tile
+from neurove_core.sim.render.tile_rows import DEPTH, LANES, LIGHT, ROWS, load_tile
+from neurove_core.sim.render.views import Backdrop, World, views_of
 
 
 @fast

@@ -9,10 +9,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.sim.compile import fast
-from neurove_core.sim.lanes import BACK, FRONT, LANES, PANEL, SECOND, SHADE, STEP_X, STEP_Y, X, Y
-from neurove_core.sim.panels import SKY_COLUMNS, SKY_ROWS, SKY_TOP
-from neurove_core.sim.textures import CHAIN, LEVELS, SIZE
+from neurove_core.sim.render.compile import fast
+from neurove_core.sim.render.tile_rows import BACK, FRONT, LANES, PANEL, SECOND, SHADE, STEP_X, STEP_Y, X, Y
+from neurove_core.sim.world.panels import SKY_COLUMNS, SKY_ROWS, SKY_TOP
+from neurove_core.sim.world.textures import CHAIN, LEVELS, SIZE
 
 TAPS: Final = 3
 """Most texture reads along the footprint's longer axis."""

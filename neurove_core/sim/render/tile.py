@@ -12,8 +12,9 @@ from the tile's first, which keeps the plane of a panel exact to 1e-7 of its dep
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.sim.compile import fast
-from neurove_core.sim.lanes import (
+from neurove_core.sim.render.compile import fast
+from neurove_core.sim.render.shade import sky_of, texture_of
+from neurove_core.sim.render.tile_rows import (
     BACK,
     BEHIND,
     COVER,
@@ -31,9 +32,8 @@ from neurove_core.sim.lanes import (
     X,
     Y,
 )
-from neurove_core.sim.panels import CLEAR2
-from neurove_core.sim.shade import sky_of, texture_of
-from neurove_core.sim.views import NEAR_M, Backdrop
+from neurove_core.sim.render.views import NEAR_M, Backdrop
+from neurove_core.sim.world.panels import CLEAR2
 
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _NEAR, _CLEAR2, _FADING = np.float32(NEAR_M), np.float32(CLEAR2), np.float32(1 / (1 - CLEAR2))

@@ -5,8 +5,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.sim.camera import TILE, Rays
-from neurove_core.sim.compile import fast
+from neurove_core.sim.render.camera import TILE, Rays
+from neurove_core.sim.render.compile import fast
 
 LANES: Final = TILE * TILE
 """Pixels of a tile; one that has fewer repeats its last."""

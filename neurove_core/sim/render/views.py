@@ -5,9 +5,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.sim.compile import fast
-from neurove_core.sim.panels import Panels, Sky
-from neurove_core.sim.textures import Textures
+from neurove_core.sim.render.compile import fast
+from neurove_core.sim.world.panels import Panels, Sky
+from neurove_core.sim.world.textures import Textures
 
 VIEW: Final = 20
 """Numbers of a panel in a camera's frame, in one row that a kernel reads: u, v, normal (3 each); the camera's place

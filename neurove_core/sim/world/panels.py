@@ -5,7 +5,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.sim.textures import NAMES, SIZE
+from neurove_core.sim.world.textures import NAMES, SIZE
 
 ENDLESS: Final = 1e5
 """Half of the side of a panel without end [m]."""

@@ -6,10 +6,10 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.sim.panels import ENDLESS, SKY_COLUMNS, SKY_ROWS, Panels, Sky, box, panel, upright
-from neurove_core.sim.path import Moving
-from neurove_core.sim.street import BARE, CORRIDOR, STREET, Street
-from protocol.errors import InvalidField
+from neurove_core.sim.world.panels import ENDLESS, SKY_COLUMNS, SKY_ROWS, Panels, Sky, box, panel, upright
+from neurove_core.sim.world.path import Moving
+from neurove_core.sim.world.street import BARE, CORRIDOR, STREET, Street
+from neurove_protocol.errors import InvalidField
 
 
 class Scene(Protocol):

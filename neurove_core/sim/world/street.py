@@ -5,8 +5,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.sim.panels import ENDLESS, NOTHING, Panels, Sky, box, panel, upright
-from neurove_core.sim.path import STEP_M, Moving, Path
+from neurove_core.sim.world.panels import ENDLESS, NOTHING, Panels, Sky, box, panel, upright
+from neurove_core.sim.world.path import STEP_M, Moving, Path
 
 BLOCK: Final = 6
 """Waypoints of one block: 12 m of street."""

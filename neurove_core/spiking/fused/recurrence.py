@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from neurove_core.recurrence_kernels import ASLSTM, LTC, SLSTM, Array, backward_steps, forward_steps
+from neurove_core.spiking.fused.recurrence_kernels import ASLSTM, LTC, SLSTM, Array, backward_steps, forward_steps
 
 __all__ = [
     "ASLSTM",

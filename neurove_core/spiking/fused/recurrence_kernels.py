@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.activations import fused, sigmoid, tanh
+from neurove_core.spiking.fused.activations import fused, sigmoid, tanh
 
 ASLSTM: Final = 0
 SLSTM: Final = 1

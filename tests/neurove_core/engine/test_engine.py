@@ -7,11 +7,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from neurove_core import bundle, convolution
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from neurove_core.engine import Engine
-from neurove_core.network import NetworkState, NeuroVE
-from neurove_core.neurons import plain
+from neurove_core.engine import convolution
+from neurove_core.engine.engine import Engine
+from neurove_core.models import bundle
+from neurove_core.networks.neurove import NetworkState, NeuroVE
+from neurove_core.spiking.lif import plain
 
 STEPS = 6
 SMALL = ModelConfig(

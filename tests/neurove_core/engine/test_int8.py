@@ -5,12 +5,13 @@ import logging
 import pytest
 import torch
 
-from neurove_core import bundle, convolution, int8
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from neurove_core.encoding import to_codes, to_spikes
-from neurove_core.engine import Engine
+from neurove_core.engine import convolution, int8
+from neurove_core.engine.engine import Engine
 from neurove_core.estimator import Estimator
-from neurove_core.neurons import plain
+from neurove_core.models import bundle
+from neurove_core.networks.encoding import to_codes, to_spikes
+from neurove_core.spiking.lif import plain
 from tests.builders import SENSOR, make_events
 
 SMALL = ModelConfig(

@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from neurove_core import bundle, convolution, encoding, scan, sparse
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from neurove_core.engine import Engine
-from neurove_core.neurons import LIFParams, LIFState, plain
+from neurove_core.engine import convolution, sparse
+from neurove_core.engine.engine import Engine
+from neurove_core.models import bundle
+from neurove_core.networks import encoding
+from neurove_core.spiking.fused import scan
+from neurove_core.spiking.lif import LIFParams, LIFState, plain
 
 DECAY, V_TH = 0.5, 0.7
 LIF = LIFParams(DECAY, V_TH)

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 import torch
 
-from neurove_core import bundle, convolution, int8, sparse, sparse_int8
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from neurove_core.engine import Engine
-from neurove_core.neurons import LIFParams, LIFState, lif_scan_reference, plain
+from neurove_core.engine import convolution, int8, sparse, sparse_int8
+from neurove_core.engine.engine import Engine
+from neurove_core.models import bundle
+from neurove_core.spiking.lif import LIFParams, LIFState, lif_scan_reference, plain
 
 DECAY, V_TH = 0.5, 0.7
 LIF = LIFParams(DECAY, V_TH)

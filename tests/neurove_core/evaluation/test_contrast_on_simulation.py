@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from neurove_core.baselines import angular
+from neurove_core.evaluation.contrast import angular
 from neurove_core.io import open_source
-from protocol.events import Events
+from neurove_protocol.events import Events
 
 
 @pytest.mark.parametrize(

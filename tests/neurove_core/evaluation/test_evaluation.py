@@ -5,17 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from neurove_core import bundle
-from neurove_core.bundle import PER_HEIGHT
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.estimator import Estimator
-from neurove_core.evaluation import NoTruth, answer, judge, report
-from neurove_core.geometry import Twists
+from neurove_core.evaluation.judge import NoTruth, answer, judge, report
+from neurove_core.geometry.camera import Twists
 from neurove_core.io import open_source
 from neurove_core.io.packets import slices
-from protocol import EventPacket
-from service.model_slot import ModelSlot
-from service.stream import Arrival, Stream
+from neurove_core.models import bundle
+from neurove_core.models.bundle import PER_HEIGHT
+from neurove_protocol import EventPacket
+from neurove_service.models.slot import ModelSlot
+from neurove_service.streams.stream import Arrival, Stream
 
 SMALL = ModelConfig(
     canonical=CanonicalConfig(width=24, height=18), network=NetworkConfig(channels=(4, 4), features=8, hidden=8)

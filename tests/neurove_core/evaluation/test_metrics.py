@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from neurove_core.metrics import direction_error_deg, figures, r2, relative_error, rmse
+from neurove_core.evaluation.metrics import direction_error_deg, figures, r2, relative_error, rmse
 
 
 def made(windows=8, bins=5, seed=0):

@@ -9,7 +9,7 @@ import torch
 from neurove_core import LIF
 from neurove_core.experiments import firing
 from neurove_core.extras import MissingExtra
-from protocol.errors import InvalidField
+from neurove_protocol.errors import InvalidField
 
 
 @pytest.fixture(scope="module")

@@ -6,15 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neurove_core import bundle, models
-from neurove_core.baselines import angular
+from neurove_core import models
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.estimator import Estimator
-from neurove_core.evaluation import answer
+from neurove_core.evaluation.contrast import angular
+from neurove_core.evaluation.judge import answer
 from neurove_core.experiments import real
 from neurove_core.io import open_source
-from protocol import Events, Sensor
-from service import cli
+from neurove_core.models import bundle
+from neurove_protocol import Events, Sensor
+from neurove_service.cli import main
 from tests.builders import make_events
 from tests.recordings import SHARED, aedat4, ecd_text, shared
 
@@ -113,9 +114,9 @@ def test_all_of_them_are_judged_where_they_are_there(tmp_path):
 
 def test_the_command_tells_machines_and_people_the_same_and_writes_both(tmp_path, capsys):
     arguments = ["reproduce", "real", "untrained", "--recordings", str(tmp_path / "none"), "--out", str(tmp_path)]
-    assert cli.main(arguments) == 0
+    assert main.main(arguments) == 0
     table = capsys.readouterr().out
-    assert cli.main([*arguments, "--json"]) == 0
+    assert main.main([*arguments, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["model"]["name"] == "untrained"
     assert table == real.markdown(told["checks"], real.title(told)) == (tmp_path / "real.md").read_text()

@@ -3,10 +3,10 @@ import json
 import numpy as np
 import pytest
 
-from neurove_core import bundle
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.experiments import repriming
-from protocol.errors import InvalidField
+from neurove_core.models import bundle
+from neurove_protocol.errors import InvalidField
 
 
 @pytest.fixture(scope="module")

@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neurove_core.experiments import sine, sine_report
-from neurove_core.experiments.sine import LENGTH, Network, Recipe, evaluate, waves
-from neurove_core.experiments.sine_training import train
-from protocol.errors import InvalidField
+from neurove_core.experiments.sine import data as sine
+from neurove_core.experiments.sine import report as sine_report
+from neurove_core.experiments.sine.data import LENGTH, Network, Recipe, evaluate, waves
+from neurove_core.experiments.sine.training import train
+from neurove_protocol.errors import InvalidField
 
 pytest.importorskip("scipy", reason="scipy is not installed: pip install 'neurove[experiments]'")
 

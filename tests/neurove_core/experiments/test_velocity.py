@@ -6,15 +6,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neurove_core import bundle
 from neurove_core.estimator import Estimator
-from neurove_core.evaluation import answer, judge
-from neurove_core.experiments import real, velocity, velocity_report
-from neurove_core.experiments.held_out import CM_GROUPS, DAY1_TRAINED_S, GROUPS, Kept, drives, items
-from neurove_core.experiments.tracks import Track, blind, follow, summary
+from neurove_core.evaluation.judge import answer, judge
+from neurove_core.experiments import real
+from neurove_core.experiments.velocity import report as velocity_report
+from neurove_core.experiments.velocity import run as velocity
+from neurove_core.experiments.velocity.held_out import CM_GROUPS, DAY1_TRAINED_S, GROUPS, Kept, drives, items
+from neurove_core.experiments.velocity.tracks import Track, blind, follow, summary
+from neurove_core.models import bundle
 from neurove_core.training import config as configs
-from protocol.errors import InvalidField
-from service import cli
+from neurove_protocol.errors import InvalidField
+from neurove_service.cli import main
 from tests.recordings import SHARED, shared
 
 RESULTS = Path(real.__file__).parent / "results"
@@ -173,7 +175,7 @@ def test_wrong_wishes_are_refused():
 def test_the_quick_command_trains_all_methods_and_leaves_tables_and_pictures(run, tmp_path, capsys):
     folder, *_ = run
     arguments = ["reproduce", "velocity", "--quick", "--data", str(folder / "data"), "--out", str(tmp_path)]
-    assert cli.main(arguments) == 0
+    assert main.main(arguments) == 0
     table = capsys.readouterr().out
     told = json.loads((tmp_path / "velocity-quick.json").read_text())
     assert table == velocity_report.markdown(told) == (tmp_path / "velocity-quick.md").read_text()
@@ -206,7 +208,7 @@ def test_with_recordings_the_real_drives_and_the_real_events_are_there_too(run, 
         shared(check.recording)
     folder, *_ = run
     arguments = ["--quick", "--methods", "ann", "--data", str(folder / "data"), "--out", str(tmp_path), "--json"]
-    assert cli.main(["reproduce", "velocity", *arguments, "--recordings", str(SHARED)]) == 0
+    assert main.main(["reproduce", "velocity", *arguments, "--recordings", str(SHARED)]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["drives"] == 2
     assert "mvsec" in told["groups"]

@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neurove_core.config import CanonicalConfig
-from neurove_core.geometry import OUTSIDE, distort, focal_px, lookup_table, undistort
-from protocol import CameraInfo, Sensor
-from protocol.errors import InvalidField
+from neurove_core.geometry.camera import OUTSIDE, distort, focal_px, lookup_table, undistort
+from neurove_protocol import CameraInfo, Sensor
+from neurove_protocol.errors import InvalidField
 
 CANONICAL = CanonicalConfig()
 ECD = CameraInfo(

@@ -3,17 +3,9 @@
 import numpy as np
 import pytest
 
-from neurove_core import rotations
-from neurove_core.geometry import (
-    MAX_GAP_US,
-    Poses,
-    Twists,
-    filter_for,
-    interpolate_poses,
-    smoothed,
-    twists,
-)
-from protocol.errors import InvalidField
+from neurove_core.geometry import rotations
+from neurove_core.geometry.camera import MAX_GAP_US, Poses, Twists, filter_for, interpolate_poses, smoothed, twists
+from neurove_protocol.errors import InvalidField
 from tests.recordings import shared
 
 h5py = pytest.importorskip("h5py", reason="h5py is not installed: pip install 'neurove[recordings]'")

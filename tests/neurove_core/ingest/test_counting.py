@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neurove_core.geometry import OUTSIDE
-from neurove_core.kernels import count_events, count_events_reference
-from protocol import Events
+from neurove_core.geometry.camera import OUTSIDE
+from neurove_core.ingest.counting import count_events, count_events_reference
+from neurove_protocol import Events
 from tests.builders import SENSOR, make_events
 
 BINS, BIN_US, HEIGHT, WIDTH = 3, 1_000, 6, 7

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from neurove_core.config import CanonicalConfig, WindowConfig
-from neurove_core.geometry import OUTSIDE, lookup_table
-from neurove_core.kernels import count_events_reference
-from neurove_core.windows import Window, WindowsState, push
-from protocol import Events
+from neurove_core.geometry.camera import OUTSIDE, lookup_table
+from neurove_core.ingest.counting import count_events_reference
+from neurove_core.ingest.windows import Window, WindowsState, push
+from neurove_protocol import Events
 from tests.builders import SENSOR, make_events
 
 CONFIG = WindowConfig(duration_us=10_000, bins=5, max_hole_windows=3)

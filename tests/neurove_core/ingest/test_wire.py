@@ -9,12 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neurove_core.config import CanonicalConfig, WindowConfig
-from neurove_core.geometry import OUTSIDE, lookup_table
-from neurove_core.kernels import count_events, count_events_reference
-from neurove_core.windows import Pushed, WindowsState, push
-from neurove_core.wire import count_wire, read_packet
-from protocol import EventPacket, Events, NeuroVEError, Sensor
-from protocol.events import (
+from neurove_core.geometry.camera import OUTSIDE, lookup_table
+from neurove_core.ingest.counting import count_events, count_events_reference
+from neurove_core.ingest.windows import Pushed, WindowsState, push
+from neurove_core.ingest.wire import count_wire, read_packet
+from neurove_protocol import EventPacket, Events, NeuroVEError, Sensor
+from neurove_protocol.events import (
     DEFAULT_LIMITS,
     FORMATS,
     Limits,

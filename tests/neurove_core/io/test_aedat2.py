@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from neurove_core.io import UnknownSource, open_source
-from protocol import Events, Sensor
-from protocol.errors import InvalidField
+from neurove_protocol import Events, Sensor
+from neurove_protocol.errors import InvalidField
 from tests.builders import make_events
 from tests.recordings import all_samples, assert_same, put, read, read_broken, shared
 

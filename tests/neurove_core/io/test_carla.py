@@ -10,10 +10,10 @@ import pytest
 
 from neurove_core.extras import MissingExtra
 from neurove_core.io import BrokenRecording, UnknownSource, open_source
-from neurove_core.io.carla import RECORD, CarlaPoses, to_optical, write
-from neurove_core.io.carla_server import record
-from protocol import Events
-from protocol.errors import InvalidField
+from neurove_core.io.formats.carla import RECORD, CarlaPoses, to_optical, write
+from neurove_core.io.formats.carla_server import record
+from neurove_protocol import Events
+from neurove_protocol.errors import InvalidField
 from tests.builders import SENSOR, make_events
 from tests.recordings import assert_same, put, read, read_broken
 

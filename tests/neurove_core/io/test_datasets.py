@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from neurove_core.extras import MissingExtra
-from neurove_core.io import BrokenRecording, UnknownSource, hdf5, open_source
+from neurove_core.io import BrokenRecording, UnknownSource, open_source
+from neurove_core.io.formats.hdf5 import file as hdf5
 from neurove_core.io.recording import CHUNK_EVENTS
-from protocol import Events, NeuroVEError
-from protocol.events import check_events
+from neurove_protocol import Events, NeuroVEError
+from neurove_protocol.events import check_events
 from tests.builders import SENSOR, make_events
 from tests.datasets import (
     CHUNK,

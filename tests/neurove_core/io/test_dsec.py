@@ -7,11 +7,11 @@ import h5py
 import numpy as np
 import pytest
 
-from neurove_core.geometry import Twists
+from neurove_core.geometry.camera import Twists
 from neurove_core.io import BrokenRecording, EventsOnly, open_source, read_poses, write_dsec
-from neurove_core.io.dsec_write import MAX_SPAN_S
-from protocol import Events, Sensor
-from protocol.errors import InvalidField
+from neurove_core.io.formats.hdf5.dsec_write import MAX_SPAN_S
+from neurove_protocol import Events, Sensor
+from neurove_protocol.errors import InvalidField
 from tests.builders import SENSOR, make_events
 from tests.datasets import DAY_US, EVENTS, LATE, make_imu, make_poses, write_dsec_file, write_mvsec
 from tests.recordings import all_samples, assert_same, read, read_broken, shared

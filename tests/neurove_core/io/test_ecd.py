@@ -12,8 +12,8 @@ from PIL import Image
 from neurove_core.extras import MissingExtra
 from neurove_core.io import BrokenRecording, UnknownSource, open_source
 from neurove_core.io.recording import BLOCK_BYTES
-from protocol import Events
-from protocol.errors import InvalidField
+from neurove_protocol import Events
+from neurove_protocol.errors import InvalidField
 from tests.builders import SENSOR, make_events
 from tests.recordings import assert_same, ecd_text, put, read, read_broken, shared
 

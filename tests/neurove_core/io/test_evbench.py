@@ -5,7 +5,7 @@ import pytest
 import scipy.io
 
 from neurove_core.io import UnknownSource, open_source
-from protocol import Events, Sensor
+from neurove_protocol import Events, Sensor
 from tests.recordings import assert_same, put, read, read_broken, shared
 
 TRUTH = b"Ground-truth: seq_0001,seq_0002\nrvec (rad/frame)\nrvec =  0.0071  0.1 0.1\nrvec = -0.0142 0 0\n"

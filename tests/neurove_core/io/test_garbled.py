@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from neurove_core.io import Recording, open_source
-from protocol import Events, NeuroVEError, Sensor
-from protocol.events import check_events
+from neurove_protocol import Events, NeuroVEError, Sensor
+from neurove_protocol.events import check_events
 from tests.builders import SENSOR, make_events
 from tests.neurove_core import test_io_aedat2, test_io_carla, test_io_ecd, test_io_evbench, test_io_eventstream
 from tests.neurove_core.test_io_prophesee import dat

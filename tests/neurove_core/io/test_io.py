@@ -10,8 +10,8 @@ import pytest
 
 from neurove_core.io import SUPPORTED, BrokenRecording, MissingGeometry, UnknownSource, open_source
 from neurove_core.io.recording import BLOCK_BYTES
-from protocol import Events, NeuroVEError, Sensor
-from protocol.events import check_events
+from neurove_protocol import Events, NeuroVEError, Sensor
+from neurove_protocol.events import check_events
 from tests.builders import SENSOR, make_events
 from tests.builders_evt import HEADER_EVT2, HEADER_EVT3, TIME_HIGH, write_evt2, write_evt3
 from tests.recordings import aedat4, assert_same, ecd_text, put, read, read_broken, shared

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from neurove_core.io import BrokenRecording, open_source
-from protocol import Events, Sensor
-from protocol.errors import InvalidField
+from neurove_protocol import Events, Sensor
+from neurove_protocol.errors import InvalidField
 from tests.builders import SENSOR
 from tests.datasets import DAY_US, EVENTS, LATE, make_imu, make_poses, matrices, rigid, write_m3ed, write_mvsec
 from tests.recordings import all_samples, assert_same

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from neurove_core.geometry import Poses, Twists
+from neurove_core.geometry.camera import Poses, Twists
 from neurove_core.io import BrokenRecording, PacketWriter, UnknownSource, open_source, write_mcap
-from neurove_core.io.mcap_recording import McapRecording
+from neurove_core.io.formats.packet_log.reader import McapRecording
 from neurove_core.io.packets import slices
 from neurove_core.io.recording import EventsOnly, Frame, Imu, Triggers
-from protocol import CameraInfo, Events, NeuroVEError, Sensor
-from protocol.events import decode_packet, encode_packet
+from neurove_protocol import CameraInfo, Events, NeuroVEError, Sensor
+from neurove_protocol.events import decode_packet, encode_packet
 from tests.builders import SENSOR, make_events, make_packet, make_packets
 from tests.recordings import assert_same, read, read_broken, shared
 

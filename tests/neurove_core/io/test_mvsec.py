@@ -8,11 +8,12 @@ import hdf5plugin
 import numpy as np
 import pytest
 
-from neurove_core import rotations
-from neurove_core.geometry import twists
-from neurove_core.io import BrokenRecording, mvsec, open_source
-from protocol import Sensor
-from protocol.errors import InvalidField
+from neurove_core.geometry import rotations
+from neurove_core.geometry.camera import twists
+from neurove_core.io import BrokenRecording, open_source
+from neurove_core.io.formats.hdf5 import mvsec
+from neurove_protocol import Sensor
+from neurove_protocol.errors import InvalidField
 from tests.builders import SENSOR
 from tests.datasets import CHUNK, DAY_US, LATE, make_imu, make_poses, matrices, own_file, spoil, write_mvsec
 from tests.recordings import all_samples, shared

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from neurove_core.io import Recording, open_source
-from neurove_core.io.pattern import FRAME_US, shift_px
-from protocol import Events, Sensor
-from protocol.errors import InvalidField
-from protocol.events import check_events
+from neurove_core.io.formats.pattern import FRAME_US, shift_px
+from neurove_protocol import Events, Sensor
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import check_events
 from tests.recordings import assert_same
 
 

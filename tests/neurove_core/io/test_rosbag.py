@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
+from neurove_core.ingest.counting import ILLEGAL, OK, OUTSIDE
 from neurove_core.io import BrokenRecording, UnknownSource, open_source
-from neurove_core.io.rosbag import RosbagRecording
-from neurove_core.kernels import ILLEGAL, OK, OUTSIDE
-from neurove_core.kernels_libcaer import WORD_EVENTS, LibcaerState, libcaer_decode, libcaer_reference
-from protocol import Events, Sensor
+from neurove_core.io.formats.ros.libcaer import WORD_EVENTS, LibcaerState, libcaer_decode, libcaer_reference
+from neurove_core.io.formats.ros.recording import RosbagRecording
+from neurove_protocol import Events, Sensor
 from tests import ros_bags
 from tests.builders import SENSOR, make_events
 from tests.builders_evt import ADDR_X, ADDR_Y, TIME_HIGH, TRIGGER, evt3, write_evt3

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neurove_core.geometry import Poses, Twists, twists
+from neurove_core.geometry.camera import Poses, Twists, twists
 from neurove_core.io import BrokenRecording, EventsOnly, Frame, Imu, Triggers, open_source
 from neurove_core.io.recording import in_chunks
 from neurove_core.io.summary import survey
 from neurove_core.io.summary_plot import draw
-from protocol import Events, Sensor
-from protocol.errors import InvalidField
+from neurove_protocol import Events, Sensor
+from neurove_protocol.errors import InvalidField
 from tests.builders import SENSOR, make_events
 from tests.recordings import ecd_text, shared
 

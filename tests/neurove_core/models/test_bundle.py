@@ -15,11 +15,11 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neurove_core import bundle
-from neurove_core.bundle import Bundle
 from neurove_core.config import NetworkConfig
 from neurove_core.estimator import Estimator
-from protocol.errors import BadModel
+from neurove_core.models import bundle
+from neurove_core.models.bundle import Bundle
+from neurove_protocol.errors import BadModel
 from tests.builders import SENSOR, make_events
 from tests.bundles import (
     CONFIG,

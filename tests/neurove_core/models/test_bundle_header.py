@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import neurove_core
-from neurove_core import bundle, golden, manifest
-from neurove_core.about import About, Limits, MadeBy
-from neurove_core.bundle import Header
-from protocol.errors import BadModel
+from neurove_core.models import bundle, golden, manifest
+from neurove_core.models.about import About, Limits, MadeBy
+from neurove_core.models.bundle import Header
+from neurove_protocol.errors import BadModel
 from tests.bundles import CONFIG, DATA, ORIGINAL, packed, refusal, unpacked, with_entries, with_fields
 
 TOLD = About(

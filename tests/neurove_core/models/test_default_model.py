@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from neurove_core import bundle, models
-from neurove_core.encoding import to_spikes
-from neurove_core.engine import Engine
+from neurove_core import models
+from neurove_core.engine.engine import Engine
 from neurove_core.estimator import Estimator
-from neurove_core.evaluation import answer, judge, report
+from neurove_core.evaluation.judge import answer, judge, report
 from neurove_core.io import open_source
+from neurove_core.models import bundle
+from neurove_core.networks.encoding import to_spikes
 from neurove_core.training import data
 from neurove_core.training.batches import regained
 

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 import torch
 
-from neurove_core import bundle, golden, neurons
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.estimator import Estimator
-from neurove_core.golden import Golden
-from protocol import Sensor
-from protocol.errors import BadModel
+from neurove_core.models import bundle, golden
+from neurove_core.models.golden import Golden
+from neurove_core.spiking import lif as neurons
+from neurove_protocol import Sensor
+from neurove_protocol.errors import BadModel
 from tests.builders import make_events
 from tests.bundles import CONFIG, ORIGINAL, make_bundle, refusal, with_fields, with_tensors
 

@@ -12,9 +12,9 @@ from cryptography.hazmat.primitives.asymmetric import ec, ed448, ed25519
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neurove_core import bundle, manifest, signing_keys
-from neurove_core.about import About
-from protocol.errors import BadModel, Downgrade, InvalidField, Untrusted
+from neurove_core.models import bundle, manifest, signing_keys
+from neurove_core.models.about import About
+from neurove_protocol.errors import BadModel, Downgrade, InvalidField, Untrusted
 from tests.bundles import CONFIG, DATA, ORIGINAL, make_bundle
 
 KEY = ed25519.Ed25519PrivateKey.from_private_bytes(bytes(range(32)))

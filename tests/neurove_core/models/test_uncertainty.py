@@ -7,16 +7,16 @@ import pytest
 import safetensors.torch
 import torch
 
-from neurove_core import bundle, golden
-from neurove_core.bundle import PER_HEIGHT
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
 from neurove_core.estimator import Estimator, Push
+from neurove_core.models import bundle, golden
+from neurove_core.models.bundle import PER_HEIGHT
+from neurove_core.models.uncertainty import Uncertainty, coverage, half_width
 from neurove_core.training import calibration
 from neurove_core.training.calibration import Watched, fitted, laplace_scale, seen_in_all_ways
 from neurove_core.training.config import TrainingConfig
-from neurove_core.uncertainty import Uncertainty, coverage, half_width
-from protocol import CameraInfo, Sensor
-from protocol.errors import BadModel, InvalidField
+from neurove_protocol import CameraInfo, Sensor
+from neurove_protocol.errors import BadModel, InvalidField
 from tests.builders import make_events
 
 HIDDEN = 6

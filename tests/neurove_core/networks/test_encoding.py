@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from neurove_core.encoding import to_spikes, to_spikes_reference
+from neurove_core.networks.encoding import to_spikes, to_spikes_reference
 
 ALL_COUNTS = torch.arange(256, dtype=torch.uint8)
 

@@ -8,24 +8,26 @@ import pytest
 import torch
 from torch import nn
 
-from neurove_core import bundle, carried, golden, networks
-from neurove_core.bundle import PER_HEIGHT
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.estimator import Estimator, Push
-from neurove_core.evaluation import answer, judge, report
+from neurove_core.evaluation.judge import answer, judge, report
 from neurove_core.io import open_source
-from neurove_core.snn_ang import CHANNELS, OUTPUT_TAU_STEPS
+from neurove_core.models import bundle, golden
+from neurove_core.models.bundle import PER_HEIGHT
+from neurove_core.models.uncertainty import Uncertainty
+from neurove_core.networks import kinds
+from neurove_core.networks import state as carried
+from neurove_core.networks.snn_ang import CHANNELS, OUTPUT_TAU_STEPS
 from neurove_core.training import calibration, data
 from neurove_core.training.config import DataConfig, RecipeConfig, TrainingConfig
 from neurove_core.training.loop import train
 from neurove_core.training.ranks import ALONE, share_norms
-from neurove_core.uncertainty import Uncertainty
-from protocol import Sensor
-from protocol.errors import BadModel
+from neurove_protocol import Sensor
+from neurove_protocol.errors import BadModel
 from tests.builders import make_events
 
 SOURCE = "sim://street?seed=4&seconds=1.2&camera=pinhole:24x18:75&height=2"
-each_kind = pytest.mark.parametrize("kind", list(networks.KINDS))
+each_kind = pytest.mark.parametrize("kind", list(kinds.KINDS))
 STEPS, BATCH = 5, 3
 
 
@@ -75,7 +77,7 @@ def test_every_parameter_learns_and_a_detached_state_has_no_past(kind):
 
 @each_kind
 def test_a_state_with_a_nan_is_told_apart(kind):
-    state = networks.make(config_of(kind)).initial_state(2)
+    state = kinds.make(config_of(kind)).initial_state(2)
     assert state.finite()
     for tensor in carried.tensors_of(state):
         tensor[(0,) * tensor.dim()] = float("nan")
@@ -110,9 +112,7 @@ def test_a_bundle_of_one_kind_is_none_of_another():
 
 
 def test_the_ann_has_the_size_of_neurove_within_a_tenth():
-    sizes = {
-        kind: sum(one.numel() for one in networks.make(ModelConfig(kind=kind)).parameters()) for kind in networks.KINDS
-    }
+    sizes = {kind: sum(one.numel() for one in kinds.make(ModelConfig(kind=kind)).parameters()) for kind in kinds.KINDS}
     assert sizes["ann"] == pytest.approx(sizes["neurove"], rel=0.1)
 
 
@@ -141,7 +141,7 @@ def test_the_outputs_of_snn_ang_leak_and_never_fire():
 
 
 def test_snn_ang_halves_its_image_four_times_and_no_more():
-    network = networks.make(config_of("snn-ang", channels=CHANNELS))
+    network = kinds.make(config_of("snn-ang", channels=CHANNELS))
     sizes = [tuple(one.v.shape[1:]) for one in network.initial_state(1).membranes]
     assert sizes == [(16, 8, 11), (32, 4, 6), (64, 2, 3), (128, 1, 2), (256, 1, 2)]
 

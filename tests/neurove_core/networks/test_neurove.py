@@ -6,9 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from neurove_core import bundle
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from neurove_core.network import NetworkState, NeuroVE
+from neurove_core.models import bundle
+from neurove_core.networks.neurove import NetworkState, NeuroVE
 
 STEPS, BATCH = 6, 3
 each_form = pytest.mark.parametrize("diffusion", [True, False], ids=["neurove", "without_diffusion"])

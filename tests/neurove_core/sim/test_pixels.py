@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from neurove_core.sim.pixels import (
+from neurove_core.sim.render.pixels import (
     QUIET,
     Found,
     PixelConfig,
@@ -16,9 +16,9 @@ from neurove_core.sim.pixels import (
     low_pass,
     make_pixels,
 )
-from protocol import Sensor
-from protocol.errors import InvalidField, TimeBackwards
-from protocol.events import check_events
+from neurove_protocol import Sensor
+from neurove_protocol.errors import InvalidField, TimeBackwards
+from neurove_protocol.events import check_events
 
 SENSOR = Sensor(40, 30)
 N = SENSOR.width * SENSOR.height

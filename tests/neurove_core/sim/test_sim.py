@@ -5,20 +5,12 @@ import itertools
 import numpy as np
 import pytest
 
-from neurove_core.geometry import Poses, distort
+from neurove_core.geometry.camera import Poses, distort
+from neurove_core.geometry.rotations import exp, matrix_of
 from neurove_core.io import UnknownSource, open_source
 from neurove_core.io.recording import CHUNK_EVENTS
-from neurove_core.rotations import exp, matrix_of
-from neurove_core.sim.camera import CAMERAS, as_image, named_camera, rays_of
 from neurove_core.sim.draw import draw
-from neurove_core.sim.pixels import QUIET, PixelConfig
-from neurove_core.sim.reference import render_reference
-from neurove_core.sim.render import render
-from neurove_core.sim.scene import SCENES, named_scene
-from neurove_core.sim.simulate import MOTION_PX, Simulation, simulate
-from neurove_core.sim.source import simulation_of
-from neurove_core.sim.textures import make_textures
-from neurove_core.sim.trajectory import (
+from neurove_core.sim.motion.trajectory import (
     Mounted,
     Trajectory,
     driving,
@@ -29,10 +21,18 @@ from neurove_core.sim.trajectory import (
     slider,
     still,
 )
-from neurove_core.sim.views import World
-from protocol import Events, Sensor
-from protocol.errors import InvalidField
-from protocol.events import check_events
+from neurove_core.sim.render.camera import CAMERAS, as_image, named_camera, rays_of
+from neurove_core.sim.render.pixels import QUIET, PixelConfig
+from neurove_core.sim.render.reference import render_reference
+from neurove_core.sim.render.render import render
+from neurove_core.sim.render.views import World
+from neurove_core.sim.simulate import MOTION_PX, Simulation, simulate
+from neurove_core.sim.source import simulation_of
+from neurove_core.sim.world.scene import SCENES, named_scene
+from neurove_core.sim.world.textures import make_textures
+from neurove_protocol import Events, Sensor
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import check_events
 from tests.recordings import shared
 
 SMALL = named_camera("pinhole:86x65:75")

@@ -6,10 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neurove_core import rotations
-from neurove_core.geometry import Poses, twists
-from neurove_core.sim.trajectory import Mounted, Trajectory, driving, from_poses, hand_held, parse_trajectory, still
-from protocol.errors import InvalidField
+from neurove_core.geometry import rotations
+from neurove_core.geometry.camera import Poses, twists
+from neurove_core.sim.motion.trajectory import (
+    Mounted,
+    Trajectory,
+    driving,
+    from_poses,
+    hand_held,
+    parse_trajectory,
+    still,
+)
+from neurove_protocol.errors import InvalidField
 from tests.recordings import shared
 
 DT_S = 1e-5

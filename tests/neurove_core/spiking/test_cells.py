@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from neurove_core.cells import (
+from neurove_core.spiking.aslstm import (
     ASLSTM,
     SLSTM,
     ASLSTMParams,
@@ -18,7 +18,7 @@ from neurove_core.cells import (
     readout_step,
     slstm_step,
 )
-from protocol.errors import InvalidField
+from neurove_protocol.errors import InvalidField
 
 each_form = pytest.mark.parametrize("diffusion", [True, False], ids=["aslstm", "without_diffusion"])
 each_width = pytest.mark.parametrize(("inputs", "hidden"), [(1, 8), (8, 8), (5, 3)])

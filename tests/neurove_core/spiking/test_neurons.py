@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 import neurove_core
-from neurove_core import neurons
-from neurove_core.neurons import (
+from neurove_core.spiking import lif as neurons
+from neurove_core.spiking.lif import (
     ALIFParams,
     LIFParams,
     LIFState,
@@ -24,8 +24,8 @@ from neurove_core.neurons import (
     lif_step,
     ltc_step,
 )
-from neurove_core.surrogate import surrogate_gradient
-from protocol.errors import InvalidField
+from neurove_core.spiking.surrogate import surrogate_gradient
+from neurove_protocol.errors import InvalidField
 
 LIF = LIFParams(decay=0.9, v_th=1.0)
 

@@ -4,10 +4,27 @@ import numpy as np
 import pytest
 import torch
 
-from neurove_core import recurrence
-from neurove_core.cells import ASLSTMParams, ASLSTMState, SLSTMParams, SLSTMState, aslstm_step, readout_step, slstm_step
-from neurove_core.neurons import LTCParams, LTCState, diffuse, ltc_step
-from neurove_core.recurrence import ASLSTM, LTC, SLSTM, Constants, LayerState, LayerWeights, State, Weights
+from neurove_core.spiking.aslstm import (
+    ASLSTMParams,
+    ASLSTMState,
+    SLSTMParams,
+    SLSTMState,
+    aslstm_step,
+    readout_step,
+    slstm_step,
+)
+from neurove_core.spiking.fused import recurrence
+from neurove_core.spiking.fused.recurrence import (
+    ASLSTM,
+    LTC,
+    SLSTM,
+    Constants,
+    LayerState,
+    LayerWeights,
+    State,
+    Weights,
+)
+from neurove_core.spiking.lif import LTCParams, LTCState, diffuse, ltc_step
 
 STEPS, BATCH, HIDDEN = 40, 5, 7
 CONSTANTS = Constants(alpha=0.5, width=0.5, damping=0.25)

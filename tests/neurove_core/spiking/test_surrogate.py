@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neurove_core.surrogate import spike, surrogate_gradient
+from neurove_core.spiking.surrogate import spike, surrogate_gradient
 
 KINDS = ("rectangular", "arctan", "triangle")
 each_kind = pytest.mark.parametrize("kind", KINDS)

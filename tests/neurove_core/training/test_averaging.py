@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
-from neurove_core import bundle, golden
 from neurove_core.estimator import Estimator
+from neurove_core.models import bundle, golden
 from neurove_core.training.averaging import average
-from protocol.errors import BadModel, InvalidField
+from neurove_protocol.errors import BadModel, InvalidField
 from tests.bundles import CONFIG, ORIGINAL
 
 

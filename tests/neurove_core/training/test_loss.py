@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from neurove_core.loss import Balance, group_loss, scaled_sum
+from neurove_core.training.loss import Balance, group_loss, scaled_sum
 
 
 def test_the_loss_of_a_group_is_half_the_mean_length_of_its_errors():

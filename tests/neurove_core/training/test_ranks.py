@@ -12,17 +12,17 @@ import safetensors.torch
 import torch
 from torch import nn
 
-from neurove_core import bundle
-from neurove_core.carried import detached
-from neurove_core.encoding import to_spikes
-from neurove_core.loss import scaled_sum
+from neurove_core.models import bundle
+from neurove_core.networks.encoding import to_spikes
+from neurove_core.networks.state import detached
 from neurove_core.training import data
 from neurove_core.training.batches import Segment, draw
 from neurove_core.training.config import TrainingConfig
 from neurove_core.training.loop import CHECKPOINT, RUN_JSON, descend, errors, learn, learning_rate, train
+from neurove_core.training.loss import scaled_sum
 from neurove_core.training.ranks import ALONE, LostRank, SharedNorm, device_of, together
 from neurove_core.training.run import Run
-from protocol.errors import BadModel, InvalidField
+from neurove_protocol.errors import BadModel, InvalidField
 from tests.neurove_core.test_training import TINY
 
 CONFIG, RECIPE = TINY, TINY.recipe
@@ -31,7 +31,7 @@ CONFIG, RECIPE = TINY, TINY.recipe
 @pytest.fixture(autouse=True)
 def _tests_can_be_imported(monkeypatch):
     """By the processes that are started, which get this one's path: what they run stands in this file."""
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[2]))
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[3]))
 
 
 @pytest.fixture(scope="module")

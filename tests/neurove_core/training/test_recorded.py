@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from neurove_core import bundle
-from neurove_core.geometry import Twists
+from neurove_core.geometry.camera import Twists
 from neurove_core.io import UnknownSource, open_source, write_mcap
+from neurove_core.models import bundle
 from neurove_core.training import config as configs
 from neurove_core.training import data
 from neurove_core.training.batches import draw
@@ -14,7 +14,7 @@ from neurove_core.training.config import DataConfig, TrainingConfig
 from neurove_core.training.loop import learn, train
 from neurove_core.training.recorded import Recorded, pieces
 from neurove_core.training.run import Run
-from protocol.errors import InvalidField
+from neurove_protocol.errors import InvalidField
 from tests.builders import make_events
 from tests.neurove_core.test_training import MODEL, TINY
 from tests.recordings import ecd_text

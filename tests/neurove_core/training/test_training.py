@@ -8,16 +8,16 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from neurove_core import bundle, golden
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.estimator import Estimator
-from neurove_core.geometry import lookup_table
+from neurove_core.geometry.camera import lookup_table
 from neurove_core.io.errors import BrokenRecording
-from neurove_core.sim.camera import named_camera
-from neurove_core.sim.pixels import PixelConfig
-from neurove_core.sim.scene import named_scene
+from neurove_core.models import bundle, golden
+from neurove_core.sim.motion.trajectory import Mounted, rotation
+from neurove_core.sim.render.camera import named_camera
+from neurove_core.sim.render.pixels import PixelConfig
 from neurove_core.sim.simulate import Simulation
-from neurove_core.sim.trajectory import Mounted, rotation
+from neurove_core.sim.world.scene import named_scene
 from neurove_core.training import config as configs
 from neurove_core.training import data
 from neurove_core.training.batches import (
@@ -37,8 +37,8 @@ from neurove_core.training.batches import (
 from neurove_core.training.config import DataConfig, RecipeConfig, TrainingConfig
 from neurove_core.training.loop import CHECKPOINT, RUN_JSON, golden_windows, learn, learning_rate, train
 from neurove_core.training.run import Run
-from protocol import Events
-from protocol.errors import BadModel, InvalidField
+from neurove_protocol import Events
+from neurove_protocol.errors import BadModel, InvalidField
 
 MODEL = ModelConfig(
     canonical=CanonicalConfig(width=22, height=16, hfov_deg=80),

@@ -2,7 +2,7 @@
 
 import sys
 
-from service.bars import progress
+from neurove_service.cli.bars import progress
 
 
 def test_a_terminal_shows_a_bar_for_each_task(monkeypatch, capsys):

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from service.cli import main
+from neurove_service.cli.main import main
 
 
 def test_bench_as_json_is_a_list_of_rows_and_says_on_which_machine(capsys):

@@ -9,10 +9,10 @@ import pytest
 import safetensors.torch
 import torch
 
-from neurove_core import bundle, golden
-from neurove_core.about import About, Limits, MadeBy
 from neurove_core.estimator import Estimator
-from service import cli
+from neurove_core.models import bundle, golden
+from neurove_core.models.about import About, Limits, MadeBy
+from neurove_service.cli import main
 from tests.bundles import CONFIG, DATA, ORIGINAL, with_fields, with_tensors
 
 TOLD = About(
@@ -263,7 +263,7 @@ def test_wrong_usage_is_one_line_and_exit_code_2(run, signed, arguments, telling
 )
 def test_a_wrong_flag_is_explained_with_exit_code_2(capsys, arguments, telling):
     with pytest.raises(SystemExit) as raised:
-        cli.main(["model", *arguments])
+        main.main(["model", *arguments])
     assert raised.value.code == 2
     assert telling in capsys.readouterr().err
 

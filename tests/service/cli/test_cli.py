@@ -4,9 +4,9 @@ import json
 
 import pytest
 
-from neurove_core import bundle
 from neurove_core.experiments import firing
-from service import cli, commands_running
+from neurove_core.models import bundle
+from neurove_service.cli import main, running
 
 
 def test_config_show_is_toml_that_serve_reads_back(run, tmp_path, monkeypatch):
@@ -70,7 +70,7 @@ def test_wrong_usage_is_one_line_and_exit_code_2(run, tmp_path, monkeypatch, arg
 )
 def test_a_wrong_flag_is_explained_with_exit_code_2(capsys, arguments, telling):
     with pytest.raises(SystemExit) as raised:
-        cli.main(arguments)
+        main.main(arguments)
     assert raised.value.code == 2
     assert telling in capsys.readouterr().err
 
@@ -79,7 +79,7 @@ def test_control_c_before_a_command_took_over_is_no_traceback(run, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(commands_running, "load", interrupted)
+    monkeypatch.setattr(running, "load", interrupted)
     assert run("config", "show") == (130, "", "")
 
 

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from neurove_core import bundle
 from neurove_core.io import open_source
-from service import cli
+from neurove_core.models import bundle
+from neurove_service.cli import main
 
 CONFIG = """
 name = "tiny"
@@ -37,7 +37,7 @@ def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("train")
     (folder / "tiny.toml").write_text(CONFIG)
     arguments = ["train", str(folder / "tiny.toml"), "--out", str(folder / "out"), "--calibration", "16", "--json"]
-    assert cli.main(arguments) == 0
+    assert main.main(arguments) == 0
     return folder
 
 

@@ -6,10 +6,10 @@ import time
 import pytest
 from rich.console import Console
 
-from protocol.control import HealthReply, Losses, ModelInfo, ModelsReply
-from service.health import stream_status
-from service.stream import Arrival, Stream
-from service.views import Board, health_table, models_table
+from neurove_protocol.control import HealthReply, Losses, ModelInfo, ModelsReply
+from neurove_service.cli.views import Board, health_table, models_table
+from neurove_service.node.health import stream_status
+from neurove_service.streams.stream import Arrival, Stream
 from tests.builders import make_packets
 
 INFO = ModelInfo(name="one", digest="ab" * 32, trained=False, provenance="a test", parameters=1234)

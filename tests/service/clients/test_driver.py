@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from neurove_core.io import BrokenRecording
 from neurove_core.io.packets import PACKET_EVENTS, PACKET_US, slices
-from protocol import Events
-from service.driver import repeated
+from neurove_protocol import Events
+from neurove_service.clients.driver import repeated
 from tests.builders import make_events
 
 

@@ -2,9 +2,9 @@ import hashlib
 
 import pytest
 
-from protocol.control import MAX_SIGNATURE_BYTES, ChunkRequest
-from protocol.errors import BadModel, InvalidField, Malformed
-from service.push_source import PushSource
+from neurove_protocol.control import MAX_SIGNATURE_BYTES, ChunkRequest
+from neurove_protocol.errors import BadModel, InvalidField, Malformed
+from neurove_service.clients.push_source import PushSource
 
 
 @pytest.fixture

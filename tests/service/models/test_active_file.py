@@ -2,7 +2,7 @@ import json
 
 import pytest
 
-from service.active_file import Active, ActiveFile
+from neurove_service.models.active_file import Active, ActiveFile
 
 KEPT = Active(digest="5e" * 32, previous=None, configured="default", highest_release=7)
 

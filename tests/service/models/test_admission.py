@@ -1,7 +1,7 @@
 import pytest
 
-from protocol.errors import NoMemory, TooSlow
-from service import admission
+from neurove_protocol.errors import NoMemory, TooSlow
+from neurove_service.models import admission
 
 MEMINFO = "MemTotal:       16000000 kB\nMemFree:         1000000 kB\nMemAvailable:    4000000 kB\n"
 

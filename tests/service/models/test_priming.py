@@ -7,14 +7,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-from neurove_core import bundle
-from neurove_core.about import About
 from neurove_core.config import ModelConfig
-from protocol.errors import Diverged
-from service.lane import windows_to_prime
-from service.lanes import RingSize
-from service.model_slot import ModelSlot, Rules
-from service.stream import Arrival, Stream
+from neurove_core.models import bundle
+from neurove_core.models.about import About
+from neurove_protocol.errors import Diverged
+from neurove_service.models.slot import ModelSlot, Rules
+from neurove_service.streams.lane import windows_to_prime
+from neurove_service.streams.lanes import RingSize
+from neurove_service.streams.stream import Arrival, Stream
 from tests.builders import make_packets
 from tests.service.conftest import SMALL
 from tests.service.test_swap import LAX, feed, said, wait_until

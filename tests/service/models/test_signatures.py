@@ -5,14 +5,14 @@ import threading
 
 import pytest
 
-from neurove_core import manifest, signing_keys
-from protocol.control import ActivateRequest, ModelsReply, ModelsRequest, PushRequest
-from protocol.errors import Downgrade, InvalidField, Untrusted
-from service.active_file import Active, ActiveFile
-from service.handlers import Handlers
-from service.model_slot import ModelSlot, Rules
-from service.model_store import ModelStore
-from service.signatures import verifier
+from neurove_core.models import manifest, signing_keys
+from neurove_protocol.control import ActivateRequest, ModelsReply, ModelsRequest, PushRequest
+from neurove_protocol.errors import Downgrade, InvalidField, Untrusted
+from neurove_service.models.active_file import Active, ActiveFile
+from neurove_service.models.signatures import verifier
+from neurove_service.models.slot import ModelSlot, Rules
+from neurove_service.models.store import ModelStore
+from neurove_service.node.handlers import Handlers
 
 KEY, OTHER = signing_keys.new(), signing_keys.new()
 

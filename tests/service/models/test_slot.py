@@ -3,8 +3,8 @@ import threading
 
 import pytest
 
-from protocol.errors import BadModel, Conflict, NothingBefore, UnknownModel
-from service.model_slot import ModelSlot, Rules
+from neurove_protocol.errors import BadModel, Conflict, NothingBefore, UnknownModel
+from neurove_service.models.slot import ModelSlot, Rules
 from tests.service.test_swap import wait_until
 
 
@@ -43,7 +43,7 @@ def test_a_broken_bundle_is_listed_with_its_reason_and_refused(models_dir, tmp_p
 
 
 def test_two_models_of_one_name_must_be_told_apart_by_digest(models_dir, tmp_path):
-    from neurove_core import bundle
+    from neurove_core.models import bundle
 
     shutil.copytree(models_dir, tmp_path, dirs_exist_ok=True)
     twin = bundle.load(models_dir / "one.safetensors")

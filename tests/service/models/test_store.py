@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neurove_core import bundle
 from neurove_core.config import NetworkConfig
-from protocol.control import PushRequest
-from protocol.errors import BadModel, Cut, Downgrade, NeuroVEError, NoQuota, NoSpace, NoStore, TooLarge
-from service import model_store
-from service.library import Library
-from service.model_slot import ModelSlot
-from service.model_store import ModelStore
-from service.pull import LEAST_BYTES, ChunkLength
-from service.signatures import Signed
+from neurove_core.models import bundle
+from neurove_protocol.control import PushRequest
+from neurove_protocol.errors import BadModel, Cut, Downgrade, NeuroVEError, NoQuota, NoSpace, NoStore, TooLarge
+from neurove_service.models import store as model_store
+from neurove_service.models.library import Library
+from neurove_service.models.pull import LEAST_BYTES, ChunkLength
+from neurove_service.models.signatures import Signed
+from neurove_service.models.slot import ModelSlot
+from neurove_service.models.store import ModelStore
 from tests.service.conftest import SMALL
 
 RUNS = threading.Event()

@@ -7,13 +7,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from neurove_core import bundle
 from neurove_core.config import WindowConfig
-from protocol import Flag
-from protocol.errors import Conflict, Diverged, InvalidField, NoMemory, NothingBefore, TooSlow
-from service.comparison import Limits
-from service.model_slot import ModelSlot, Rules
-from service.stream import Arrival, Stream
+from neurove_core.models import bundle
+from neurove_protocol import Flag
+from neurove_protocol.errors import Conflict, Diverged, InvalidField, NoMemory, NothingBefore, TooSlow
+from neurove_service.models.slot import ModelSlot, Rules
+from neurove_service.streams.comparison import Limits
+from neurove_service.streams.stream import Arrival, Stream
 from tests.builders import make_packets
 from tests.service.conftest import SMALL
 

@@ -3,8 +3,8 @@ import threading
 
 import pytest
 
-from neurove_core import bundle
-from protocol.control import (
+from neurove_core.models import bundle
+from neurove_protocol.control import (
     ActivateReply,
     ActivateRequest,
     HealthReply,
@@ -17,14 +17,22 @@ from protocol.control import (
     PushRequest,
     RollbackRequest,
 )
-from protocol.errors import Downgrade, InvalidField, Malformed, NeuroVEError, NoStore, NothingBefore, UnknownModel
-from service.active_file import Active, ActiveFile
-from service.handlers import Handlers
-from service.health import stream_status
-from service.model_slot import ModelSlot, Rules
-from service.model_store import ModelStore
-from service.signatures import Signed
-from service.stream import Arrival, Stream
+from neurove_protocol.errors import (
+    Downgrade,
+    InvalidField,
+    Malformed,
+    NeuroVEError,
+    NoStore,
+    NothingBefore,
+    UnknownModel,
+)
+from neurove_service.models.active_file import Active, ActiveFile
+from neurove_service.models.signatures import Signed
+from neurove_service.models.slot import ModelSlot, Rules
+from neurove_service.models.store import ModelStore
+from neurove_service.node.handlers import Handlers
+from neurove_service.node.health import stream_status
+from neurove_service.streams.stream import Arrival, Stream
 from tests.builders import make_packets
 from tests.service.conftest import SMALL
 

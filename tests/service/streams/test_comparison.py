@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from neurove_core import about
-from service.comparison import Answered, Comparison, Limits, finding
+from neurove_core.models import about
+from neurove_service.streams.comparison import Answered, Comparison, Limits, finding
 from tests.bundles import make_bundle
 
 

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from neurove_core.windows import Window
-from service.ring import Ring, packed
+from neurove_core.ingest.windows import Window
+from neurove_service.streams.ring import Ring, packed
 
 SHAPE = (10, 16, 24)
 

@@ -7,12 +7,12 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neurove_core import bundle
-from neurove_core.uncertainty import Uncertainty
-from protocol import CameraInfo, Flag, Sensor
-from protocol.errors import InvalidField
-from service.model_slot import ModelSlot
-from service.stream import Arrival, Stream
+from neurove_core.models import bundle
+from neurove_core.models.uncertainty import Uncertainty
+from neurove_protocol import CameraInfo, Flag, Sensor
+from neurove_protocol.errors import InvalidField
+from neurove_service.models.slot import ModelSlot
+from neurove_service.streams.stream import Arrival, Stream
 from tests.builders import make_packet, make_packets
 from tests.service.conftest import SMALL
 
@@ -109,7 +109,7 @@ _SLOTS: list = []
 
 def _slot():
     if not _SLOTS:
-        from service.model_slot import ModelSlot
+        from neurove_service.models.slot import ModelSlot
 
         _SLOTS.append(ModelSlot("untrained"))
     return _SLOTS[0]

@@ -2,11 +2,11 @@ import threading
 
 import pytest
 
-from protocol import CameraInfo, TwistEstimate
-from protocol.errors import Malformed
-from protocol.events import Limits, encode_packet
-from service.stream import Stream
-from service.worker import Inbox, Outlet, Sample, StreamWorker
+from neurove_protocol import CameraInfo, TwistEstimate
+from neurove_protocol.errors import Malformed
+from neurove_protocol.events import Limits, encode_packet
+from neurove_service.streams.stream import Stream
+from neurove_service.streams.worker import Inbox, Outlet, Sample, StreamWorker
 from tests.builders import make_packets
 
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from neurove_core.io.clock import count_on
 from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.recording import BLOCK_BYTES, SUPPORTED, EventsOnly, Imu, in_chunks, whole
-from protocol.errors import EventOutsideSensor, InvalidField, TimeBackwards
-from protocol.events import Events, Sensor, check_events
+from neurove_protocol.errors import EventOutsideSensor, InvalidField, TimeBackwards
+from neurove_protocol.events import Events, Sensor, check_events
 
 MAX_HEADER_BYTES = 4 << 20  # jAER writes all its preferences there, some 200,000 bytes
 PAIR = np.dtype([("address", ">u4"), ("t", ">u4")])

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
 from neurove_core.io.recording import SUPPORTED, EventsOnly, Frame, Imu, Triggers, in_chunks, whole
-from protocol.errors import EventOutsideSensor, InvalidField, TimeBackwards
-from protocol.events import Events, Sensor, check_events
+from neurove_protocol.errors import EventOutsideSensor, InvalidField, TimeBackwards
+from neurove_protocol.events import Events, Sensor, check_events
 
 _MAGIC = b"#!AER-DAT4.0\r\n"
 MAX_HEADER_BYTES = 16 << 20  # a header has some 3,000 bytes

@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple, Self
 
 from neurove_core.extras import MissingExtra
-from neurove_core.io.bag_files import MAX_RECORD_BYTES, BagMessage, type_name, unpacked
 from neurove_core.io.errors import BrokenRecording, UnknownSource
-from neurove_core.io.mcap_records import (
+from neurove_core.io.formats.containers.bags import MAX_RECORD_BYTES, BagMessage, type_name, unpacked
+from neurove_core.io.formats.containers.mcap_records import (
     CHANNEL,
     CHUNK,
     CHUNK_HEAD,

@@ -9,7 +9,7 @@ from io import BytesIO
 from typing import Any, BinaryIO, Final, NamedTuple
 
 from neurove_core.extras import MissingExtra
-from neurove_core.io.bag_files import MAX_RECORD_BYTES
+from neurove_core.io.formats.containers.bags import MAX_RECORD_BYTES
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, _CHUNK_INDEX, METADATA, DATA_END = 1, 2, 3, 4, 5, 6, 8, 0xC, 15

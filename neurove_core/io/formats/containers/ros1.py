@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, BinaryIO, Final, NamedTuple, Self
 
 from neurove_core.extras import MissingExtra
-from neurove_core.io.bag_files import MAX_RECORD_BYTES, BagMessage
 from neurove_core.io.errors import BrokenRecording, UnknownSource
+from neurove_core.io.formats.containers.bags import MAX_RECORD_BYTES, BagMessage
 from neurove_core.io.recording import SUPPORTED
 
 MAGIC: Final = b"#ROSBAG V2.0\n"

@@ -2,15 +2,15 @@
 
 from pathlib import Path
 
-from neurove_core.io.dsec import DsecRecording
 from neurove_core.io.errors import UnknownSource
-from neurove_core.io.hdf5 import has, opened
-from neurove_core.io.m3ed import TOPICS as M3ED_TOPICS
-from neurove_core.io.m3ed import M3edRecording
-from neurove_core.io.mvsec import TOPICS as MVSEC_TOPICS
-from neurove_core.io.mvsec import MvsecRecording
+from neurove_core.io.formats.hdf5.dsec import DsecRecording
+from neurove_core.io.formats.hdf5.file import has, opened
+from neurove_core.io.formats.hdf5.m3ed import TOPICS as M3ED_TOPICS
+from neurove_core.io.formats.hdf5.m3ed import M3edRecording
+from neurove_core.io.formats.hdf5.mvsec import TOPICS as MVSEC_TOPICS
+from neurove_core.io.formats.hdf5.mvsec import MvsecRecording
 from neurove_core.io.recording import SUPPORTED, Recording, refuse_topic
-from protocol.events import Sensor
+from neurove_protocol.events import Sensor
 
 _LOOKED_FOR = (
     "davis/left/events or davis/right/events (MVSEC)",

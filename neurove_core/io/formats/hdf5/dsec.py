@@ -19,14 +19,14 @@ from typing import Any, Final, Self
 
 import numpy as np
 
-from neurove_core.geometry import Poses, Twists
+from neurove_core.geometry.camera import Poses, Twists
 from neurove_core.io.errors import BrokenRecording
-from neurove_core.io.hdf5 import Column, dataset, has, opened, value
-from neurove_core.io.hdf5_tables import EventTable, ImuTable, TableRecording, seek_indexed
+from neurove_core.io.formats.hdf5.file import Column, dataset, has, opened, value
+from neurove_core.io.formats.hdf5.tables import EventTable, ImuTable, TableRecording, seek_indexed
 from neurove_core.io.poses import stored_poses, table
-from protocol.camera import CameraInfo
-from protocol.errors import InvalidField
-from protocol.events import Events, Sensor
+from neurove_protocol.camera import CameraInfo
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import Events, Sensor
 
 DSEC_SENSOR: Final = Sensor(640, 480)
 """The Prophesee Gen3.1 of the data set."""

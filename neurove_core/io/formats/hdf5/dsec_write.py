@@ -7,11 +7,11 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from neurove_core.files import written_whole
-from neurove_core.io import hdf5
-from neurove_core.io.dsec import LENS_FIELDS
+from neurove_core.io.formats.hdf5 import file as hdf5
+from neurove_core.io.formats.hdf5.dsec import LENS_FIELDS
 from neurove_core.io.recording import Recording
-from protocol.errors import InvalidField
-from protocol.events import Events
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import Events
 
 MAX_SPAN_S: Final = 86_400
 """Longest recording; beyond it its times jump, for the index has an entry for each millisecond."""

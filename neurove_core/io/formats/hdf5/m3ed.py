@@ -16,15 +16,15 @@ from typing import Any, Final, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core import rotations
-from neurove_core.geometry import Poses
+from neurove_core.geometry import rotations
+from neurove_core.geometry.camera import Poses
 from neurove_core.io.errors import BrokenRecording
-from neurove_core.io.hdf5 import Column, dataset, has, opened, value
-from neurove_core.io.hdf5_tables import EventTable, ImuTable, TableRecording, chosen_topic, seek_indexed
+from neurove_core.io.formats.hdf5.file import Column, dataset, has, opened, value
+from neurove_core.io.formats.hdf5.tables import EventTable, ImuTable, TableRecording, chosen_topic, seek_indexed
 from neurove_core.io.poses import m3ed_poses
-from protocol.camera import CameraInfo
-from protocol.errors import InvalidField
-from protocol.events import Events, Sensor
+from neurove_protocol.camera import CameraInfo
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import Events, Sensor
 
 EVK4: Final = Sensor(1280, 720)
 """Both cameras, where the file has no calibration."""

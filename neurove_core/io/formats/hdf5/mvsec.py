@@ -14,15 +14,15 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core import rotations
-from neurove_core.geometry import Poses
+from neurove_core.geometry import rotations
+from neurove_core.geometry.camera import Poses
 from neurove_core.io.errors import BrokenRecording
-from neurove_core.io.hdf5 import Column, dataset, has, opened, read_rows
-from neurove_core.io.hdf5_tables import EventTable, ImuTable, TableRecording, chosen_topic
+from neurove_core.io.formats.hdf5.file import Column, dataset, has, opened, read_rows
+from neurove_core.io.formats.hdf5.tables import EventTable, ImuTable, TableRecording, chosen_topic
 from neurove_core.io.poses import mvsec_odometry
 from neurove_core.io.recording import Frame
-from protocol.camera import CameraInfo
-from protocol.events import Sensor
+from neurove_protocol.camera import CameraInfo
+from neurove_protocol.events import Sensor
 
 DAVIS346: Final = Sensor(346, 260)
 """Both cameras."""

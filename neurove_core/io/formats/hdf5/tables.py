@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.geometry import Twists, twists
+from neurove_core.geometry.camera import Twists, twists
 from neurove_core.io.errors import BrokenRecording, UnknownSource
-from neurove_core.io.hdf5 import FAULTS, Column, opened, read_rows
+from neurove_core.io.formats.hdf5.file import FAULTS, Column, opened, read_rows
 from neurove_core.io.recording import CHUNK_EVENTS, SUPPORTED, EventsOnly, Imu, later
-from protocol.events import Events, Sensor
+from neurove_protocol.events import Events, Sensor
 
 _MAX_T_US = 1 << 62
 

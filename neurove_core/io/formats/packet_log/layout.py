@@ -24,9 +24,9 @@ from typing import Any, Final, NamedTuple
 import msgpack
 import numpy as np
 
-from neurove_core.geometry import Poses, Twists
+from neurove_core.geometry.camera import Poses, Twists
 from neurove_core.io.recording import Frame, Imu, Triggers
-from protocol import camera, events
+from neurove_protocol import camera, events
 
 PROFILE: Final = "neurove"
 VERSION: Final = 1

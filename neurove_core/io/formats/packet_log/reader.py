@@ -7,16 +7,16 @@ from typing import Any, Final, NamedTuple, Self, TypeVar
 
 import numpy as np
 
-from neurove_core.geometry import Poses, Twists
-from neurove_core.io import mcap_layout
+from neurove_core.geometry.camera import Poses, Twists
 from neurove_core.io.checked import checked
 from neurove_core.io.errors import BrokenRecording, UnknownSource
-from neurove_core.io.mcap_file import McapFile, Record
-from neurove_core.io.mcap_layout import BadColumns
+from neurove_core.io.formats.containers.mcap import McapFile, Record
+from neurove_core.io.formats.packet_log import layout
+from neurove_core.io.formats.packet_log.layout import BadColumns
 from neurove_core.io.recording import SUPPORTED, EventsOnly, Frame, Imu, Triggers, later
-from protocol.camera import CameraInfo
-from protocol.errors import NeuroVEError
-from protocol.events import EventPacket, Events, Limits, Sensor, decode_packet
+from neurove_protocol.camera import CameraInfo
+from neurove_protocol.errors import NeuroVEError
+from neurove_protocol.events import EventPacket, Events, Limits, Sensor, decode_packet
 
 LIMITS: Final = Limits(max_events=16_000_000, max_side_px=1 << 15)
 """Caps on packets: those of the wire are the service's to set, and a recording may come from any."""
@@ -147,7 +147,7 @@ class McapRecording(EventsOnly):
 
     def frames(self) -> Iterator[Frame]:
         """Images, as the converted recording had them."""
-        return self._messages("frames", mcap_layout.unpack_frame)
+        return self._messages("frames", layout.unpack_frame)
 
     def poses(self) -> Poses | None:
         """Poses, as the converted recording had them."""
@@ -161,7 +161,7 @@ class McapRecording(EventsOnly):
         return f"{self.stream}/{kind}"
 
     def _tables(self, kind: str) -> Iterator[Any]:
-        return self._messages(kind, lambda data: mcap_layout.unpack_columns(kind, data))
+        return self._messages(kind, lambda data: layout.unpack_columns(kind, data))
 
     def _joined(self, kind: str, table: Callable[..., T]) -> T | None:
         parts = list(self._tables(kind))

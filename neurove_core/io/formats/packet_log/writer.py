@@ -10,13 +10,13 @@ from typing import Any, Final, Self
 import numpy as np
 
 from neurove_core.extras import MissingExtra
-from neurove_core.io import mcap_layout
+from neurove_core.io.formats.packet_log import layout
 from neurove_core.io.packets import slices
 from neurove_core.io.recording import Recording
-from protocol.camera import CameraInfo
-from protocol.errors import InvalidField
-from protocol.events import EventPacket, encode_packet
-from protocol.keys import check_name
+from neurove_protocol.camera import CameraInfo
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import EventPacket, encode_packet
+from neurove_protocol.keys import check_name
 
 CHUNK_BYTES: Final = 1 << 20
 """So much is compressed at once, and lost at most where the machine fails."""
@@ -56,7 +56,7 @@ class PacketWriter:
                 why = "a recording that was cut short lies there, or is being written: rename or remove it"
                 raise InvalidField("recording", "FILE", str(self._part), why) from None
         self._writer: Any = Writer(self._file, CHUNK_BYTES, CompressionType.ZSTD)
-        self._writer.start(mcap_layout.PROFILE, "neurove")
+        self._writer.start(layout.PROFILE, "neurove")
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._count: dict[int, int] = {}
@@ -102,7 +102,7 @@ class PacketWriter:
             self._writer.add_message(channel, log_ns, payload, log_ns, number & 0xFFFFFFFF)
 
     def _registered(self, topic: str, kind: str) -> int:
-        name, encoding = mcap_layout.schema_of(kind)
+        name, encoding = layout.schema_of(kind)
         if name not in self._schemas:
             self._schemas[name] = self._writer.register_schema(name, "", b"")
         return int(self._writer.register_channel(topic, encoding, self._schemas[name]))
@@ -110,7 +110,7 @@ class PacketWriter:
     def about(self, **told: object) -> None:
         """Note what was recorded, and from where, as text."""
         with self._told():
-            self._writer.add_metadata(mcap_layout.PROFILE, {name: str(value) for name, value in told.items()})
+            self._writer.add_metadata(layout.PROFILE, {name: str(value) for name, value in told.items()})
 
     @property
     def bytes_written(self) -> int:
@@ -189,10 +189,10 @@ def _write_beside(recording: Recording, stream: str, writer: PacketWriter) -> No
     if twists is not None:
         _write_rows(writer, stream, "twists", twists)
     for frame in recording.frames():
-        writer.add(stream, "frames", mcap_layout.pack_frame(frame), frame.t_us * 1000)
+        writer.add(stream, "frames", layout.pack_frame(frame), frame.t_us * 1000)
 
 
 def _write_rows(writer: PacketWriter, stream: str, kind: str, table: Any) -> None:
-    for first in range(0, table.t.size, mcap_layout.ROWS):
-        rows = type(table)(*(np.asarray(column)[first : first + mcap_layout.ROWS] for column in table))
-        writer.add(stream, kind, mcap_layout.pack_columns(kind, rows), int(rows.t[0]) * 1000)
+    for first in range(0, table.t.size, layout.ROWS):
+        rows = type(table)(*(np.asarray(column)[first : first + layout.ROWS] for column in table))
+        writer.add(stream, kind, layout.pack_columns(kind, rows), int(rows.t[0]) * 1000)

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from neurove_core.io.clock import count_on
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
-from neurove_core.io.prophesee import HEADER_BYTES, parse_header
+from neurove_core.io.formats.prophesee.raw import HEADER_BYTES, parse_header
 from neurove_core.io.recording import BLOCK_BYTES, SUPPORTED, EventsOnly, Triggers, in_chunks, later, whole
-from protocol.errors import EventOutsideSensor, TimeBackwards
-from protocol.events import Events, Sensor, check_events
+from neurove_protocol.errors import EventOutsideSensor, TimeBackwards
+from neurove_protocol.events import Events, Sensor, check_events
 
 RECORD = np.dtype([("t", "<u4"), ("bits", "<u4")])
 _EVENTS, _TRIGGERS = (0x00, 0x0C), (0x0E,)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.compiled import compiled
-from protocol.events import Events
+from neurove_protocol.events import Events
 
 OK: Final = 0  # every word was read, or `out` is full: call again with the words that were not
 ILLEGAL: Final = 1  # the next word is of no known type

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core import evt, triggers
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
+from neurove_core.io.formats.prophesee import evt, triggers
 from neurove_core.io.recording import BLOCK_BYTES, CHUNK_EVENTS, SUPPORTED, EventsOnly, Triggers, room
-from protocol.errors import InvalidField
-from protocol.events import Events, Sensor
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import Events, Sensor
 
 HEADER_BYTES = 64 << 10  # a header is some 500 bytes; more than this is none
 

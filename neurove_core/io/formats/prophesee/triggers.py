@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.compiled import compiled
-from neurove_core.evt import TIME_HIGH, TIME_LOW, counted_on, signed, step_of
+from neurove_core.io.formats.prophesee.evt import TIME_HIGH, TIME_LOW, counted_on, signed, step_of
 
 Columns = tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.uint8]]
 """Time [us], channel and level (1 rising, 0 falling) of trigger edges, each (N,); the fields of io's Triggers."""

@@ -10,11 +10,11 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core import kernels
+from neurove_core.ingest import counting
+from neurove_core.io.formats.ros.libcaer import WORD_EVENTS, LibcaerState, libcaer_decode
+from neurove_core.io.formats.ros.messages import DVS, BadMessage, EventMessage
 from neurove_core.io.recording import CHUNK_EVENTS, Triggers, room
-from neurove_core.io.ros_messages import DVS, BadMessage, EventMessage
-from neurove_core.kernels_libcaer import WORD_EVENTS, LibcaerState, libcaer_decode
-from protocol.events import Events, Sensor
+from neurove_protocol.events import Events, Sensor
 
 ENCODINGS: Final = ("evt3", "libcaer", "libcaer_cmp", "mono")
 UNIX_TIME: Final = ("libcaer", "libcaer_cmp", DVS)
@@ -45,8 +45,8 @@ class Decoder:
         self._sensor = sensor
         self._anchor = anchor
         self._seq: int | None = None
-        self._evt3 = kernels.Evt3State()
-        self._triggers = kernels.TriggerState()
+        self._evt3 = counting.Evt3State()
+        self._triggers = counting.TriggerState()
         self._libcaer = LibcaerState()
         self._shift_us: int | None = 0 if anchor is None else None  # None: to be found, after a gap
 
@@ -83,28 +83,28 @@ class Decoder:
         self._heed_a_gap(message)
         for _ in self._decoded(message):  # the clock goes on by the events, and a bad word is told
             pass
-        self._triggers, (t, channel, level) = kernels.evt3_triggers(_words(message), self._triggers)
+        self._triggers, (t, channel, level) = counting.evt3_triggers(_words(message), self._triggers)
         if t.size:
             yield Triggers(t + self._shift(message, int(t[0])), channel, level)
 
     def _heed_a_gap(self, message: EventMessage) -> None:
         """After lost messages it is not known what the camera said last of row, column and time."""
         if self._seq is not None and message.seq not in (self._seq + 1, -1):
-            self._evt3, self._triggers, self._shift_us = kernels.Evt3State(), kernels.TriggerState(), None
+            self._evt3, self._triggers, self._shift_us = counting.Evt3State(), counting.TriggerState(), None
             self._libcaer = LibcaerState()
         self._seq = message.seq
 
     def _of_evt3(self, message: EventMessage) -> Iterator[Events]:
         words, done = _words(message), 0
         while words.size:
-            out = room(min(CHUNK_EVENTS, max(words.size * kernels.VECTOR_EVENTS, kernels.VECTOR_EVENTS)))
+            out = room(min(CHUNK_EVENTS, max(words.size * counting.VECTOR_EVENTS, counting.VECTOR_EVENTS)))
             width, height = self._sensor.width, self._sensor.height
-            self._evt3, read, n, verdict = kernels.evt3_decode(words, self._evt3, width, height, out)
+            self._evt3, read, n, verdict = counting.evt3_decode(words, self._evt3, width, height, out)
             if n:
                 yield self._counted_on(out.span(0, n), message)
-            if verdict == kernels.OUTSIDE:
+            if verdict == counting.OUTSIDE:
                 raise BadMessage(f"an event at x={out.x[n]} y={out.y[n]} lies outside the sensor {self._sensor}")
-            if verdict != kernels.OK:
+            if verdict != counting.OK:
                 raise BadMessage(f"its word {done + read}, 0x{int(words[read]):04x}, is of no known type")
             words, done = words[read:], done + read
 
@@ -130,9 +130,9 @@ class Decoder:
             out = room(part.size * WORD_EVENTS)
             self._libcaer, read, n, verdict = libcaer_decode(part, self._libcaer, base_us, width, height, out)
             yield out.span(0, n)
-            if verdict == kernels.OUTSIDE:
+            if verdict == counting.OUTSIDE:
                 raise BadMessage(f"an event at x={out.x[n]} y={out.y[n]} lies outside the sensor {self._sensor}")
-            if verdict != kernels.OK:
+            if verdict != counting.OK:
                 raise BadMessage(f"its word {first + read}, 0x{int(part[read]):04x}, is of no known type")
 
 

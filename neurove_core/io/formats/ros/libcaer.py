@@ -20,8 +20,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.kernels import ILLEGAL, OK, OUTSIDE, compiled
-from protocol.events import Events
+from neurove_core.ingest.counting import ILLEGAL, OK, OUTSIDE, compiled
+from neurove_protocol.events import Events
 
 WORD_EVENTS: Final = 8
 """Most events that one word makes: `out` needs this many places a word."""

@@ -11,9 +11,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from protocol.camera import CameraInfo
-from protocol.errors import InvalidField
-from protocol.events import Events
+from neurove_protocol.camera import CameraInfo
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import Events
 
 MAX_MESSAGE_BYTES: Final = 64 << 20
 """A message larger than this is none; an event camera's are some 10 kB to some MB."""

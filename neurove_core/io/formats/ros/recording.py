@@ -8,20 +8,20 @@ from typing import Final, Self, TypeVar
 
 import numpy as np
 
-from neurove_core import geometry
-from neurove_core.geometry import Poses, Twists
-from neurove_core.io import ros_messages
-from neurove_core.io.bag_files import BagFile, BagFolder, BagMessage, SqliteBag, in_recorded_order
+from neurove_core.geometry import camera
+from neurove_core.geometry.camera import Poses, Twists
 from neurove_core.io.checked import checked
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
-from neurove_core.io.mcap_file import McapFile
+from neurove_core.io.formats.containers.bags import BagFile, BagFolder, BagMessage, SqliteBag, in_recorded_order
+from neurove_core.io.formats.containers.mcap import McapFile
+from neurove_core.io.formats.containers.ros1 import Ros1Bag
+from neurove_core.io.formats.ros import messages
+from neurove_core.io.formats.ros.events import UNIX_TIME, Anchor, Decoder
+from neurove_core.io.formats.ros.messages import BadMessage, EventMessage
 from neurove_core.io.recording import SUPPORTED, EventsOnly, Imu, Triggers, later
-from neurove_core.io.ros1_file import Ros1Bag
-from neurove_core.io.ros_events import UNIX_TIME, Anchor, Decoder
-from neurove_core.io.ros_messages import BadMessage, EventMessage
-from protocol.camera import CameraInfo
-from protocol.errors import InvalidField
-from protocol.events import Events, Sensor
+from neurove_protocol.camera import CameraInfo
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import Events, Sensor
 
 EVENT_TYPES: Final = ("event_camera_msgs/EventPacket", "event_array_msgs/EventArray", "dvs_msgs/EventArray")
 IMU_TYPE: Final = "sensor_msgs/Imu"
@@ -180,7 +180,7 @@ class RosbagRecording(EventsOnly):
         if topic is None:
             return None
         for message in self.bag.messages((topic,)):
-            info = self._read(message, ros_messages.camera_info)
+            info = self._read(message, messages.camera_info)
             if info is None or info.sensor != self.sensor:
                 return None
             return CameraInfo(**(info.model_dump() | {"stream": stream}))
@@ -194,11 +194,11 @@ class RosbagRecording(EventsOnly):
         """
         topic = self._beside(IMU_TYPE)
         offset_us = self.ros_offset_us
-        batch: list[ros_messages.ImuSample] = []
+        batch: list[messages.ImuSample] = []
         broken: BrokenRecording | None = None
         try:
             for message in self.bag.messages((topic,) if topic else ()):
-                sample = self._read(message, ros_messages.imu)
+                sample = self._read(message, messages.imu)
                 if batch and sample.stamp_ns < batch[-1].stamp_ns:
                     raise BrokenRecording(self.path, message.where, "time runs backwards")
                 batch.append(sample)
@@ -235,8 +235,8 @@ class RosbagRecording(EventsOnly):
         if topic is None:
             return None
         offset_us = self.ros_offset_us
-        read = ros_messages.odometry if self.bag.topics[topic] == "nav_msgs/Odometry" else ros_messages.pose
-        samples: list[ros_messages.PoseSample] = []
+        read = messages.odometry if self.bag.topics[topic] == "nav_msgs/Odometry" else messages.pose
+        samples: list[messages.PoseSample] = []
         for message in self.bag.messages((topic,)):
             sample = self._read(message, read)
             if samples and sample.stamp_ns // 1000 <= samples[-1].stamp_ns // 1000:
@@ -258,7 +258,7 @@ class RosbagRecording(EventsOnly):
     def twists(self) -> Twists | None:
         """How the tracked body moved, by its poses; None where these are too few. See `geometry.twists`."""
         poses = self.poses()
-        return geometry.twists(poses) if poses is not None and poses.t.size > 1 else None
+        return camera.twists(poses) if poses is not None and poses.t.size > 1 else None
 
     def _beside(self, *types: str) -> str | None:
         """The topic of one of these types whose name has most in common with that of the events."""
@@ -275,8 +275,8 @@ class RosbagRecording(EventsOnly):
 def _parsed(message: BagMessage, bag: BagFile) -> tuple[EventMessage, Events | None]:
     """The message, and its events where its type lays them out itself."""
     if bag.topics[message.topic] == "dvs_msgs/EventArray":
-        return ros_messages.dvs_events(message.data, cdr=bag.cdr)
-    return ros_messages.event_packet(message.data, cdr=bag.cdr), None
+        return messages.dvs_events(message.data, cdr=bag.cdr)
+    return messages.event_packet(message.data, cdr=bag.cdr), None
 
 
 def _first(path: Path, bag: BagFile, topic: str) -> EventMessage:
@@ -295,7 +295,7 @@ def _in_common(one: str, other: str) -> int:
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
-def _imu(samples: list[ros_messages.ImuSample], offset_us: int) -> Imu:
+def _imu(samples: list[messages.ImuSample], offset_us: int) -> Imu:
     t = np.array([sample.stamp_ns for sample in samples]) // 1000 - offset_us
     accel = np.array([sample.accel_m_s2 for sample in samples])
     return Imu(t, accel, np.array([sample.gyro_rad_s for sample in samples]))

@@ -1,0 +1,1 @@
+"""Evaluation of estimates against the truth, and contrast maximisation."""

@@ -1,0 +1,1 @@
+"""The paper's Tables III and IV: velocity by all methods."""

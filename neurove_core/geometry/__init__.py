@@ -1,0 +1,1 @@
+"""Rotations, motion (poses and twists), and the camera (lens and look-up table)."""

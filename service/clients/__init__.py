@@ -1,0 +1,1 @@
+"""What talks to a service: queries, camera drivers, recorders."""

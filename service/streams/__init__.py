@@ -1,0 +1,1 @@
+"""A packet's path: queue, worker, stream, models at work."""
