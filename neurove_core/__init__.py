@@ -8,18 +8,22 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from neurove_core.spiking.aslstm import ASLSTM, SLSTM, Readout
-    from neurove_core.spiking.lif import ALIF, LIF, LTC
+    from neurove_core.spiking.alif import ALIF
+    from neurove_core.spiking.aslstm import ASLSTM
+    from neurove_core.spiking.lif import LIF
+    from neurove_core.spiking.ltc import LTC
+    from neurove_core.spiking.readout import Readout
+    from neurove_core.spiking.slstm import SLSTM
 
 __all__ = ["ALIF", "ASLSTM", "LIF", "LTC", "SLSTM", "Readout"]
 
 _MODULE_OF = {
-    "ALIF": "neurons",
-    "LIF": "neurons",
-    "LTC": "neurons",
-    "ASLSTM": "cells",
-    "SLSTM": "cells",
-    "Readout": "cells",
+    "ALIF": "spiking.alif",
+    "ASLSTM": "spiking.aslstm",
+    "LIF": "spiking.lif",
+    "LTC": "spiking.ltc",
+    "Readout": "spiking.readout",
+    "SLSTM": "spiking.slstm",
 }
 
 

@@ -9,18 +9,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from neurove_core.engine.encoding import to_codes, to_counts
 from neurove_core.engine.engine import Engine
 from neurove_core.geometry.camera import lookup_table
 from neurove_core.ingest import windows
 from neurove_core.ingest.windows import Pushed, Window, WindowsState
 from neurove_core.ingest.wire import read_packet
 from neurove_core.models.bundle import PER_HEIGHT, Bundle
-from neurove_core.networks.encoding import to_codes, to_counts, to_spikes
+from neurove_core.networks.encoding import to_spikes
 from neurove_core.networks.kinds import State
 from neurove_core.networks.neurove import NetworkState, NeuroVE
 from neurove_protocol import CameraInfo, Events, Sensor
 from neurove_protocol.errors import BadModel
-from neurove_protocol.events import EventPacket, Limits, WireEvents, encode_packet
+from neurove_protocol.events import EventPacket, PacketLimits, WireEvents, encode_packet
 
 
 class StreamState(NamedTuple):
@@ -51,7 +52,7 @@ class WindowEstimate(NamedTuple):
     uncertain: bool = False  # the linear part's sigma is a larger share of its speed than the bundle's bound
 
 
-class Answer(NamedTuple):
+class PushResult(NamedTuple):
     """What came of some events: an estimate for each window that they completed, and what was left out."""
 
     estimates: list[WindowEstimate]
@@ -116,7 +117,7 @@ class Estimator:
         network = self.network.initial_state()
         return StreamState(sensor, camera, lut, WindowsState(), network, 0, low_activity_below=least)
 
-    def push(self, events: Events | WireEvents, state: StreamState, horizon_us: int) -> Answer:
+    def push(self, events: Events | WireEvents, state: StreamState, horizon_us: int) -> PushResult:
         """Take a packet's events and answer every window that they complete.
 
         A model whose linear part is per metre of camera height is told in m/s by the height of the stream's camera;
@@ -129,7 +130,7 @@ class Estimator:
         """
         return self.push_many([Push(events, state, horizon_us)])[0]
 
-    def push_many(self, pushes: Sequence[Push]) -> list[Answer]:
+    def push_many(self, pushes: Sequence[Push]) -> list[PushResult]:
         """Take a packet of each of several streams, and answer all windows that they complete, in common batches.
 
         As `push` for each, in less time where several streams complete a window; see Engine.together for when the
@@ -140,7 +141,7 @@ class Estimator:
         """
         courses = [self._begin(push) for push in pushes]
         self._answer(courses)
-        return [Answer(course.estimates, course.state, *course.lost) for course in courses]
+        return [PushResult(course.estimates, course.state, *course.lost) for course in courses]
 
     def cut(self, events: Events | WireEvents, state: StreamState, horizon_us: int) -> Pushed:
         """The first half of push: the windows that some events complete; the network has not seen them yet."""
@@ -200,7 +201,9 @@ class Estimator:
         x, y, p = (rng.integers(0, high, t.size) for high in (sensor.width, sensor.height, 2))
         events = Events.from_columns(t, x, y, p)
         packet = EventPacket("warm", 0, sensor, 0, events)
-        from_wire = read_packet(encode_packet(packet), Limits(max_side_px=max(sensor.width, sensor.height))).events
+        from_wire = read_packet(
+            encode_packet(packet), PacketLimits(max_side_px=max(sensor.width, sensor.height))
+        ).events
         state = self.initial_state(sensor)
         for given in (events, from_wire):
             answer = self.push(given, state._replace(windows=WindowsState()), 0)

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from neurove_core.extras import MissingExtra
-from neurove_core.files import written_whole
+from neurove_core.files import atomic_path
 from neurove_protocol.errors import InvalidField
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def write_figure(figure: "Figure", file: Path, dpi: int = 150) -> None:
         OSError: it can not be written.
     """
     kind = "svg" if file.suffix.lower() == ".svg" else "png"
-    with written_whole(file) as part:
+    with atomic_path(file) as part:
         figure.savefig(part, format=kind, dpi=dpi, metadata={"Date": None} if kind == "svg" else None)
 
 

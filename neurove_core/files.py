@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 @contextmanager
-def written_whole(path: Path) -> Iterator[Path]:
+def atomic_path(path: Path) -> Iterator[Path]:
     """Another name beside a file, to write to; where the block ends without an error, what is there becomes the file.
 
     Until then the file is what it was before; several processes may write the same one.
@@ -25,13 +25,13 @@ def written_whole(path: Path) -> Iterator[Path]:
         part.unlink(missing_ok=True)  # it is there only where writing failed
 
 
-def write_whole(path: Path, data: bytes) -> None:
+def write_atomically(path: Path, data: bytes) -> None:
     """Write a file so that it is whole, or what was there before; several processes may write the same one.
 
     Raises:
         OSError: it can not be written; nothing is left beside it.
     """
-    with written_whole(path) as part:
+    with atomic_path(path) as part:
         part.write_bytes(data)
 
 

@@ -16,7 +16,7 @@ PROTOCOL_VERSION: Final = 1
 MAX_STRING_BYTES = 4096
 MAX_ITEMS = 4096
 MAX_MESSAGE_BYTES = 1 << 20
-"""Cap of every message but the event packet, which has its own (events.Limits)."""
+"""Cap of every message but the event packet, which has its own (events.PacketLimits)."""
 
 
 def _name(value: str) -> str:

@@ -211,7 +211,7 @@ class WirePacket(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class PacketLimits:
     """Caps on what a packet may claim; beyond them it is refused."""
 
     max_events: int = 1_000_000
@@ -223,7 +223,7 @@ class Limits:
         return self.max_events * 8 + 1024
 
 
-DEFAULT_LIMITS = Limits()
+DEFAULT_LIMITS = PacketLimits()
 
 Packet = EventPacket | WirePacket
 
@@ -282,7 +282,7 @@ def encode_packet(packet: EventPacket, blob_format: str | None = None) -> bytes:
     return validate(_Header, header).encode()
 
 
-def decode_packet(data: bytes, limits: Limits = DEFAULT_LIMITS) -> EventPacket:
+def decode_packet(data: bytes, limits: PacketLimits = DEFAULT_LIMITS) -> EventPacket:
     """Read and check an event packet; x is a view into `data`, the other columns are computed.
 
     Raises:
@@ -295,7 +295,7 @@ def decode_packet(data: bytes, limits: Limits = DEFAULT_LIMITS) -> EventPacket:
     return EventPacket(packet.stream, packet.seq, packet.sensor, packet.t0_us, events)
 
 
-def open_packet(data: bytes, limits: Limits = DEFAULT_LIMITS) -> WirePacket:
+def open_packet(data: bytes, limits: PacketLimits = DEFAULT_LIMITS) -> WirePacket:
     """Read an event packet and check all but its events, which may lie outside the sensor or run backwards.
 
     Raises:

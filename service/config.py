@@ -18,7 +18,7 @@ from pydantic_settings import (
 )
 
 from neurove_protocol.errors import NeuroVEError
-from neurove_protocol.events import Limits
+from neurove_protocol.events import PacketLimits
 from neurove_protocol.fields import WrongField
 from neurove_protocol.keys import DEFAULT_PREFIX, Keys, check_name
 
@@ -135,9 +135,9 @@ class ServiceConfig(_Settings):
         return self.state_dir or self.models_dir
 
     @property
-    def limits(self) -> Limits:
+    def limits(self) -> PacketLimits:
         """Caps on event packets."""
-        return Limits(self.max_packet_events, self.max_side_px)
+        return PacketLimits(self.max_packet_events, self.max_side_px)
 
 
 SettingsT = TypeVar("SettingsT", bound=_Settings)

@@ -43,7 +43,7 @@ class EndpointError(NeuroVEError):
     code = "endpoint"
 
 
-class Answered(NamedTuple):
+class Reply(NamedTuple):
     """One reply to a query."""
 
     key: str
@@ -195,7 +195,7 @@ class Transport:
         thread.start()
         self._answering.append((queryable, thread))
 
-    def ask(self, key: str, request: bytes, timeout_s: float, *, bulk: bool = False) -> list[Answered]:
+    def ask(self, key: str, request: bytes, timeout_s: float, *, bulk: bool = False) -> list[Reply]:
         """Query a key expression and wait for everybody's reply.
 
         Args:
@@ -213,7 +213,7 @@ class Transport:
         priority = zenoh.Priority.DATA_LOW if bulk else zenoh.Priority.DATA
         return list(self._ask(key, request, timeout_s, priority, zenoh.ConsolidationMode.AUTO))
 
-    def ask_streaming(self, key: str, request: bytes, timeout_s: float) -> Iterator[Answered]:
+    def ask_streaming(self, key: str, request: bytes, timeout_s: float) -> Iterator[Reply]:
         """Query one node and hear every reply as it comes; those of PROGRESS_SCHEMA are not the last one.
 
         Raises:
@@ -223,7 +223,7 @@ class Transport:
 
     def _ask(
         self, key: str, request: bytes, timeout_s: float, priority: zenoh.Priority, mode: zenoh.ConsolidationMode
-    ) -> Iterator[Answered]:
+    ) -> Iterator[Reply]:
         channel: Any = zenoh.handlers.FifoChannel(64)
         replies = self._session.get(
             key,
@@ -236,7 +236,7 @@ class Transport:
         )
         for reply in replies:
             if reply.ok is not None:
-                yield Answered(str(reply.ok.key_expr), reply.ok.payload.to_bytes(), str(reply.ok.encoding))
+                yield Reply(str(reply.ok.key_expr), reply.ok.payload.to_bytes(), str(reply.ok.encoding))
             elif reply.err is not None and reply.err.payload.to_bytes() != b"Timeout":
                 raise PeerError(ErrorReply.decode(reply.err.payload.to_bytes()))
 

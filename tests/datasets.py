@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.geometry import rotations
-from neurove_core.geometry.camera import Poses
+from neurove_core.geometry.motion import Poses
 from neurove_core.io import Imu, open_source, write_dsec
 from neurove_protocol import Events
 from tests.builders import SENSOR, make_events

@@ -11,14 +11,15 @@ from numpy.typing import NDArray
 
 from neurove_core import io
 from neurove_core.bench import Row, interleaved, peers, rows, window
+from neurove_core.compiled import compiled
 from neurove_core.config import ModelConfig
 from neurove_core.estimator import Estimator
 from neurove_core.geometry.camera import lookup_table
-from neurove_core.ingest.counting import compiled, count_events, count_events_reference
+from neurove_core.ingest.counting import count_events, count_events_reference
 from neurove_core.models import bundle
 from neurove_core.networks.encoding import to_spikes_reference
 from neurove_core.networks.neurove import NeuroVE
-from neurove_core.spiking.lif import plain
+from neurove_core.spiking.plain import plain
 from neurove_protocol import Events, Sensor
 
 SENSOR = Sensor(346, 260)

@@ -5,9 +5,10 @@ import torch
 from torch import Tensor
 
 from neurove_core.bench import Row, interleaved
-from neurove_core.spiking.aslstm import ASLSTMParams, ASLSTMState, aslstm_step, readout_step
+from neurove_core.spiking.alif import diffuse
+from neurove_core.spiking.aslstm import ASLSTMParams, ASLSTMState, aslstm_step
 from neurove_core.spiking.fused import recurrence
-from neurove_core.spiking.lif import diffuse
+from neurove_core.spiking.readout import readout_step
 
 HIDDEN, BATCH, STEPS = 51, 16, 100
 V_TH = 0.3

@@ -9,11 +9,11 @@ from torch import Tensor
 
 from neurove_core.bench import Row, interleaved, machine, peers, rows
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from neurove_core.engine import int8
 from neurove_core.engine.engine import Engine
 from neurove_core.models import bundle
+from neurove_core.networks import quantisation
 from neurove_core.networks.neurove import NetworkState, NeuroVE
-from neurove_core.spiking.lif import plain
+from neurove_core.spiking.plain import plain
 
 REFERENCE = ModelConfig(
     window=WindowConfig(bins=10),
@@ -56,7 +56,7 @@ def _windows(
     quantised = config.network.precision == "int8"
     in_float32 = _network(with_precision(config, "float32")) if quantised else network
     spikes, rest = draw(config, steps), network.initial_state(1)
-    given = int8.codes(spikes).contiguous() if quantised else spikes  # as the encoding lays them
+    given = quantisation.codes(spikes).contiguous() if quantised else spikes  # as the encoding lays them
     engine = Engine(network)
     others = peers.networks(in_float32, missing) if with_peers else {}
     runs: dict[str, Callable[[], object]] = {"ours": lambda: engine(given, rest)}

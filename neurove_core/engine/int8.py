@@ -22,58 +22,17 @@ from torch.nn.functional import conv2d, linear
 from neurove_core.compiled import compiled
 from neurove_core.engine import sparse_int8
 from neurove_core.engine.convolution import Convolution, say_once
-from neurove_core.engine.sparse import Fired, maps_of
+from neurove_core.engine.spike_lists import Fired, maps_of
 from neurove_core.engine.vectors import LANES
-from neurove_core.spiking.lif import LIFParams, LIFState, is_plain, lif_scan_reference
+from neurove_core.networks.quantisation import MAX_WEIGHT, Quantised, codes
+from neurove_core.spiking.lif import LIFParams, LIFState, lif_scan_reference
+from neurove_core.spiking.plain import is_plain
 
-LEVELS: Final = 32
-"""Of the input per unit; log1p of a saturated count, 5.5, becomes 177."""
-
-_MOST: Final = 127  # of a weight
 _EXACT: Final = 1 << 24  # whole numbers below this are exact in float32
 _BLOCK: Final = 1024  # neurons whose potentials stay in the first cache over all steps
 _GATHERED: Final = 256  # inputs whose weights are summed in 16 bits: 256 * 127 < 2**15
 
 Array = NDArray[Any]
-
-
-class Quantised(NamedTuple):
-    """Weights as whole numbers."""
-
-    q: Tensor  # (C', C, 3, 3) of a convolution, (F, I) of the projection, int8
-    step: Tensor  # (C') float32, positive: weight = q * step
-
-
-def quantised(weight: Tensor) -> Quantised:
-    """The nearest multiples of a step per output channel, which is its largest weight / 127."""
-    whole, step = _multiples(weight)
-    return Quantised(whole.to(torch.int8), step)
-
-
-def rounded(weight: Tensor) -> Tensor:
-    """The weights that `quantised` stands for, in float32; gradients pass as if nothing were rounded."""
-    whole, step = _multiples(weight)
-    return weight + whole.mul_(_by_output(step, weight)).sub_(weight.detach())  # in place: a projection may be large
-
-
-def _multiples(weight: Tensor) -> tuple[Tensor, Tensor]:
-    largest = torch.linalg.vector_norm(weight.detach().flatten(1), torch.inf, dim=1)
-    step = torch.where(largest > 0, largest, torch.ones_like(largest)) / _MOST
-    return weight.detach().div(_by_output(step, weight)).round_().clamp_(-_MOST, _MOST), step
-
-
-def _by_output(step: Tensor, weight: Tensor) -> Tensor:
-    return step.view(-1, *[1] * (weight.dim() - 1))
-
-
-def rounded_input(spikes: Tensor) -> Tensor:
-    """The input in steps of 1 / LEVELS."""
-    return codes(spikes).to(spikes.dtype) / LEVELS
-
-
-def codes(spikes: Tensor) -> Tensor:
-    """The input as whole numbers, uint8, layout kept."""
-    return (spikes * LEVELS).round_().clamp_(0, 255).to(torch.uint8)
 
 
 class Layer(NamedTuple):
@@ -233,8 +192,8 @@ def _packed(q: Tensor, rows: int, columns: int) -> Convolution:
 def _agrees(q: Tensor, top: int, rows: int, columns: int) -> bool:
     """Whether the private operator is exact: on the largest sums, of both signs, and on random ones; 1 and 3 maps."""
     generator = torch.Generator().manual_seed(0)
-    random = torch.randint(-_MOST, _MOST + 1, q.shape, generator=generator, dtype=torch.int8)
-    for weight in (torch.full_like(q, _MOST), torch.full_like(q, -_MOST), random, q):
+    random = torch.randint(-MAX_WEIGHT, MAX_WEIGHT + 1, q.shape, generator=generator, dtype=torch.int8)
+    for weight in (torch.full_like(q, MAX_WEIGHT), torch.full_like(q, -MAX_WEIGHT), random, q):
         if not _exact_in_float32(weight, top):
             continue  # more than these weights can ever sum to
         fast, plain = _packed(weight, rows, columns), plain_sums(weight, top)

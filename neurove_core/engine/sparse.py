@@ -21,30 +21,28 @@ from torch import Tensor
 
 from neurove_core.compiled import compiled
 from neurove_core.engine.convolution import LARGE, Convolution, say_once
+from neurove_core.engine.spike_lists import (
+    Array,
+    Fired,
+    Places,
+    allocate_list,
+    cells_of,
+    in_maps,
+    listed,
+    maps_of,
+    shape_after,
+    values_of,
+)
 from neurove_core.engine.vectors import LANES, entry, fire, nothing, plus, plus_product, put, put_floats, tile_of
 from neurove_core.spiking.lif import LIFParams, LIFState
-
-Array = NDArray[np.float32]
-Places = NDArray[np.int32]
 
 _MANY: Final = 0.4
 """Share of spikes from which maps are convolved dense: with AVX-512 large ones take as long then (with AVX2 at 0.7)."""
 
 _FEW: Final = 1 << 14  # that fired: fewer are summed up sooner than a dense convolution of a small map has begun
 
-SPARE: Final = 2 * LANES
-"""Numbers behind those of a list that may be read and written, and mean nothing."""
 
 _CHUNK: Final = 512  # inputs of the projection whose weights, 512 KiB for 256 features, stay in the second cache
-
-
-class Fired(NamedTuple):
-    """Who fired, in maps (R, H, W, C)."""
-
-    places: Places  # of those that fired, in their map as it lies channels last, ascending; map after map
-    starts: Places  # (R * H * W + 1): where in `places` each cell begins
-    shape: tuple[int, int, int, int]
-    found: int  # of `places`; what lies behind means nothing
 
 
 class Counts(NamedTuple):
@@ -134,25 +132,6 @@ def extractor(layers: Sequence[Layer], projection: tuple[Tensor, Tensor], lif: L
     return None
 
 
-def maps_of(fired: Fired, kind: type[np.generic] = np.float32) -> Tensor:
-    """Spikes of 0 and 1 (R, C, H, W), channels last."""
-    maps = np.zeros((fired.shape[0], fired.shape[1] * fired.shape[2] * fired.shape[3]), kind)
-    _mark(fired.places, fired.starts, maps)
-    return in_maps(maps.reshape(fired.shape))
-
-
-def listed(maps: Tensor) -> Fired:
-    """What `maps_of` undoes."""
-    rows = cells_of(maps)
-    flat = rows.reshape(rows.shape[0], -1)
-    found = np.nonzero(flat)[1]
-    places = np.zeros(found.size + SPARE, np.int32)
-    places[: found.size] = found
-    cells = np.count_nonzero(rows.reshape(-1, rows.shape[3]), axis=1)
-    starts = np.concatenate([[0], np.cumsum(cells)]).astype(np.int32)
-    return Fired(places, starts, rows.shape, found.size)
-
-
 class OverValues:
     """The first layer: maps (R, H, W, C) of any float32, or counts, to who fires in (R, H', W', C')."""
 
@@ -169,7 +148,7 @@ class OverValues:
         else:
             whole, given = x.shape, (x.reshape(-1), _NO_COUNTS, _NO_VALUES)
         shape = shape_after(whole, self._widths, v)
-        (places, starts), after = room_for(shape), np.empty_like(v)
+        (places, starts), after = allocate_list(shape), np.empty_like(v)
         layer = self._tile, self._firing, whole, *given, self._weight, self._bias
         found = _convolve_values(*layer, v, after, decay, v_th, places, starts)
         return Fired(places, starts, shape, found), after
@@ -197,20 +176,10 @@ class OverList:
     def over_list(self, fired: Fired, v: Array, decay: np.float32, v_th: np.float32) -> tuple[Fired, Array]:
         """The same, however many fired."""
         shape = shape_after(fired.shape, self._widths, v)
-        (places, starts), after = room_for(shape), np.empty_like(v)
+        (places, starts), after = allocate_list(shape), np.empty_like(v)
         given = self._tile, fired.places, fired.starts, fired.shape, self._weight, self._bias
         found = _convolve(*given, v, after, decay, v_th, places, starts)
         return Fired(places, starts, shape, found), after
-
-
-def shape_after(given: tuple[int, ...], weights: tuple[int, int], v: Array) -> tuple[int, int, int, int]:
-    """Shape (R, H', W', C') after a layer of C and C' channels; compiled code asks no more whether all fits."""
-    maps, rows, columns, inputs = given
-    shape = (rows + 1) // 2, (columns + 1) // 2, weights[1]
-    if v.shape[1:] != shape or maps % v.shape[0] or inputs != weights[0] or v.dtype != np.float32:
-        have = f"{v.dtype} {v.shape}"
-        raise ValueError(f"maps {given} and weights {weights} give {shape} for each stream, potentials are {have}")
-    return maps, *shape
 
 
 def _by_input(weight: Tensor) -> Array:
@@ -218,32 +187,10 @@ def _by_input(weight: Tensor) -> Array:
     return weight.permute(2, 3, 1, 0).reshape(-1).numpy()
 
 
-def values_of(x: Tensor) -> NDArray[Any]:
-    """Of a tensor, without its gradient; each call of torch takes as long as a small layer's kernel starts in."""
-    values: NDArray[Any] = (x.detach() if x.requires_grad else x).numpy()
-    return values
-
-
-def cells_of(maps: Tensor) -> NDArray[Any]:
-    """Maps (R, C, H, W) as (R, H, W, C): their own memory, where they lie channels last."""
-    return np.ascontiguousarray(values_of(maps).transpose(0, 2, 3, 1))
-
-
-def in_maps(cells: Array) -> Tensor:
-    """What `cells_of` undoes."""
-    return torch.from_numpy(cells.transpose(0, 3, 1, 2))
-
-
-def room_for(shape: tuple[int, int, int, int]) -> tuple[Places, Places]:
-    """Room for all of these maps to fire."""
-    cells = shape[0] * shape[1] * shape[2]
-    return np.empty(cells * shape[3] + SPARE, np.int32), np.empty(cells + 1, np.int32)
-
-
 def _fired(currents: Tensor, v: Array, decay: np.float32, v_th: np.float32) -> tuple[Fired, Array]:
     """Who fires of currents (R, C, H, W), and the potentials (B, H, W, C) after v."""
     rows = cells_of(currents)
-    (places, starts), after = room_for(rows.shape), np.empty_like(v)
+    (places, starts), after = allocate_list(rows.shape), np.empty_like(v)
     channels = rows.shape[3]
     found = _fire(tile_of(channels), rows.reshape(-1), channels, v, after, decay, v_th, places, starts)
     return Fired(places, starts, rows.shape, found), after
@@ -534,12 +481,3 @@ def _project(
                 for i in range(begin, end):
                     total = plus(total, weight, entry(given, i) * features + first)
                 put(total, sums, r * features + first)
-
-
-@compiled
-def _mark(given: Places, starts: Places, maps: NDArray[Any]) -> None:  # pragma: no cover (machine code)
-    """Write 1 where someone fired; maps (R, H * W * C) are 0."""
-    cells = (starts.size - 1) // maps.shape[0]
-    for r in range(maps.shape[0]):
-        for i in range(starts[r * cells], starts[(r + 1) * cells]):
-            maps[r, given[i]] = 1

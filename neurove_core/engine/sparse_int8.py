@@ -19,7 +19,17 @@ from torch import Tensor
 
 from neurove_core.compiled import compiled
 from neurove_core.engine.convolution import LARGE, Convolution, say_once
-from neurove_core.engine.sparse import Array, Fired, Places, cells_of, in_maps, listed, maps_of, room_for, shape_after
+from neurove_core.engine.spike_lists import (
+    Array,
+    Fired,
+    Places,
+    allocate_list,
+    cells_of,
+    in_maps,
+    listed,
+    maps_of,
+    shape_after,
+)
 from neurove_core.engine.vectors import (
     LANES,
     entry,
@@ -119,7 +129,7 @@ class OverDense:
         """Potentials (B, H', W', C') before, to who fires and the potentials after."""
         shape = shape_after(cells_shape(x), self._widths, v)
         sums = cells_of(self._dense(torch.from_numpy(x).contiguous(memory_format=torch.channels_last)))
-        (places, starts), after = room_for(shape), np.empty_like(v)
+        (places, starts), after = allocate_list(shape), np.empty_like(v)
         given = self._tile, sums.reshape(-1), self._factor, self._offset
         return Fired(places, starts, shape, _fire(*given, v, after, decay, v_th, places, starts)), after
 
@@ -140,7 +150,7 @@ class OverCodes:
     def __call__(self, x: Codes, v: Array, decay: np.float32, v_th: np.float32) -> tuple[Fired, Array]:
         """Potentials (B, H', W', C') before, to who fires and the potentials after."""
         shape = shape_after(cells_shape(x), self._widths, v)
-        (places, starts), after = room_for(shape), np.empty_like(v)
+        (places, starts), after = allocate_list(shape), np.empty_like(v)
         given = self._tile, x, self._weight, self._factor, self._offset
         return Fired(places, starts, shape, _convolve_codes(*given, v, after, decay, v_th, places, starts)), after
 
@@ -179,7 +189,7 @@ class OverList:
     def over_list(self, fired: Fired, v: Array, decay: np.float32, v_th: np.float32) -> tuple[Fired, Array]:
         """The same, however many fired."""
         shape = shape_after(fired.shape, self._widths, v)
-        (places, starts), after = room_for(shape), np.empty_like(v)
+        (places, starts), after = allocate_list(shape), np.empty_like(v)
         given = (
             self._tile,
             fired.places,

@@ -10,8 +10,8 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from neurove_core.compiled import compiled
 from neurove_core.geometry.camera import undistort
-from neurove_core.ingest.counting import compiled
 from neurove_protocol import CameraInfo, Events
 from neurove_protocol.errors import InvalidField
 

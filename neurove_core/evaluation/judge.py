@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from neurove_core.estimator import Estimator, WindowEstimate
 from neurove_core.evaluation.metrics import ANGULAR_FLOOR_RAD_S, LINEAR_FLOOR_M_S, SKIP_S, figures
-from neurove_core.geometry.camera import Twists
+from neurove_core.geometry.motion import Twists
 from neurove_core.io.packets import slices
 from neurove_core.io.recording import Recording
 from neurove_core.models.uncertainty import LEVEL, LEVELS, coverage

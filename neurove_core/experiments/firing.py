@@ -18,20 +18,10 @@ from torch import Tensor
 
 from neurove_core.experiments import save_text
 from neurove_core.figures import blank_figure, save_figure
+from neurove_core.spiking.alif import ALIFParams, alif_potential, diffuse
 from neurove_core.spiking.layers import require
-from neurove_core.spiking.lif import (
-    LIF,
-    ALIFParams,
-    LIFParams,
-    LIFState,
-    LTCParams,
-    LTCState,
-    NeuronSteps,
-    alif_potential,
-    diffuse,
-    fire,
-    ltc_step,
-)
+from neurove_core.spiking.lif import LIF, LIFParams, LIFState, NeuronSteps, fire
+from neurove_core.spiking.ltc import LTCParams, LTCState, ltc_step
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

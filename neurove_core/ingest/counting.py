@@ -1,10 +1,8 @@
-"""The hot loops, each compiled, beside its plain reference.
+"""Binning: events to a window's counts, compiled, beside its reference implementation.
 
 A kernel is a pure function: state goes in and comes out as a named tuple, arrays are read or filled, nothing is kept.
-It is compiled by numba on first use, cached on disk, and runs without the GIL. Its reference (`*_reference`) does the
-same in plain Python or numpy, written for reading; tests hold the two together bit for bit.
-
-Here is the binning; what reads Prophesee words lives in `evt.py` and `triggers.py`, and is named here too.
+numba compiles it on first use, caches it on disk, and runs it without the GIL. The reference (`*_reference`) computes
+the same in plain Python or numpy; tests compare the two bit for bit.
 """
 
 from typing import Final
@@ -14,41 +12,7 @@ from numpy.typing import NDArray
 
 from neurove_core.compiled import compiled
 from neurove_core.geometry.camera import OUTSIDE as NO_CELL
-from neurove_core.io.formats.prophesee.evt import (
-    ILLEGAL,
-    OK,
-    OUTSIDE,
-    STEP_BACK,
-    VECTOR_EVENTS,
-    Evt2State,
-    Evt3State,
-    evt2_decode,
-    evt2_reference,
-    evt3_decode,
-    evt3_reference,
-)
-from neurove_core.io.formats.prophesee.triggers import TriggerState, evt2_triggers, evt3_triggers
 from neurove_protocol.events import Events
-
-__all__ = [
-    "ILLEGAL",
-    "OK",
-    "OUTSIDE",
-    "STEP_BACK",
-    "VECTOR_EVENTS",
-    "Evt2State",
-    "Evt3State",
-    "TriggerState",
-    "compiled",
-    "count_events",
-    "count_events_reference",
-    "evt2_decode",
-    "evt2_reference",
-    "evt2_triggers",
-    "evt3_decode",
-    "evt3_reference",
-    "evt3_triggers",
-]
 
 
 def count_events(events: Events, start_us: int, bin_us: int, lut: NDArray[np.int32], counts: NDArray[np.uint8]) -> int:

@@ -11,13 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.compiled import compiled
-from neurove_protocol.events import DEFAULT_LIMITS, Limits, Sensor, WireEvents, WirePacket, decode_packet, open_packet
+from neurove_protocol.events import (
+    DEFAULT_LIMITS,
+    PacketLimits,
+    Sensor,
+    WireEvents,
+    WirePacket,
+    decode_packet,
+    open_packet,
+)
 from neurove_protocol.keys import is_name
 
 _BLOCK: Final = 512  # as in kernels
 
 
-def read_packet(data: bytes, limits: Limits = DEFAULT_LIMITS) -> WirePacket:
+def read_packet(data: bytes, limits: PacketLimits = DEFAULT_LIMITS) -> WirePacket:
     """Read and check an event packet; its events stay where they are.
 
     Raises:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.geometry import rotations
-from neurove_core.geometry.camera import Poses
+from neurove_core.geometry.motion import Poses
 from neurove_core.io.errors import UnknownSource
 from neurove_core.io.formats.hdf5 import file as hdf5
 from neurove_core.io.recording import SUPPORTED

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.geometry.camera import Poses, Twists
+from neurove_core.geometry.motion import Poses, Twists
 from neurove_core.io.errors import UnknownSource
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.events import Events, Sensor
@@ -192,6 +192,6 @@ def whole(events: Events, sensor: Sensor, not_before_us: int | None) -> Events:
     return events.span(0, events.n if good.all() else int(good.argmin()))
 
 
-def room(n: int) -> Events:
+def empty_events(n: int) -> Events:
     """Columns for a decoder to write this many events into."""
     return Events(np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8))

@@ -7,7 +7,7 @@ from typing import Any, Final, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.geometry.camera import Twists
+from neurove_core.geometry.motion import Twists
 from neurove_core.io.errors import BrokenRecording
 from neurove_core.io.recording import Imu, Recording
 from neurove_protocol.errors import InvalidField

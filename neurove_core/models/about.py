@@ -31,7 +31,7 @@ class MadeBy(Config):
     data: Record = Field(default_factory=dict, description="What it learned from.")
 
 
-class Limits(Config):
+class BundleLimits(Config):
     """By how much a model may differ from the one before while both see the same windows; none: that is not judged."""
 
     mean_dv_m_s: float | None = Field(None, gt=0, description="Mean length of the linear difference [m/s].")
@@ -48,7 +48,7 @@ class About(Config):
     prime_windows: int | None = Field(
         None, ge=0, le=256, description="Windows that a stream replays until it is settled; none: settle_windows."
     )
-    limits: Limits | None = None
+    limits: BundleLimits | None = None
 
     def told(self) -> set[str]:
         """The fields that say something: those that are not at their defaults."""

@@ -18,9 +18,9 @@ from safetensors import SafetensorError
 from torch import Tensor, nn
 
 from neurove_core.config import Config, ModelConfig
-from neurove_core.files import write_whole
+from neurove_core.files import write_atomically
 from neurove_core.models import golden
-from neurove_core.models.about import About, Limits
+from neurove_core.models.about import About, BundleLimits
 from neurove_core.models.golden import Golden
 from neurove_core.models.uncertainty import Uncertainty, why_no_correlation
 from neurove_core.networks import kinds
@@ -117,9 +117,9 @@ class Bundle:
         return self.config.settle_windows if windows is None else windows
 
     @property
-    def limits(self) -> Limits:
+    def limits(self) -> BundleLimits:
         """By how much it may differ from the model that it takes over from."""
-        return self.about.limits or Limits()
+        return self.about.limits or BundleLimits()
 
     def to_bytes(self) -> bytes:
         """The bundle as the bytes of its file."""
@@ -154,7 +154,7 @@ class Bundle:
 
 def save(bundle: Bundle, path: Path) -> None:
     """Write a bundle's file; it is whole or it is not there, and what was there before stays until it is."""
-    write_whole(path, bundle.to_bytes())
+    write_atomically(path, bundle.to_bytes())
 
 
 def load(path: Path) -> Bundle:

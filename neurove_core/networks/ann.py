@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from neurove_core.config import ModelConfig
 from neurove_core.networks import state as carried
-from neurove_core.spiking.aslstm import readout_step
+from neurove_core.spiking.readout import readout_step
 
 
 class AnnState(NamedTuple):

@@ -7,10 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from neurove_core.engine import int8
-from neurove_core.engine.sparse import Counts
-from neurove_core.engine.vectors import BYTES, put_entries
-from neurove_core.ingest.counting import compiled
+from neurove_core.compiled import compiled
 
 
 def to_spikes(counts: Tensor, encoding: str) -> Tensor:
@@ -29,40 +26,14 @@ def to_spikes(counts: Tensor, encoding: str) -> Tensor:
     """
     if counts.device.type != "cpu" or counts.dim() < 3 or not counts.is_contiguous() or counts.dtype != torch.uint8:
         return to_spikes_reference(counts, encoding)
-    return _channels_last(counts, _BINARY if encoding == "binary" else _LOG1P)
-
-
-def to_codes(counts: Tensor, encoding: str) -> Tensor:
-    """What `int8.codes` makes of `to_spikes`, at once: the input of an int8 network's engine.
-
-    Args:
-        counts: (..., 2n, H, W) uint8, contiguous, on the CPU.
-        encoding: of NetworkConfig.
-
-    Returns:
-        uint8 tensor of the same shape, contiguous.
-    """
-    given = counts.numpy()
-    found = np.empty(given.shape, np.uint8)
-    _look_up(given.reshape(-1), _CODES[encoding], found.reshape(-1))
-    return torch.from_numpy(found)
-
-
-def to_counts(counts: Tensor, encoding: str) -> Counts:
-    """What `to_spikes` makes of counts, made where it is read: the input of an engine that `reads_counts`.
-
-    Args:
-        counts: (T, B, 2n, H, W) uint8, on the CPU.
-        encoding: of NetworkConfig.
-    """
-    return Counts(counts, _BINARY if encoding == "binary" else _LOG1P)
+    return _channels_last(counts, BINARY if encoding == "binary" else LOG1P)
 
 
 def to_spikes_reference(counts: Tensor, encoding: str) -> Tensor:
     """What to_spikes computes, in plain PyTorch."""
     if encoding == "binary":
         return (counts > 0).to(torch.float32)
-    return _LOG1P.to(counts.device)[counts.to(torch.int64)]
+    return LOG1P.to(counts.device)[counts.to(torch.int64)]
 
 
 def _channels_last(counts: Tensor, table: Tensor) -> Tensor:
@@ -75,17 +46,6 @@ def _channels_last(counts: Tensor, table: Tensor) -> Tensor:
 
 
 @compiled
-def _look_up(
-    counts: NDArray[np.uint8], table: NDArray[np.uint8], found: NDArray[np.uint8]
-) -> None:  # pragma: no cover (machine code)
-    whole = counts.size - counts.size % BYTES
-    for i in range(0, whole, BYTES):
-        put_entries(table, counts, i, found)
-    for i in range(whole, counts.size):
-        found[i] = table[counts[i]]
-
-
-@compiled
 def _encode(
     planes: NDArray[np.uint8], table: NDArray[Any], spikes: NDArray[Any]
 ) -> None:  # pragma: no cover (machine code)
@@ -95,6 +55,5 @@ def _encode(
                 spikes[row, cell, channel] = table[planes[row, channel, cell]]
 
 
-_LOG1P = torch.log1p(torch.arange(256, dtype=torch.float32))
-_BINARY = (torch.arange(256) > 0).to(torch.float32)
-_CODES = {"binary": int8.codes(_BINARY).numpy(), "log1p": int8.codes(_LOG1P).numpy()}
+LOG1P = torch.log1p(torch.arange(256, dtype=torch.float32))
+BINARY = (torch.arange(256) > 0).to(torch.float32)

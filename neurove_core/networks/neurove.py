@@ -8,10 +8,12 @@ from torch import Tensor, nn
 from torch.nn.functional import conv2d, linear
 
 from neurove_core.config import ModelConfig
-from neurove_core.engine.int8 import rounded, rounded_input
 from neurove_core.networks import state as carried
-from neurove_core.spiking.aslstm import ASLSTM, ASLSTMState, readout_step
-from neurove_core.spiking.lif import LIFParams, LIFState, diffuse, lif_scan
+from neurove_core.networks.quantisation import rounded, rounded_input
+from neurove_core.spiking.alif import diffuse
+from neurove_core.spiking.aslstm import ASLSTM, ASLSTMState
+from neurove_core.spiking.lif import LIFParams, LIFState, lif_scan
+from neurove_core.spiking.readout import readout_step
 
 
 class NetworkState(NamedTuple):

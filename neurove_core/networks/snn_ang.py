@@ -15,8 +15,8 @@ from torch import Tensor, nn
 
 from neurove_core.config import ModelConfig
 from neurove_core.networks import state as carried
-from neurove_core.spiking.aslstm import readout_step
 from neurove_core.spiking.lif import LIFParams, LIFState, lif_scan
+from neurove_core.spiking.readout import readout_step
 
 CHANNELS: Final = (16, 32, 64, 128, 256)
 """Of its five layers."""

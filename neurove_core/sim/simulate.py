@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.geometry.camera import Twists
+from neurove_core.geometry.motion import Twists
 from neurove_core.io.recording import EventsOnly, in_chunks
 from neurove_core.sim.motion.trajectory import Mounted, Trajectory
 from neurove_core.sim.render.camera import Camera, Rays, rays_of

@@ -7,8 +7,8 @@ from typing import Final
 import torch
 from torch import Tensor
 
+from neurove_core import self_test
 from neurove_core.estimator import Estimator
-from neurove_core.models import golden
 from neurove_core.models.about import About, MadeBy
 from neurove_core.models.bundle import Bundle
 from neurove_core.networks import kinds
@@ -53,7 +53,7 @@ def average(bundles: Sequence[Bundle]) -> Bundle:
         uncertainty=None,
     )
     if made.golden:
-        made = replace(made, golden=golden.record(Estimator(made), made.golden.counts, made.golden.tolerance))
+        made = replace(made, golden=self_test.record(Estimator(made), made.golden.counts, made.golden.tolerance))
     return made.with_digest()
 
 

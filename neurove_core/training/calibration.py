@@ -21,9 +21,9 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
+from neurove_core import self_test
 from neurove_core.engine.engine import Engine
 from neurove_core.estimator import Estimator
-from neurove_core.models import golden
 from neurove_core.models.bundle import PER_HEIGHT, Bundle
 from neurove_core.models.uncertainty import LEVEL, LEVELS, Uncertainty, half_width
 from neurove_core.networks.encoding import to_spikes
@@ -150,7 +150,7 @@ def fitted(bundle: Bundle, watched: list[Watched], about: str) -> Calibrated:
     uncertainty = Uncertainty(_correlation(usual, factor), UNCERTAIN_ABOVE, about)
     made = replace(bundle, network=network.eval(), uncertainty=uncertainty)
     if made.golden:  # a wider last layer may round otherwise
-        made = replace(made, golden=golden.record(Estimator(made), made.golden.counts, made.golden.tolerance))
+        made = replace(made, golden=self_test.record(Estimator(made), made.golden.counts, made.golden.tolerance))
     return Calibrated(made.with_digest(), _report(held, factor, about))
 
 

@@ -20,7 +20,7 @@ import safetensors.numpy
 from numpy.typing import ArrayLike, NDArray
 
 from neurove_core.config import ModelConfig
-from neurove_core.files import write_whole
+from neurove_core.files import write_atomically
 from neurove_core.geometry.camera import lookup_table
 from neurove_core.ingest import windows
 from neurove_core.ingest.windows import WindowsState
@@ -201,7 +201,7 @@ def save(sequence: Sequence, path: Path) -> None:
     """Write a sequence's file; it is whole or it is not there."""
     arrays: dict[str, NDArray[Any]] = {"counts": sequence.counts, "twists": sequence.twists}
     about = {"height_m": repr(sequence.height_m), "name": sequence.name}
-    write_whole(path, safetensors.numpy.save(arrays, about))
+    write_atomically(path, safetensors.numpy.save(arrays, about))
 
 
 class Sequences:

@@ -14,8 +14,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from neurove_core import self_test
 from neurove_core.estimator import Estimator
-from neurove_core.files import write_whole
+from neurove_core.files import write_atomically
 from neurove_core.models import bundle, golden
 from neurove_core.models.about import About, MadeBy
 from neurove_core.models.bundle import Bundle
@@ -117,7 +118,7 @@ def train(
     draw_curve(run.curve, out, f"{config.name}: {run.step} updates")
     path = out / f"{config.name}{bundle.SUFFIX}"
     made = run.bundle(provenance(run, len(more)), about(run))
-    test = golden.record(Estimator(made), golden_windows(sequences))
+    test = self_test.record(Estimator(made), golden_windows(sequences))
     bundle.save(replace(made, golden=test), path)
     return path
 
@@ -294,4 +295,4 @@ def _write_run(run: Run, out: Path) -> None:
         "cpu_s": round(run.cpu_s, 1),
         "curve": run.curve,
     }
-    write_whole(out / RUN_JSON, json.dumps(about, indent=1).encode())
+    write_atomically(out / RUN_JSON, json.dumps(about, indent=1).encode())

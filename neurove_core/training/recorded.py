@@ -14,8 +14,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.files import write_whole
-from neurove_core.geometry.camera import Twists, lookup_table, twists
+from neurove_core.files import write_atomically
+from neurove_core.geometry.camera import lookup_table
+from neurove_core.geometry.motion import Twists, twists
 from neurove_core.ingest import windows
 from neurove_core.ingest.windows import Window, WindowsState
 from neurove_core.io import Recording, UnknownSource, open_source, read_poses
@@ -68,7 +69,7 @@ class Recorded:
                 for sequence in pieces(found.recording, found.truth, found.height_m, self._config):
                     save(sequence, folder / f"{len(lengths):06d}.safetensors")
                     lengths.append(len(sequence.twists))
-                write_whole(folder / INDEX, json.dumps({"source": found.source, "windows": lengths}).encode())
+                write_atomically(folder / INDEX, json.dumps({"source": found.source, "windows": lengths}).encode())
                 yield found.recording.name
             self._paths_of(found)
 

@@ -18,7 +18,7 @@ from pydantic import ValidationError
 from torch import Tensor, nn
 
 from neurove_core.config import ModelConfig
-from neurove_core.files import write_whole
+from neurove_core.files import write_atomically
 from neurove_core.models.about import About
 from neurove_core.models.bundle import PER_HEIGHT, Bundle
 from neurove_core.networks import kinds
@@ -115,7 +115,7 @@ class Run:
         about = {"config": self.config.model_dump(mode="json"), "step": self.step, "cpu_s": self.cpu_s}
         about |= {"orders": orders, "curve": self.curve, "start": self.start}
         stored = {name: tensor.cpu() for name, tensor in tensors.items()}
-        write_whole(path, safetensors.torch.save(stored, {_KEY: json.dumps(about)}))
+        write_atomically(path, safetensors.torch.save(stored, {_KEY: json.dumps(about)}))
 
     @property
     def order(self) -> Any:

@@ -11,6 +11,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neurove_core import self_test
 from neurove_protocol.errors import BadModel, InvalidField, Untrusted
 from neurove_service.cli.arguments import BAD_NEWS, Command, command
 from neurove_service.cli.bundle_views import about, release_told, told
@@ -121,7 +122,7 @@ def keygen(args: argparse.Namespace) -> int:
 @_judging
 def sign_model(args: argparse.Namespace) -> int:
     """Sign a bundle: writes BUNDLE.sig beside it."""
-    from neurove_core.files import write_whole
+    from neurove_core.files import write_atomically
     from neurove_core.models import bundle, manifest, signing_keys
 
     key = signing_keys.read_private(_read(args.key, signing_keys.MAX_KEY_BYTES), str(args.key))
@@ -129,7 +130,7 @@ def sign_model(args: argparse.Namespace) -> int:
     bundle.from_bytes(data, args.bundle.name)  # nobody vouches for what no node would load
     signature = manifest.sign(data, key, release=args.release, allow_downgrade=args.allow_downgrade)
     try:
-        write_whole(path, signature)
+        write_atomically(path, signature)
     except OSError as error:
         raise InvalidField("model sign", "file", str(path), error.strerror or str(error)) from None
     signed = manifest.read(signature)
@@ -144,7 +145,7 @@ def sign_model(args: argparse.Namespace) -> int:
 def verify_model(args: argparse.Namespace) -> int:
     """Whether a node that trusts these keys would take a bundle: signature, contents, golden test."""
     from neurove_core.estimator import Estimator
-    from neurove_core.models import bundle, golden, manifest
+    from neurove_core.models import bundle, manifest
 
     data, name = _bundle(args.bundle), args.bundle.name
     trusted, signature = [_public(path) for path in args.trust], _signature(args.bundle)
@@ -152,7 +153,7 @@ def verify_model(args: argparse.Namespace) -> int:
         raise Untrusted(name, "unsigned", f"there is no {name}{manifest.SUFFIX} beside it")
     signed = manifest.verify(data, signature, trusted, name)
     found = bundle.from_bytes(data, name)
-    golden.check(Estimator(found))
+    self_test.check(Estimator(found))
     if args.json:
         print(json.dumps({"ok": True, **signed.model_dump(), "golden": found.golden is not None}))
     else:

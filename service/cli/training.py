@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neurove_core.geometry import motion
 from neurove_service.cli.arguments import command, sensor_size
 from neurove_service.cli.bars import progress
 
@@ -101,13 +102,12 @@ def evaluate(args: argparse.Namespace) -> int:
     from neurove_core import models
     from neurove_core.estimator import Estimator
     from neurove_core.evaluation import judge
-    from neurove_core.geometry import camera
     from neurove_core.io import open_source, read_poses
 
     torch.set_num_threads(1)
     estimator = Estimator(models.find(args.model))
     estimator.warm_up()
-    given = camera.twists(read_poses(args.truth)) if args.truth else None
+    given = motion.twists(read_poses(args.truth)) if args.truth else None
     judged = []
     for source in args.recordings:
         recording = open_source(source, args.sensor, args.topic)

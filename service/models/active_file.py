@@ -7,7 +7,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from neurove_core.files import write_whole
+from neurove_core.files import write_atomically
 from neurove_protocol.control import Digest
 from neurove_service import logs
 
@@ -58,7 +58,7 @@ class ActiveFile:
         text = json.dumps({"version": _VERSION, "active": record, "sha256": _sum(record)}, indent=2) + "\n"
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(self._path, text.encode())
+            write_atomically(self._path, text.encode())
         except OSError as error:
             log.warning("active model not kept over a restart", path=str(self._path), why=error.strerror or str(error))
             return False

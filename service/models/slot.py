@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from neurove_core import self_test
 from neurove_core.estimator import Estimator
-from neurove_core.models import golden
 from neurove_core.models.bundle import Bundle
 from neurove_protocol.errors import BadModel, Conflict, InvalidField, NeuroVEError, NothingBefore, UnknownModel
 from neurove_service import logs
@@ -17,7 +17,7 @@ from neurove_service.models import admission, swap
 from neurove_service.models.library import MIN_DIGEST, Available, Files, Library, nothing_pushed
 from neurove_service.models.progress import OnProgress, Progress, Step, silent
 from neurove_service.models.swap import Plan, Subject
-from neurove_service.streams.comparison import Limits
+from neurove_service.streams.comparison import TrialLimits
 from neurove_service.streams.lane import Serving
 from neurove_service.streams.lanes import Roles
 
@@ -28,8 +28,8 @@ class Rules(NamedTuple):
     """How a model change is judged."""
 
     probation_s: float = 10.0
-    shadow: Limits = Limits()
-    probation: Limits = Limits(divergence=3.0)  # it acts by itself: only on what can not be meant
+    shadow: TrialLimits = TrialLimits()
+    probation: TrialLimits = TrialLimits(divergence=3.0)  # it acts by itself: only on what can not be meant
     prime_s: float = 15.0  # longest that a new model waits for windows that its bundle wants beyond those that are kept
     warm_up_share: float = 1.0  # 99th percentile of the time for a window, in the window's duration
 
@@ -279,7 +279,7 @@ class ModelSlot:
         estimator = Estimator(found)
         tell("loaded", f"{found.info.parameters:,} parameters")
         estimator.warm_up()
-        golden.check(estimator)
+        self_test.check(estimator)
         p99_ms = admission.check_speed(estimator, self._rules.warm_up_share)
         tell("warmed", f"p99 {p99_ms:.1f} ms of a window of {estimator.config.window.duration_us / 1e3:g} ms")
         return estimator

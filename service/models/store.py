@@ -17,7 +17,7 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from neurove_core.files import move_folder, write_whole
+from neurove_core.files import move_folder, write_atomically
 from neurove_core.models import bundle
 from neurove_core.models.bundle import Bundle
 from neurove_protocol.control import ModelInfo, PushRequest
@@ -150,7 +150,7 @@ class ModelStore:
                 shutil.rmtree(target)
                 return self._fetch_anew(wanted, target, pull, stop, on_progress, admit)
             if wanted.signature is not None:
-                write_whole(target / (FILE + SIGNATURE), wanted.signature)
+                write_atomically(target / (FILE + SIGNATURE), wanted.signature)
             on_progress(Progress("verified", _about(model, signed)))
             return model, signed, 0
 
@@ -182,7 +182,7 @@ class ModelStore:
             shutil.rmtree(staging)
             raise
         if wanted.signature is not None:
-            write_whole(staging / (FILE + SIGNATURE), wanted.signature)
+            write_atomically(staging / (FILE + SIGNATURE), wanted.signature)
         if target.exists():  # of another size than it should be
             shutil.rmtree(target)
         move_folder(staging, target)

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable
 from typing import Literal, NamedTuple, Protocol
 
 from neurove_protocol.errors import Diverged
-from neurove_service.streams.comparison import LEAST_WINDOWS, Finding, Limits, Measured, finding
+from neurove_service.streams.comparison import LEAST_WINDOWS, Finding, Measured, TrialLimits, finding
 from neurove_service.streams.lane import Primed, Serving, windows_to_prime
 from neurove_service.streams.lanes import Lanes, Roles
 
@@ -154,7 +154,7 @@ def measured(serving: Serving, streams: Iterable[Subject], *, front_is_tried: bo
     return found
 
 
-def worst(found: dict[str, Measured], limits: Limits, newest: int) -> tuple[str, Finding] | None:
+def worst(found: dict[str, Measured], limits: TrialLimits, newest: int) -> tuple[str, Finding] | None:
     """The first stream on which a model broke a limit, and which."""
     for name, one in found.items():
         wrong = finding(one, limits, newest)
@@ -167,7 +167,7 @@ def shadow(
     serving: Serving,
     streams: Callable[[], list[Subject]],
     seconds: float,
-    limits: Limits,
+    limits: TrialLimits,
     wait: Callable[[float], bool],
 ) -> dict[str, Measured]:
     """Look at a model that runs beside another for so long.

@@ -20,7 +20,7 @@ from neurove_service.models.store import ModelStore
 from neurove_service.node import memory
 from neurove_service.node.handlers import Handlers
 from neurove_service.node.health import stream_status
-from neurove_service.streams.comparison import Limits
+from neurove_service.streams.comparison import TrialLimits
 from neurove_service.streams.lanes import RingSize
 from neurove_service.streams.stream import Stream
 from neurove_service.streams.worker import Inbox, Outlet, StreamWorker
@@ -41,8 +41,8 @@ def _rules(config: ServiceConfig) -> Rules:
     return Rules(
         probation_s=config.probation_s,
         prime_s=config.prime_s,
-        shadow=Limits(config.shadow_divergence),
-        probation=Limits(config.probation_divergence),
+        shadow=TrialLimits(config.shadow_divergence),
+        probation=TrialLimits(config.probation_divergence),
     )
 
 
@@ -138,7 +138,7 @@ class Service:
             (keys.rollback(node), self._handlers.rollback),
             (keys.push(node), self._pushes(transport)),
         ):
-            transport.answer_streaming(key, handle, after=memory.give_back)
+            transport.answer_streaming(key, handle, after=memory.release_memory)
         transport.token(keys.alive(node))
 
     def _pushes(self, transport: Transport) -> Callable[[bytes, Tell], bytes]:

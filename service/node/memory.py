@@ -6,7 +6,7 @@ import gc
 import sys
 
 
-def give_back() -> None:
+def release_memory() -> None:
     """Collect what refers to itself, and have the allocator return the pages that nobody uses.
 
     Without it a model's second copy, and what its warm-up took, stay with the allocator, which keeps freed memory in

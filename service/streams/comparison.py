@@ -20,15 +20,15 @@ _SLOW_WINDOWS = 16
 _STEADY_RATE = 0.01
 
 
-class Limits(NamedTuple):
+class TrialLimits(NamedTuple):
     """What a model that is tried must keep to."""
 
     divergence: float = 1.0  # RMS difference of the estimates, in RMS of the proven model's
     rate_ratio: float = 8.0  # share of cells that fire, in that of the proven model, either way
     latency_share: float = 0.5  # median time for a window, in the window's duration
-    own: about.Limits = about.Limits()  # what the model's bundle says of it besides, where it does
+    own: about.BundleLimits = about.BundleLimits()  # what the model's bundle says of it besides, where it does
 
-    def and_of(self, bundle: Bundle) -> "Limits":
+    def and_of(self, bundle: Bundle) -> "TrialLimits":
         """These, and those that a bundle sets itself: it may be stricter than the node, never laxer."""
         return self._replace(own=bundle.limits)
 
@@ -103,7 +103,7 @@ class Measured(NamedTuple):
         return f"{len(self.pairs)} windows, divergence {self.divergence:.3g}, {share}"
 
 
-def finding(measured: Measured, limits: Limits, newest: int = NEWEST_WINDOWS) -> Finding | None:
+def finding(measured: Measured, limits: TrialLimits, newest: int = NEWEST_WINDOWS) -> Finding | None:
     """The first limit that a trial broke, or None.
 
     Args:
@@ -134,7 +134,7 @@ def finding(measured: Measured, limits: Limits, newest: int = NEWEST_WINDOWS) ->
     return None
 
 
-class Answered(NamedTuple):
+class Outcome(NamedTuple):
     """One model's answer to one window, as far as it is compared."""
 
     end_us: int
@@ -155,18 +155,18 @@ class Comparison:
 
     def __init__(self, *, front_is_tried: bool, window_ms: float, reach_us: int) -> None:
         self.front_is_tried, self._window_ms, self._reach_us = front_is_tried, window_ms, reach_us
-        self._front: deque[Answered] = deque(maxlen=NEWEST_WINDOWS)
+        self._front: deque[Outcome] = deque(maxlen=NEWEST_WINDOWS)
         self._pairs: deque[Pair] = deque(maxlen=NEWEST_WINDOWS)
         self._tried_ms: deque[float] = deque(maxlen=NEWEST_WINDOWS)
         self._proven_ms: deque[float] = deque(maxlen=NEWEST_WINDOWS)
         self.fault = ""
 
-    def front(self, answered: Answered, took_ms: float) -> None:
+    def front(self, answered: Outcome, took_ms: float) -> None:
         """An answer of the model that answers the stream."""
         self._front.append(answered)
         (self._tried_ms if self.front_is_tried else self._proven_ms).append(took_ms)
 
-    def beside(self, answered: Answered, took_ms: float) -> None:
+    def beside(self, answered: Outcome, took_ms: float) -> None:
         """An answer of the model that runs beside it, which comes after that of the other."""
         (self._proven_ms if self.front_is_tried else self._tried_ms).append(took_ms)
         other = min(self._front, key=lambda one: abs(one.end_us - answered.end_us), default=None)

@@ -12,7 +12,7 @@ from neurove_core.estimator import Estimator, StreamState, WindowEstimate
 from neurove_core.ingest.windows import Window
 from neurove_core.networks.neurove import NetworkState
 from neurove_protocol.events import Packet
-from neurove_service.streams.comparison import Answered
+from neurove_service.streams.comparison import Outcome
 from neurove_service.streams.ring import Packed, Ring
 
 MOST_OWED_WINDOWS, MOST_OWED_PACKETS, MOST_OWED_EVENTS = 128, 4096, 4_000_000
@@ -45,9 +45,9 @@ class Answer(NamedTuple):
     took_ms: float  # processor time
 
     @property
-    def compared(self) -> Answered:
+    def compared(self) -> Outcome:
         """The part of it that is compared."""
-        return Answered(self.estimate.end_us, self.estimate.twists.mean(axis=0), self.rate)
+        return Outcome(self.estimate.end_us, self.estimate.twists.mean(axis=0), self.rate)
 
 
 class Lane:

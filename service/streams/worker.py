@@ -9,7 +9,7 @@ from typing import NamedTuple
 from neurove_core.ingest.wire import read_packet
 from neurove_protocol import CameraInfo
 from neurove_protocol.errors import NeuroVEError
-from neurove_protocol.events import Limits
+from neurove_protocol.events import PacketLimits
 from neurove_protocol.velocity import TwistEstimate
 from neurove_service import logs
 from neurove_service.streams.stream import Arrival, Stream
@@ -105,7 +105,7 @@ class StreamWorker:
         stream: Stream,
         open_outlet: Callable[[], Outlet],
         inbox: Inbox,
-        limits: Limits,
+        limits: PacketLimits,
         spare: threading.Semaphore | None = None,
     ) -> None:
         self.stream = stream

@@ -14,7 +14,7 @@ import torch
 
 import neurove_core
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from neurove_core.estimator import Answer, Estimator, Push, StreamState, WindowEstimate
+from neurove_core.estimator import Estimator, Push, PushResult, StreamState, WindowEstimate
 from neurove_core.models import bundle
 from neurove_core.models.bundle import Bundle
 from neurove_protocol import CameraInfo, Events, Sensor
@@ -52,7 +52,7 @@ def estimator() -> Estimator:
     return Estimator(make_bundle())
 
 
-def feed(estimator: Estimator, packets: list[Events], state: StreamState | None = None) -> Answer:
+def feed(estimator: Estimator, packets: list[Events], state: StreamState | None = None) -> PushResult:
     """All that comes of packets, each pushed with the time of its first event."""
     state = state or estimator.initial_state(SENSOR)
     estimates, late, outside, skipped = [], 0, 0, 0
@@ -62,7 +62,7 @@ def feed(estimator: Estimator, packets: list[Events], state: StreamState | None 
         estimates += answer.estimates
         late, outside = late + answer.late_events, outside + answer.outside_events
         skipped += answer.skipped_windows
-    return Answer(estimates, state, late, outside, skipped)
+    return PushResult(estimates, state, late, outside, skipped)
 
 
 def cut_at_random(events: Events, seed: int, cuts: int = 25) -> list[Events]:
@@ -159,7 +159,7 @@ def test_streams_pushed_at_once_are_answered_as_each_alone(precision):
     packets = [windows_of_events(6, seed=50), hole, [make_events(9, seed=1)] * 6, [Events.join(hole), *[tick(30)] * 5]]
     alone = [feed(estimator, one) for one in packets]
     states = [estimator.initial_state(SENSOR) for _ in packets]
-    together: list[list[Answer]] = []
+    together: list[list[PushResult]] = []
     for turn in zip(*packets, strict=True):
         pushes = [Push(events, state, int(events.t[0])) for events, state in zip(turn, states, strict=True)]
         answers = estimator.push_many(pushes)

@@ -3,14 +3,14 @@
 import pytest
 
 from neurove_core.figures import blank_figure, save_figure
-from neurove_core.files import move_folder, write_whole, written_whole
+from neurove_core.files import atomic_path, move_folder, write_atomically
 from neurove_protocol.errors import InvalidField
 
 
 def test_a_file_is_what_it_was_until_all_is_written(tmp_path):
     file = tmp_path / "a.txt"
-    write_whole(file, b"before")
-    with written_whole(file) as part:
+    write_atomically(file, b"before")
+    with atomic_path(file) as part:
         part.write_bytes(b"after")
         assert file.read_bytes() == b"before"
     assert file.read_bytes() == b"after"
@@ -20,10 +20,10 @@ def test_a_file_is_what_it_was_until_all_is_written(tmp_path):
 @pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
 def test_writing_that_fails_leaves_what_was_there_and_nothing_beside_it(tmp_path, error):
     file = tmp_path / "a.txt"
-    write_whole(file, b"before")
+    write_atomically(file, b"before")
 
     def stopped():
-        with written_whole(file) as part:
+        with atomic_path(file) as part:
             part.write_bytes(b"aft")
             raise error
 
@@ -35,8 +35,8 @@ def test_writing_that_fails_leaves_what_was_there_and_nothing_beside_it(tmp_path
 
 def test_a_block_that_writes_nothing_is_told_and_the_file_stays(tmp_path):
     file = tmp_path / "a.txt"
-    write_whole(file, b"before")
-    with pytest.raises(FileNotFoundError), written_whole(file):
+    write_atomically(file, b"before")
+    with pytest.raises(FileNotFoundError), atomic_path(file):
         pass
     assert file.read_bytes() == b"before"
 
@@ -44,7 +44,7 @@ def test_a_block_that_writes_nothing_is_told_and_the_file_stays(tmp_path):
 def test_a_folder_moves_whole_and_not_onto_one_that_is_in_use(tmp_path):
     for name in ("new", "used"):
         (tmp_path / name).mkdir()
-        write_whole(tmp_path / name / "a.txt", name.encode())
+        write_atomically(tmp_path / name / "a.txt", name.encode())
     with pytest.raises(OSError, match="not empty"):
         move_folder(tmp_path / "new", tmp_path / "used")
     assert (tmp_path / "used" / "a.txt").read_bytes() == b"used"

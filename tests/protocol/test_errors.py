@@ -71,7 +71,7 @@ every_error = pytest.mark.parametrize("error", ERRORS, ids=lambda error: error.c
 def subclasses(kind: type[NeuroVEError]) -> set[type[NeuroVEError]]:
     """All errors of this package below this one; other packages may add their own."""
     below = {kind, *(found for child in kind.__subclasses__() for found in subclasses(child))}
-    return {found for found in below if found.__module__.startswith("protocol.")}
+    return {found for found in below if found.__module__.startswith("neurove_protocol.")}
 
 
 def test_the_table_of_this_test_is_complete() -> None:

@@ -217,7 +217,7 @@ def test_an_example_is_short_and_uses_only_what_the_package_has(example: str) ->
             assert {name.name for name in node.names} <= {"time", "numpy", "zenoh"}
         if isinstance(node, ast.ImportFrom):
             module = importlib.import_module(str(node.module))
-            assert module.__name__.partition(".")[0] == "protocol"
+            assert module.__name__.partition(".")[0] == "neurove_protocol"
             assert all(hasattr(module, name.name) for name in node.names)
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in known:
             assert hasattr(known[node.value.id], node.attr)

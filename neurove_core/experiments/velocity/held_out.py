@@ -14,7 +14,7 @@ import numpy as np
 
 from neurove_core.config import ModelConfig
 from neurove_core.evaluation.contrast import angular
-from neurove_core.files import write_whole
+from neurove_core.files import write_atomically
 from neurove_core.sim.motion.trajectory import Trajectory, driving, hand_held, parse_trajectory
 from neurove_core.sim.render.camera import named_camera
 from neurove_core.sim.render.pixels import USUAL, PixelConfig
@@ -204,7 +204,7 @@ class Kept:
                 save(sequence_of(item.simulation, self._config), self.path(item))
             if item.group in CM_GROUPS and not self.turning_path(item).exists():
                 told = list(_turning(item.simulation))
-                write_whole(self.turning_path(item), json.dumps(told).encode())
+                write_atomically(self.turning_path(item), json.dumps(told).encode())
             yield item
 
     def _key(self, item: Item) -> str:

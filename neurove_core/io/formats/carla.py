@@ -15,8 +15,8 @@ from typing import IO, Any, Final, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.files import written_whole
-from neurove_core.geometry.camera import Poses, Twists, twists
+from neurove_core.files import atomic_path
+from neurove_core.geometry.motion import Poses, Twists, twists
 from neurove_core.io.archive import BROKEN_ZIP
 from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.recording import BLOCK_BYTES, SUPPORTED, EventsOnly, in_chunks, whole
@@ -233,7 +233,7 @@ def write(
         if poses is not None:
             names = ("pose_t_ns", "location", "rotation_deg")
             small |= dict(zip(names, poses(), strict=True))
-        with written_whole(path) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        with atomic_path(path) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
             for name, value in small.items():
                 with archive.open(f"{name}.npy", "w") as member:
                     np.lib.format.write_array(member, np.asanyarray(value), allow_pickle=False)

@@ -12,7 +12,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.geometry.camera import Poses, Twists, twists
+from neurove_core.geometry.motion import Poses, Twists, twists
 from neurove_core.io.archive import Place, folder_in_zip, read_image
 from neurove_core.io.errors import BrokenRecording
 from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Frame, Imu, in_chunks

@@ -9,7 +9,7 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.geometry.camera import Twists
+from neurove_core.geometry.motion import Twists
 from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.formats.mat5 import MatFault, read_columns
 from neurove_core.io.recording import SUPPORTED, EventsOnly, in_chunks, whole

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from neurove_core.compiled import compiled
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
-from neurove_core.io.recording import BLOCK_BYTES, CHUNK_EVENTS, SUPPORTED, EventsOnly, room
+from neurove_core.io.recording import BLOCK_BYTES, CHUNK_EVENTS, SUPPORTED, EventsOnly, empty_events
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
 
@@ -83,7 +83,7 @@ class EventStreamRecording(EventsOnly):
             while block := file.read(BLOCK_BYTES):
                 data = np.frombuffer(rest + block, np.uint8)
                 while True:
-                    out = room(CHUNK_EVENTS)
+                    out = empty_events(CHUNK_EVENTS)
                     t_us, read, n, inside = es_decode(data, t_us, self.kind, self.sensor.width, self.sensor.height, out)
                     if n:
                         yield out.span(0, n)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neurove_core.geometry import rotations
-from neurove_core.geometry.camera import Poses, Twists
+from neurove_core.geometry.motion import Poses, Twists
 from neurove_protocol.errors import InvalidField
 
 Array = NDArray[np.float64]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from neurove_core.ingest.counting import compiled
+from neurove_core.compiled import compiled
 from neurove_core.spiking.surrogate import Surrogate
 
 Array = NDArray[Any]  # float32 or float64

@@ -12,7 +12,7 @@ from neurove_core.engine import convolution
 from neurove_core.engine.engine import Engine
 from neurove_core.models import bundle
 from neurove_core.networks.neurove import NetworkState, NeuroVE
-from neurove_core.spiking.lif import plain
+from neurove_core.spiking.plain import plain
 
 STEPS = 6
 SMALL = ModelConfig(

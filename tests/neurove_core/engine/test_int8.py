@@ -7,11 +7,13 @@ import torch
 
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
 from neurove_core.engine import convolution, int8
+from neurove_core.engine.encoding import to_codes
 from neurove_core.engine.engine import Engine
 from neurove_core.estimator import Estimator
 from neurove_core.models import bundle
-from neurove_core.networks.encoding import to_codes, to_spikes
-from neurove_core.spiking.lif import plain
+from neurove_core.networks import quantisation
+from neurove_core.networks.encoding import to_spikes
+from neurove_core.spiking.plain import plain
 from tests.builders import SENSOR, make_events
 
 SMALL = ModelConfig(
@@ -87,7 +89,7 @@ def projection_of(inputs: int, features: int, seed: int = 0, *, q: torch.Tensor 
     if q is None:
         q = torch.randint(-127, 128, (features, inputs), generator=generator, dtype=torch.int8)
     step, factor, offset = torch.rand(3, features, generator=generator)
-    return int8.Projection(int8.Layer(int8.Quantised(q, step), factor / 100, offset - 0.5))
+    return int8.Projection(int8.Layer(quantisation.Quantised(q, step), factor / 100, offset - 0.5))
 
 
 @pytest.mark.parametrize("inputs", [1, 255, 256, 257, 700, 25_344])
@@ -118,16 +120,16 @@ def test_the_largest_sums_of_a_projection_are_exact(inputs, sign):
 def test_weights_move_by_half_a_step_at_most_and_rounding_again_changes_nothing(shape):
     by_row = (-1, *[1] * (len(shape) - 1))
     weight = torch.randn(shape) * torch.tensor([1e-3, 1.0, 50.0, 0.0, 1.0]).view(by_row)
-    rounded, step = int8.rounded(weight), int8.quantised(weight).step
+    rounded, step = quantisation.rounded(weight), quantisation.quantised(weight).step
     assert torch.all((rounded - weight).abs() <= 0.501 * step.view(by_row))
-    assert torch.equal(int8.quantised(rounded).q, int8.quantised(weight).q)
+    assert torch.equal(quantisation.quantised(rounded).q, quantisation.quantised(weight).q)
 
 
 @pytest.mark.parametrize("shape", [(5, 4, 3, 3), (5, 36)], ids=["convolution", "projection"])
 def test_gradients_pass_the_rounding_as_if_it_were_not_there(shape):
     weight = torch.randn(shape, requires_grad=True)
     pull = torch.randn(shape)
-    int8.rounded(weight).backward(pull)
+    quantisation.rounded(weight).backward(pull)
     torch.testing.assert_close(weight.grad, pull)
 
 
@@ -138,7 +140,7 @@ def test_training_sees_the_projection_that_runs():
         config = SMALL.model_copy(update={"network": SMALL.network.model_copy(update={"precision": precision})})
         network, spikes = network_of(config), draw(config)
         weight = network.project.weight
-        q, step = int8.quantised(weight)
+        q, step = quantisation.quantised(weight)
         weight.copy_(q * step.view(-1, 1))
         before = network(spikes, network.initial_state(1))[0]
         weight.add_(step.view(-1, 1) / 3 * (q.abs() < 127))
@@ -150,7 +152,7 @@ def test_training_sees_the_projection_that_runs():
 def test_counts_become_the_codes_of_their_spikes_and_a_network_may_be_given_either(encoding):
     counts = torch.arange(256, dtype=torch.uint8).repeat(2, 16).reshape(1, 1, 4, 32, 64)[..., :14, :19].contiguous()
     found, spikes = to_codes(counts, encoding), to_spikes(counts, encoding)
-    assert torch.equal(found, int8.codes(spikes))
+    assert torch.equal(found, quantisation.codes(spikes))
     assert found.is_contiguous()
     engine = Engine(network_of(SMALL))
     state = network_of(SMALL).initial_state(1)

@@ -7,12 +7,14 @@ import pytest
 import torch
 
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from neurove_core.engine import convolution, sparse
+from neurove_core.engine import convolution, sparse, spike_lists
+from neurove_core.engine.encoding import to_counts
 from neurove_core.engine.engine import Engine
 from neurove_core.models import bundle
-from neurove_core.networks import encoding
+from neurove_core.networks.encoding import to_spikes
 from neurove_core.spiking.fused import scan
-from neurove_core.spiking.lif import LIFParams, LIFState, plain
+from neurove_core.spiking.lif import LIFParams, LIFState
+from neurove_core.spiking.plain import plain
 
 DECAY, V_TH = 0.5, 0.7
 LIF = LIFParams(DECAY, V_TH)
@@ -38,8 +40,8 @@ def layer_of(inputs, outputs, rows, columns, seed=0):
 def fire_over(layer, spikes, v):
     """Spikes and potentials of a layer over a list."""
     cells = np.ascontiguousarray(v.numpy().transpose(0, 2, 3, 1))
-    fired, after = sparse.OverList(layer)(sparse.listed(spikes), cells, np.float32(DECAY), np.float32(V_TH))
-    return sparse.maps_of(fired), torch.from_numpy(after.transpose(0, 3, 1, 2))
+    fired, after = sparse.OverList(layer)(spike_lists.listed(spikes), cells, np.float32(DECAY), np.float32(V_TH))
+    return spike_lists.maps_of(fired), torch.from_numpy(after.transpose(0, 3, 1, 2))
 
 
 @pytest.mark.parametrize("share", [0, 0.02, 0.15, 0.39, 0.6, 1])
@@ -73,8 +75,8 @@ def test_a_layer_over_a_list_fires_as_the_dense_one_bit_for_bit(inputs, outputs,
 @pytest.mark.parametrize("share", [0, 0.15, 1])
 def test_a_list_holds_what_its_maps_hold(share):
     maps = spikes_of(3, 5, 4, 7, share)
-    fired = sparse.listed(maps)
-    assert torch.equal(sparse.maps_of(fired), maps)
+    fired = spike_lists.listed(maps)
+    assert torch.equal(spike_lists.maps_of(fired), maps)
     assert fired.found == int(maps.sum())
     assert fired.starts.size == 3 * 4 * 7 + 1
 
@@ -89,10 +91,10 @@ def test_each_map_is_projected_as_alone_and_summed_in_the_order_of_its_neurons(f
     extractor = sparse.extractor([layer_of(4, 16, 5, 5)], (weight, bias), LIF)
     assert extractor is not None
     maps = spikes_of(4, *size, share)
-    found = torch.from_numpy(extractor.project(sparse.listed(maps)))
+    found = torch.from_numpy(extractor.project(spike_lists.listed(maps)))
     assert found.shape == (4, features)
     for index in range(4):
-        alone = torch.from_numpy(extractor.project(sparse.listed(maps[index : index + 1])))
+        alone = torch.from_numpy(extractor.project(spike_lists.listed(maps[index : index + 1])))
         assert torch.equal(alone, found[index : index + 1])
         expected = bias.clone()
         for place in maps[index].permute(1, 2, 0).flatten().nonzero():
@@ -208,14 +210,14 @@ def test_counts_answer_as_the_spikes_that_they_stand_for_bit_for_bit(name, size,
     for steps in (1, 3, 1):
         drawn = torch.poisson(torch.full((steps, 2, 4, *size), rate), generator=torch.Generator().manual_seed(steps))
         counts = drawn.clamp(max=255).to(torch.uint8)
-        found, states[0] = engine(encoding.to_counts(counts, name), states[0])
-        expected, states[1] = engine(encoding.to_spikes(counts, name), states[1])
+        found, states[0] = engine(to_counts(counts, name), states[0])
+        expected, states[1] = engine(to_spikes(counts, name), states[1])
         assert torch.equal(found, expected)
         for one, other in zip(states[0].membranes, states[1].membranes, strict=True):
             assert torch.equal(one.v, other.v)
     starts = [network.initial_state(1) for _ in range(2)]
-    for b, (twists, _) in enumerate(engine.together(encoding.to_counts(counts, name), starts)):
-        assert torch.equal(twists, engine(encoding.to_spikes(counts[:, b : b + 1], name), starts[b])[0])
+    for b, (twists, _) in enumerate(engine.together(to_counts(counts, name), starts)):
+        assert torch.equal(twists, engine(to_spikes(counts[:, b : b + 1], name), starts[b])[0])
     with plain():
-        plainly = [engine(give(counts, name), states[0])[0] for give in (encoding.to_counts, encoding.to_spikes)]
+        plainly = [engine(give(counts, name), states[0])[0] for give in (to_counts, to_spikes)]
     assert torch.equal(*plainly)

@@ -7,10 +7,12 @@ import pytest
 import torch
 
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from neurove_core.engine import convolution, int8, sparse, sparse_int8
+from neurove_core.engine import convolution, int8, sparse_int8, spike_lists
 from neurove_core.engine.engine import Engine
 from neurove_core.models import bundle
-from neurove_core.spiking.lif import LIFParams, LIFState, lif_scan_reference, plain
+from neurove_core.networks import quantisation
+from neurove_core.spiking.lif import LIFParams, LIFState, lif_scan_reference
+from neurove_core.spiking.plain import plain
 
 DECAY, V_TH = 0.5, 0.7
 LIF = LIFParams(DECAY, V_TH)
@@ -46,7 +48,7 @@ def expected_of(layer, maps, v, top=1):
 
 def assert_fires_alike(found, expected):
     fired, after = found
-    assert torch.equal(sparse.maps_of(fired), expected[0])
+    assert torch.equal(spike_lists.maps_of(fired), expected[0])
     assert torch.equal(torch.from_numpy(after.transpose(0, 3, 1, 2)), expected[1])
 
 
@@ -73,8 +75,8 @@ def test_a_layer_over_a_list_fires_as_the_plain_one_bit_for_bit(inputs, outputs,
         cells = np.ascontiguousarray(v.numpy().transpose(0, 2, 3, 1))
         expected = expected_of(layer, maps, v)
         over = sparse_int8.OverList(layer)
-        assert_fires_alike(over(sparse.listed(maps), cells, *CONSTANTS), expected)
-        assert_fires_alike(over.over_list(sparse.listed(maps), cells, *CONSTANTS), expected)
+        assert_fires_alike(over(spike_lists.listed(maps), cells, *CONSTANTS), expected)
+        assert_fires_alike(over.over_list(spike_lists.listed(maps), cells, *CONSTANTS), expected)
 
 
 @pytest.mark.parametrize("how", ["as this machine does", "dense"])
@@ -106,7 +108,7 @@ def test_the_largest_sums_are_exact(inputs, sign):
             continue
         layer = layer_of(inputs, 16, 7, 5, top, q=q)
         maps = torch.full((2, inputs, 7, 5), top, dtype=torch.uint8)
-        given = sparse.listed(maps) if top == 1 else maps.numpy()
+        given = spike_lists.listed(maps) if top == 1 else maps.numpy()
         assert_fires_alike(over(layer)(given, v, *CONSTANTS), expected_of(layer, maps, torch.zeros(2, 16, 4, 3), top))
 
 
@@ -119,10 +121,10 @@ def test_who_fired_is_projected_as_its_maps_are_bit_for_bit(features, size, shar
     generator = torch.Generator().manual_seed(0)
     q = torch.randint(-127, 128, (features, inputs), generator=generator, dtype=torch.int8)
     step, factor, offset = torch.rand(3, features, generator=generator)
-    projection = int8.Projection(int8.Layer(int8.Quantised(q, step), factor, offset))
+    projection = int8.Projection(int8.Layer(quantisation.Quantised(q, step), factor, offset))
     maps = maps_of(4, *size, share)
     rows = maps.permute(0, 2, 3, 1).flatten(1)
-    found = projection(sparse.listed(maps))
+    found = projection(spike_lists.listed(maps))
     assert torch.equal(found, projection(rows))
     with plain():
         assert torch.equal(found, projection(rows))
@@ -130,9 +132,9 @@ def test_who_fired_is_projected_as_its_maps_are_bit_for_bit(features, size, shar
 
 def test_the_largest_sums_of_a_projection_over_a_list_are_exact():
     q = torch.cat([torch.full((8, 132_105), 127), torch.full((8, 132_105), -127)]).to(torch.int8)
-    projection = int8.Projection(int8.Layer(int8.Quantised(q, torch.ones(16)), torch.ones(16), torch.zeros(16)))
+    projection = int8.Projection(int8.Layer(quantisation.Quantised(q, torch.ones(16)), torch.ones(16), torch.zeros(16)))
     maps = torch.ones(2, 132_105, 1, 1, dtype=torch.uint8)
-    assert torch.equal(projection(sparse.listed(maps)), projection(maps.flatten(1)))
+    assert torch.equal(projection(spike_lists.listed(maps)), projection(maps.flatten(1)))
 
 
 def test_widths_that_suit_no_vector_are_left_to_the_dense_layers():

@@ -10,7 +10,7 @@ from neurove_core.io import open_source
 from neurove_core.io.formats.ecd import DAVIS240C, parse_calib
 from neurove_protocol import CameraInfo, Events
 from neurove_protocol.errors import InvalidField
-from tests.neurove_core.test_geometry import ECD, MVSEC
+from tests.neurove_core.geometry.test_geometry import ECD, MVSEC
 from tests.recordings import shared
 
 

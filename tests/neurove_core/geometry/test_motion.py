@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from neurove_core.geometry import rotations
-from neurove_core.geometry.camera import MAX_GAP_US, Poses, Twists, filter_for, interpolate_poses, smoothed, twists
+from neurove_core.geometry.motion import MAX_GAP_US, Poses, Twists, filter_for, interpolate_poses, smoothed, twists
 from neurove_protocol.errors import InvalidField
 from tests.recordings import shared
 

@@ -17,8 +17,8 @@ from neurove_protocol import EventPacket, Events, NeuroVEError, Sensor
 from neurove_protocol.events import (
     DEFAULT_LIMITS,
     FORMATS,
-    Limits,
     Packet,
+    PacketLimits,
     WireEvents,
     decode_packet,
     encode_packet,
@@ -27,12 +27,14 @@ from neurove_protocol.events import (
 from tests.builders import SENSOR, make_events, make_packet, make_packets
 from tests.protocol.messages import EVENT_PACKET, assert_same_events, bounded, pack, packets, soa
 
-LIMITS = Limits(max_events=5, max_side_px=400)
+LIMITS = PacketLimits(max_events=5, max_side_px=400)
 LUT = lookup_table(CanonicalConfig(width=16, height=12), SENSOR, None)
 HALF_BLIND = np.where(np.arange(SENSOR.width) < SENSOR.width // 2, OUTSIDE, LUT).astype(np.int32)
 
 
-def outcome(read: Callable[[bytes, Limits], Packet], data: bytes, limits: Limits = DEFAULT_LIMITS) -> object:
+def outcome(
+    read: Callable[[bytes, PacketLimits], Packet], data: bytes, limits: PacketLimits = DEFAULT_LIMITS
+) -> object:
     """The packet as plain values, or the error that was raised."""
     try:
         packet = read(data, limits)
@@ -43,7 +45,7 @@ def outcome(read: Callable[[bytes, Limits], Packet], data: bytes, limits: Limits
     return about, events.t.dtype, *(column.tolist() for column in events)
 
 
-def assert_read_alike(data: bytes, limits: Limits = DEFAULT_LIMITS) -> None:
+def assert_read_alike(data: bytes, limits: PacketLimits = DEFAULT_LIMITS) -> None:
     assert outcome(read_packet, data, limits) == outcome(decode_packet, data, limits)
 
 
@@ -109,7 +111,7 @@ def test_every_truncation_and_every_flipped_bit_is_read_alike() -> None:
 
 def test_a_packet_beyond_the_caps_is_refused_alike() -> None:
     data = encode_packet(make_packet(50))
-    for limits in (Limits(max_events=49), Limits(max_side_px=63), Limits(max_events=0)):
+    for limits in (PacketLimits(max_events=49), PacketLimits(max_side_px=63), PacketLimits(max_events=0)):
         assert_read_alike(data, limits)
 
 

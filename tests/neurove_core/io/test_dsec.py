@@ -7,7 +7,7 @@ import h5py
 import numpy as np
 import pytest
 
-from neurove_core.geometry.camera import Twists
+from neurove_core.geometry.motion import Twists
 from neurove_core.io import BrokenRecording, EventsOnly, open_source, read_poses, write_dsec
 from neurove_core.io.formats.hdf5.dsec_write import MAX_SPAN_S
 from neurove_protocol import Events, Sensor

@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from neurove_core.ingest import counting
-from neurove_core.ingest.counting import ILLEGAL, OK, OUTSIDE, VECTOR_EVENTS, Evt2State, Evt3State
-from neurove_core.io.formats.prophesee import triggers
+from neurove_core import compiled
+from neurove_core.io.formats.prophesee import evt, triggers
+from neurove_core.io.formats.prophesee.evt import ILLEGAL, OK, OUTSIDE, VECTOR_EVENTS, Evt2State, Evt3State
 from neurove_protocol import Events, Sensor
 from tests.builders import make_events
 from tests.builders_evt import (
@@ -46,8 +46,8 @@ class Format(NamedTuple):
     wrap_us: int
 
 
-EVT2 = Format(counting.evt2_decode, counting.evt2_reference, Evt2State(), write_evt2, np.uint32, 1 << 34)
-EVT3 = Format(counting.evt3_decode, counting.evt3_reference, Evt3State(), write_evt3, np.uint16, 1 << 24)
+EVT2 = Format(evt.evt2_decode, evt.evt2_reference, Evt2State(), write_evt2, np.uint32, 1 << 34)
+EVT3 = Format(evt.evt3_decode, evt.evt3_reference, Evt3State(), write_evt3, np.uint16, 1 << 24)
 both = pytest.mark.parametrize("format_", [EVT2, EVT3], ids=["evt2", "evt3"])
 
 
@@ -189,7 +189,7 @@ def reference(format_: Format, words: NDArray[Any], *, state: Any, sensor: Senso
 def test_a_vector_that_does_not_fit_any_more_is_left_for_the_next_call(room_for):
     words = evt3((TIME_HIGH, 0), (ADDR_Y, 1), (BASE_X, 0), HIT, *[(VECT_12, 0xFFF)] * 50)
     out = room(room_for + 50)  # what lies beyond `out` must not be written to
-    _, _, n, _ = counting.evt3_decode(words, Evt3State(), 1280, 720, out.span(0, room_for))
+    _, _, n, _ = evt.evt3_decode(words, Evt3State(), 1280, 720, out.span(0, room_for))
     assert n <= room_for
     assert not out.x[room_for:].any()
     assert_same(decode(EVT3, words, room_for=room_for)[2], decode(EVT3, words)[2])
@@ -197,7 +197,7 @@ def test_a_vector_that_does_not_fit_any_more_is_left_for_the_next_call(room_for)
 
 def test_without_room_for_a_vector_nothing_is_read_or_written():
     out = room(VECTOR_EVENTS)
-    _, read, n, verdict = counting.evt3_decode(
+    _, read, n, verdict = evt.evt3_decode(
         evt3((TIME_HIGH, 0), (ADDR_Y, 1), HIT), Evt3State(), 1280, 720, out.span(0, VECTOR_EVENTS - 1)
     )
     assert (read, n, verdict) == (0, 0, OK)
@@ -331,12 +331,10 @@ def test_an_unknown_evt2_word_stops_before_itself(kind):
 def test_an_event_outside_the_sensor_stops_and_can_be_seen():
     out = room(64)
     words = evt3((TIME_HIGH, 1), (ADDR_Y, 47), (BASE_X, 58), (VECT_12, 0b1111), (VECT_12, 0b1), HIT)
-    _, read, n, verdict = counting.evt3_decode(words, Evt3State(), 64, 48, out)
+    _, read, n, verdict = evt.evt3_decode(words, Evt3State(), 64, 48, out)
     assert (read, n, verdict) == (4, 4, OUTSIDE)
     assert rows(out)[4] == (4096, 70, 47, 0)
-    _, read, n, verdict = counting.evt2_decode(
-        evt2((8, 1), (1, cd(0, 63, 47)), (1, cd(0, 3, 48))), Evt2State(), 64, 48, out
-    )
+    _, read, n, verdict = evt.evt2_decode(evt2((8, 1), (1, cd(0, 63, 47)), (1, cd(0, 3, 48))), Evt2State(), 64, 48, out)
     assert (read, n, verdict) == (2, 1, OUTSIDE)
     assert rows(out)[1] == (64, 3, 48, 1)
 
@@ -360,4 +358,4 @@ def test_a_kernel_runs_where_no_cache_can_be_written(monkeypatch):
     def double(x: int) -> int:
         return 2 * x
 
-    assert counting.compiled(double)(21) == 42
+    assert compiled.compiled(double)(21) == 42

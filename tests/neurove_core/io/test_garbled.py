@@ -9,8 +9,8 @@ from neurove_core.io import Recording, open_source
 from neurove_protocol import Events, NeuroVEError, Sensor
 from neurove_protocol.events import check_events
 from tests.builders import SENSOR, make_events
-from tests.neurove_core import test_io_aedat2, test_io_carla, test_io_ecd, test_io_evbench, test_io_eventstream
-from tests.neurove_core.test_io_prophesee import dat
+from tests.neurove_core.io import test_aedat2, test_carla, test_ecd, test_evbench, test_eventstream
+from tests.neurove_core.io.test_prophesee import dat
 from tests.recordings import put
 
 EVENTS = make_events(200, seed=1)
@@ -19,21 +19,21 @@ DAVIS = Sensor(240, 180)
 
 def aedat2() -> bytes:
     events = make_events(100, seed=1, sensor=DAVIS)
-    samples = test_io_aedat2.imu_words(list(range(7)))
+    samples = test_aedat2.imu_words(list(range(7)))
     return (
-        test_io_aedat2.header(b"DAVIS240C", test_io_aedat2.SCALE % (1000, 8))
-        + test_io_aedat2.pairs(test_io_aedat2.davis(events, DAVIS), events.t)
-        + test_io_aedat2.pairs(samples, np.full(7, events.t[-1]))
+        test_aedat2.header(b"DAVIS240C", test_aedat2.SCALE % (1000, 8))
+        + test_aedat2.pairs(test_aedat2.davis(events, DAVIS), events.t)
+        + test_aedat2.pairs(samples, np.full(7, events.t[-1]))
     )
 
 
 WRITTEN = {
     "a.dat": lambda folder: dat(EVENTS),
-    "a.es": lambda folder: test_io_eventstream.header() + b"".join(test_io_eventstream.write(EVENTS)),
+    "a.es": lambda folder: test_eventstream.header() + b"".join(test_eventstream.write(EVENTS)),
     "a.aedat": lambda folder: aedat2(),
-    "a.zip": lambda folder: Path(test_io_ecd.put_zip(folder, test_io_ecd.FILES)).read_bytes(),
-    "a.mat": lambda folder: Path(test_io_evbench.put_mat(folder)).read_bytes(),
-    "a.npz": lambda folder: Path(test_io_carla.written(folder, EVENTS)).read_bytes(),
+    "a.zip": lambda folder: Path(test_ecd.put_zip(folder, test_ecd.FILES)).read_bytes(),
+    "a.mat": lambda folder: Path(test_evbench.put_mat(folder)).read_bytes(),
+    "a.npz": lambda folder: Path(test_carla.written(folder, EVENTS)).read_bytes(),
 }
 each_format = pytest.mark.parametrize("name", WRITTEN)
 

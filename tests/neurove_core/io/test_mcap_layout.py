@@ -4,7 +4,7 @@ import msgpack
 import numpy as np
 import pytest
 
-from neurove_core.geometry.camera import Twists
+from neurove_core.geometry.motion import Twists
 from neurove_core.io import Imu
 from neurove_core.io.formats.packet_log.layout import BadColumns, pack_columns, pack_frame, unpack_columns, unpack_frame
 from neurove_core.io.recording import Frame

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from neurove_core.geometry.camera import Poses, Twists
+from neurove_core.geometry.motion import Poses, Twists
 from neurove_core.io import BrokenRecording, PacketWriter, UnknownSource, open_source, write_mcap
 from neurove_core.io.formats.packet_log.reader import McapRecording
 from neurove_core.io.packets import slices

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from neurove_core.geometry import rotations
-from neurove_core.geometry.camera import twists
+from neurove_core.geometry.motion import twists
 from neurove_core.io import BrokenRecording, open_source
 from neurove_core.io.formats.hdf5 import mvsec
 from neurove_protocol import Sensor

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from neurove_core.extras import MissingExtra
-from neurove_core.geometry import camera
+from neurove_core.geometry import motion
 from neurove_core.io import BrokenRecording, UnknownSource, poses, read_poses
 from neurove_protocol.errors import InvalidField
 from tests.builders import make_events
@@ -54,7 +54,7 @@ def test_mvsecs_odometry_has_its_known_length(path, length_m):
 
 
 def test_the_slider_moves_along_its_own_x_at_its_known_speed():
-    got = camera.twists(read_poses(shared("slider_depth/groundtruth.txt"))).twist
+    got = motion.twists(read_poses(shared("slider_depth/groundtruth.txt"))).twist
     assert 0.2 < got[:200, 0].min() < got[:200, 0].max() < 0.35  # in its first two seconds
     assert np.abs(got[:, 1:]).max() < 1e-3
 

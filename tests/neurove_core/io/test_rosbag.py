@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from neurove_core.ingest.counting import ILLEGAL, OK, OUTSIDE
 from neurove_core.io import BrokenRecording, UnknownSource, open_source
+from neurove_core.io.formats.prophesee.evt import ILLEGAL, OK, OUTSIDE
 from neurove_core.io.formats.ros.libcaer import WORD_EVENTS, LibcaerState, libcaer_decode, libcaer_reference
 from neurove_core.io.formats.ros.recording import RosbagRecording
 from neurove_protocol import Events, Sensor

@@ -10,7 +10,7 @@ from neurove_core.extras import MissingExtra
 from neurove_core.io import BrokenRecording, UnknownSource, open_source
 from tests import ros_bags
 from tests.builders import make_events
-from tests.neurove_core.test_rosbag import beside, in_packets
+from tests.neurove_core.io.test_rosbag import beside, in_packets
 from tests.recordings import assert_same, read, read_broken
 
 zstandard = pytest.importorskip("zstandard")

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neurove_core.geometry.camera import Poses, Twists, twists
+from neurove_core.geometry.motion import Poses, Twists, twists
 from neurove_core.io import BrokenRecording, EventsOnly, Frame, Imu, Triggers, open_source
 from neurove_core.io.recording import in_chunks
 from neurove_core.io.summary import survey

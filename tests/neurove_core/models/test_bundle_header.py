@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 import neurove_core
 from neurove_core.models import bundle, golden, manifest
-from neurove_core.models.about import About, Limits, MadeBy
+from neurove_core.models.about import About, BundleLimits, MadeBy
 from neurove_core.models.bundle import Header
 from neurove_protocol.errors import BadModel
 from tests.bundles import CONFIG, DATA, ORIGINAL, packed, refusal, unpacked, with_entries, with_fields
@@ -29,7 +29,7 @@ TOLD = About(
         data={"sequences": 112},
     ),
     prime_windows=40,
-    limits=Limits(mean_dv_m_s=1.5, latency_ratio=2.0),
+    limits=BundleLimits(mean_dv_m_s=1.5, latency_ratio=2.0),
 )
 
 PATHS = [
@@ -96,7 +96,7 @@ def test_a_bundle_that_tells_nothing_is_the_file_that_it_always_was():
         "linear_unit",
     ]
     loaded = bundle.from_bytes(DATA, "x")
-    assert (loaded.release, loaded.limits, loaded.about.made_by) == (0, Limits(), None)
+    assert (loaded.release, loaded.limits, loaded.about.made_by) == (0, BundleLimits(), None)
     assert loaded.prime_windows == CONFIG.settle_windows
 
 
@@ -178,7 +178,7 @@ def test_a_pickle_is_refused_and_not_one_opcode_of_it_runs(tmp_path):
 
 def test_the_page_of_the_format_names_every_field_and_reason():
     page = (Path(neurove_core.__file__).parent / "BUNDLE.md").read_text()
-    named = [*Header.model_fields, *MadeBy.model_fields, *Limits.model_fields, *manifest.Signed.model_fields]
+    named = [*Header.model_fields, *MadeBy.model_fields, *BundleLimits.model_fields, *manifest.Signed.model_fields]
     named += [*bundle.UncertaintyHeader.model_fields, "spread.weight", "spread.bias", "output.correlation"]
     assert [name for name in named if f"`{name}`" not in page] == []
     for bound in (bundle.MAX_BYTES >> 20, bundle.MAX_HEADER_BYTES >> 20, golden.MAX_CELLS >> 20):

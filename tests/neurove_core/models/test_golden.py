@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 import torch
 
+from neurove_core import self_test
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.estimator import Estimator
 from neurove_core.models import bundle, golden
 from neurove_core.models.golden import Golden
-from neurove_core.spiking import lif as neurons
+from neurove_core.spiking import plain
 from neurove_protocol import Sensor
 from neurove_protocol.errors import BadModel
 from tests.builders import make_events
@@ -25,7 +26,7 @@ def make_counts(windows: int = 5, *, mean: float = 0.4, seed: int = 0, config: M
 
 def with_test(counts=None, model=ORIGINAL, **how):
     """The model with a golden test."""
-    test = golden.record(Estimator(model), make_counts() if counts is None else counts, **how)
+    test = self_test.record(Estimator(model), make_counts() if counts is None else counts, **how)
     return replace(model, golden=test)
 
 
@@ -38,13 +39,13 @@ def test_a_golden_test_travels_with_its_model_and_holds():
     np.testing.assert_array_equal(loaded.golden.counts, make_counts())
     assert loaded.golden.twists.shape == (5, 2, 6)
     assert loaded.golden.tolerance == golden.TOLERANCE
-    golden.check(Estimator(loaded))
+    self_test.check(Estimator(loaded))
     assert loaded.to_bytes() == TESTED
 
 
 def test_a_model_without_a_golden_test_passes():
     assert ORIGINAL.golden is None
-    golden.check(Estimator(ORIGINAL))
+    self_test.check(Estimator(ORIGINAL))
 
 
 def test_the_answers_are_those_to_the_events_of_a_camera():
@@ -55,7 +56,7 @@ def test_the_answers_are_those_to_the_events_of_a_camera():
     counts = np.stack([window.counts for window in estimator.cut(events, state, 50_000).windows])
     seen = estimator.push(events, estimator.initial_state(sensor), 50_000)
     want = np.stack([estimate.twists for estimate in seen.estimates])
-    np.testing.assert_array_equal(golden.answers(estimator, counts), want)
+    np.testing.assert_array_equal(self_test.answers(estimator, counts), want)
 
 
 def test_windows_without_events_and_saturated_ones_are_pushed_as_they_are():
@@ -64,15 +65,15 @@ def test_windows_without_events_and_saturated_ones_are_pushed_as_they_are():
     counts[3, 0, 0, 0] = 255
     counts[8:29] = 0
     model = replace(ORIGINAL, config=CONFIG)
-    test = golden.record(Estimator(model), counts)
+    test = self_test.record(Estimator(model), counts)
     assert len(test.twists) == 30
-    golden.check(Estimator(bundle.from_bytes(replace(model, golden=test).to_bytes(), "x")))
+    self_test.check(Estimator(bundle.from_bytes(replace(model, golden=test).to_bytes(), "x")))
 
 
 def test_a_plain_engine_holds_the_golden_test_of_a_fast_one():
     loaded = bundle.from_bytes(TESTED, "x")
-    with neurons.plain():
-        golden.check(Estimator(loaded))
+    with plain.plain():
+        self_test.check(Estimator(loaded))
 
 
 @pytest.mark.parametrize("axis", range(6))
@@ -81,8 +82,8 @@ def test_a_machine_that_computes_otherwise_is_refused_with_window_bin_and_axis(a
     wrong = model.golden.twists.copy()
     wrong[3, 1, axis] += 0.03
     with pytest.raises(BadModel, match=rf"golden test: window 3, bin 1: {('vx', 'vy', 'vz', 'wx', 'wy', 'wz')[axis]}="):
-        golden.check(Estimator(replace(model, golden=model.golden._replace(twists=wrong))))
-    golden.check(Estimator(replace(model, golden=model.golden._replace(twists=wrong, tolerance=0.05))))
+        self_test.check(Estimator(replace(model, golden=model.golden._replace(twists=wrong))))
+    self_test.check(Estimator(replace(model, golden=model.golden._replace(twists=wrong, tolerance=0.05))))
 
 
 @pytest.mark.parametrize("precision", ["float32", "int8"])
@@ -91,14 +92,14 @@ def test_a_refused_int8_model_is_told_that_its_precision_once_meant_less(precisi
     model = with_test(model=make_bundle(network=network))
     off = model.golden._replace(twists=model.golden.twists + np.float32(0.1))
     with pytest.raises(BadModel, match="golden test: window") as refused:
-        golden.check(Estimator(replace(model, golden=off)))
+        self_test.check(Estimator(replace(model, golden=off)))
     assert ("before the projection was in int8" in str(refused.value)) == (precision == "int8")
 
 
 def test_the_tolerance_is_a_share_of_the_models_own_scale():
     coarse = with_test(model=replace(ORIGINAL, scale=torch.full((6,), 100.0)))
     off = coarse.golden.twists + np.float32(1.5)
-    golden.check(Estimator(replace(coarse, golden=coarse.golden._replace(twists=off))))
+    self_test.check(Estimator(replace(coarse, golden=coarse.golden._replace(twists=off))))
 
 
 def test_changed_weights_are_refused():
@@ -107,7 +108,7 @@ def test_changed_weights_are_refused():
     with torch.no_grad():
         network.readout.weight[0] += 0.5
     with pytest.raises(BadModel, match="golden test"):
-        golden.check(Estimator(replace(changed, network=network)))
+        self_test.check(Estimator(replace(changed, network=network)))
 
 
 def test_an_answer_that_is_not_finite_is_refused():
@@ -116,7 +117,7 @@ def test_an_answer_that_is_not_finite_is_refused():
     with torch.no_grad():
         network.readout.bias[0] = float("nan")
     with pytest.raises(BadModel, match="golden test.*vx=nan"):
-        golden.check(Estimator(replace(broken, network=network)))
+        self_test.check(Estimator(replace(broken, network=network)))
 
 
 def test_a_golden_test_of_the_default_size_makes_a_bundle_at_most_200_kb_larger():

@@ -7,9 +7,10 @@ import pytest
 import safetensors.torch
 import torch
 
+from neurove_core import self_test
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
 from neurove_core.estimator import Estimator, Push
-from neurove_core.models import bundle, golden
+from neurove_core.models import bundle
 from neurove_core.models.bundle import PER_HEIGHT
 from neurove_core.models.uncertainty import Uncertainty, coverage, half_width
 from neurove_core.training import calibration
@@ -108,11 +109,11 @@ def test_calibrating_changes_no_answer_and_doing_it_again_replaces_it(made):
 def test_a_golden_test_is_that_of_the_calibrated_model(tmp_path):
     before = replace(bundle.untrained(1, SMALL), linear_unit=PER_HEIGHT, scale=torch.tensor([2.0] * 3 + [0.5] * 3))
     counts = np.random.default_rng(0).poisson(0.4, (5, 4, 8, 10)).astype(np.uint8)
-    wrong = golden.record(Estimator(before), counts, 0.03)._replace(twists=np.zeros((5, 2, 6), np.float32))
+    wrong = self_test.record(Estimator(before), counts, 0.03)._replace(twists=np.zeros((5, 2, 6), np.float32))
     after = fitted(replace(before, golden=wrong), list(wild(np.random.default_rng(0), 16)), "a test").bundle
     bundle.save(after, tmp_path / "a.safetensors")
     loaded = bundle.load(tmp_path / "a.safetensors")
-    np.testing.assert_array_equal(golden.answers(Estimator(loaded), counts), loaded.golden.twists)
+    np.testing.assert_array_equal(self_test.answers(Estimator(loaded), counts), loaded.golden.twists)
     assert loaded.golden.tolerance == wrong.tolerance
     assert loaded.digest == after.digest
 

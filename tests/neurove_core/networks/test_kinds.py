@@ -8,11 +8,12 @@ import pytest
 import torch
 from torch import nn
 
+from neurove_core import self_test
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.estimator import Estimator, Push
 from neurove_core.evaluation.judge import answer, judge, report
 from neurove_core.io import open_source
-from neurove_core.models import bundle, golden
+from neurove_core.models import bundle
 from neurove_core.models.bundle import PER_HEIGHT
 from neurove_core.models.uncertainty import Uncertainty
 from neurove_core.networks import kinds
@@ -206,7 +207,7 @@ def test_each_kind_trains_from_one_recipe_and_goes_on_exactly(kind, tmp_path):
     with pytest.raises(Stopped):
         train(config, tmp_path / "parts", tmp_path, on_progress=stop)
     parts = bundle.load(train(config, tmp_path / "parts", tmp_path, resume=True))
-    golden.check(Estimator(whole))
+    self_test.check(Estimator(whole))
     np.testing.assert_array_equal(whole.golden.twists, parts.golden.twists)
     weights = parts.network.state_dict()
     assert all(torch.equal(tensor, weights[name]) for name, tensor in whole.network.state_dict().items())

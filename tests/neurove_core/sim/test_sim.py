@@ -5,7 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from neurove_core.geometry.camera import Poses, distort
+from neurove_core.geometry.camera import distort
+from neurove_core.geometry.motion import Poses
 from neurove_core.geometry.rotations import exp, matrix_of
 from neurove_core.io import UnknownSource, open_source
 from neurove_core.io.recording import CHUNK_EVENTS

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from neurove_core.geometry import rotations
-from neurove_core.geometry.camera import Poses, twists
+from neurove_core.geometry.motion import Poses, twists
 from neurove_core.sim.motion.trajectory import (
     Mounted,
     Trajectory,

@@ -6,18 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from neurove_core.spiking.aslstm import (
-    ASLSTM,
-    SLSTM,
-    ASLSTMParams,
-    ASLSTMState,
-    Readout,
-    SLSTMParams,
-    SLSTMState,
-    aslstm_step,
-    readout_step,
-    slstm_step,
-)
+from neurove_core.spiking.aslstm import ASLSTM, ASLSTMParams, ASLSTMState, aslstm_step
+from neurove_core.spiking.readout import Readout, readout_step
+from neurove_core.spiking.slstm import SLSTM, SLSTMParams, SLSTMState, slstm_step
 from neurove_protocol.errors import InvalidField
 
 each_form = pytest.mark.parametrize("diffusion", [True, False], ids=["aslstm", "without_diffusion"])

@@ -11,19 +11,11 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 import neurove_core
+from neurove_core.spiking import alif, ltc
 from neurove_core.spiking import lif as neurons
-from neurove_core.spiking.lif import (
-    ALIFParams,
-    LIFParams,
-    LIFState,
-    LTCParams,
-    LTCState,
-    alif_step,
-    diffuse,
-    lif_scan,
-    lif_step,
-    ltc_step,
-)
+from neurove_core.spiking.alif import ALIFParams, alif_step, diffuse
+from neurove_core.spiking.lif import LIFParams, LIFState, lif_scan, lif_step
+from neurove_core.spiking.ltc import LTCParams, LTCState, ltc_step
 from neurove_core.spiking.surrogate import surrogate_gradient
 from neurove_protocol.errors import InvalidField
 
@@ -221,17 +213,17 @@ def test_an_ltc_neuron_that_fires_is_reset_to_zero_and_no_gradient_goes_through_
 # Modules
 
 
-def make(name: str, **options) -> neurons.LIF | neurons.ALIF | neurons.LTC:
+def make(name: str, **options) -> neurons.LIF | alif.ALIF | ltc.LTC:
     """A population of 4 neurons with 4 inputs that fires now and then."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
         if name == "LIF":
             return neurons.LIF(4, **options).double()
         if name == "ALIF":
-            return neurons.ALIF(4, 4, **{"v_th": 0.3, **options}).double()
-        ltc = neurons.LTC(4, 4, **options).double()
-        torch.nn.init.uniform_(ltc.w_x, 0.0, 1.0)
-        return ltc
+            return alif.ALIF(4, 4, **{"v_th": 0.3, **options}).double()
+        layer = ltc.LTC(4, 4, **options).double()
+        torch.nn.init.uniform_(layer.w_x, 0.0, 1.0)
+        return layer
 
 
 each_module = pytest.mark.parametrize("name", ["LIF", "ALIF", "LTC"])
@@ -241,9 +233,9 @@ def step_of(module: torch.nn.Module, x: Tensor, state: tuple[Tensor, ...]) -> tu
     match module:
         case neurons.LIF():
             return lif_step(x, state, module.params())
-        case neurons.ALIF():
+        case alif.ALIF():
             return alif_step(x, torch.zeros_like(x), state, module.params(), module.f)
-        case neurons.LTC():
+        case ltc.LTC():
             state = ltc_step(x, state, module.params())
             return state.s, state
     raise AssertionError(module)
@@ -324,7 +316,7 @@ def test_below_the_threshold_the_gradient_of_a_module_is_the_derivative(name):
 
     def run(x: Tensor, *parameters: Tensor) -> Tensor:
         values = dict(zip(names, parameters, strict=True))
-        args = (x, module.initial_state(3)) + ((x,) if isinstance(module, neurons.ALIF) else ())
+        args = (x, module.initial_state(3)) + ((x,) if isinstance(module, alif.ALIF) else ())
         steps, last = torch.func.functional_call(module, values, args)
         return steps[0].sum() + last[0]
 
@@ -335,19 +327,19 @@ def test_below_the_threshold_the_gradient_of_a_module_is_the_derivative(name):
     ("call", "field", "bound"),
     [
         (lambda: neurons.LIF(0), "hidden", "at least 1"),
-        (lambda: neurons.ALIF(0, 3), "inputs", "at least 1"),
-        (lambda: neurons.LTC(3, -2), "hidden", "at least 1"),
+        (lambda: alif.ALIF(0, 3), "inputs", "at least 1"),
+        (lambda: ltc.LTC(3, -2), "hidden", "at least 1"),
         (lambda: neurons.LIF(3, decay=1.0), "decay", "below 1"),
         (lambda: neurons.LIF(3, decay=-0.1), "decay", "at least 0"),
-        (lambda: neurons.ALIF(3, 3, decay=math.nan), "decay", "below 1"),
+        (lambda: alif.ALIF(3, 3, decay=math.nan), "decay", "below 1"),
         (lambda: neurons.LIF(3, v_th=0.0), "v_th", "above 0"),
-        (lambda: neurons.ALIF(3, 3, v_th=-1.0), "v_th", "above 0"),
-        (lambda: neurons.LTC(3, 3, v_th=math.inf), "v_th", "finite"),
-        (lambda: neurons.ALIF(3, 3, d_time=1.0), "d_time", "below 1"),
-        (lambda: neurons.ALIF(3, 3, d_space=-0.5), "d_space", "at least 0"),
+        (lambda: alif.ALIF(3, 3, v_th=-1.0), "v_th", "above 0"),
+        (lambda: ltc.LTC(3, 3, v_th=math.inf), "v_th", "finite"),
+        (lambda: alif.ALIF(3, 3, d_time=1.0), "d_time", "below 1"),
+        (lambda: alif.ALIF(3, 3, d_space=-0.5), "d_space", "at least 0"),
         (lambda: neurons.LIF(3, surrogate="gaussian"), "surrogate", "rectangular, arctan, triangle"),
-        (lambda: neurons.LTC(3, 3, surrogate="gaussian"), "surrogate", "rectangular, arctan, triangle"),
-        (lambda: neurons.ALIF(3, 3, surrogate_width=0.0), "surrogate_width", "above 0"),
+        (lambda: ltc.LTC(3, 3, surrogate="gaussian"), "surrogate", "rectangular, arctan, triangle"),
+        (lambda: alif.ALIF(3, 3, surrogate_width=0.0), "surrogate_width", "above 0"),
     ],
 )
 def test_a_wrong_parameter_is_named_with_its_value_and_bound(call, field, bound):

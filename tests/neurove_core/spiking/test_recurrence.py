@@ -4,15 +4,8 @@ import numpy as np
 import pytest
 import torch
 
-from neurove_core.spiking.aslstm import (
-    ASLSTMParams,
-    ASLSTMState,
-    SLSTMParams,
-    SLSTMState,
-    aslstm_step,
-    readout_step,
-    slstm_step,
-)
+from neurove_core.spiking.alif import diffuse
+from neurove_core.spiking.aslstm import ASLSTMParams, ASLSTMState, aslstm_step
 from neurove_core.spiking.fused import recurrence
 from neurove_core.spiking.fused.recurrence import (
     ASLSTM,
@@ -24,7 +17,9 @@ from neurove_core.spiking.fused.recurrence import (
     State,
     Weights,
 )
-from neurove_core.spiking.lif import LTCParams, LTCState, diffuse, ltc_step
+from neurove_core.spiking.ltc import LTCParams, LTCState, ltc_step
+from neurove_core.spiking.readout import readout_step
+from neurove_core.spiking.slstm import SLSTMParams, SLSTMState, slstm_step
 
 STEPS, BATCH, HIDDEN = 40, 5, 7
 CONSTANTS = Constants(alpha=0.5, width=0.5, damping=0.25)

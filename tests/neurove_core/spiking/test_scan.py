@@ -4,7 +4,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from neurove_core.spiking.lif import LIFParams, LIFState, lif_scan, lif_scan_reference, plain
+from neurove_core.spiking.lif import LIFParams, LIFState, lif_scan, lif_scan_reference
+from neurove_core.spiking.plain import plain
 
 STEPS, BATCH = 5, 2
 MAP = (BATCH, 7, 11, 13)  # more than one block of neurons, and no multiple of any vector's width

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from neurove_core import self_test
 from neurove_core.estimator import Estimator
-from neurove_core.models import bundle, golden
+from neurove_core.models import bundle
 from neurove_core.training.averaging import average
 from neurove_protocol.errors import BadModel, InvalidField
 from tests.bundles import CONFIG, ORIGINAL
@@ -33,9 +34,9 @@ def test_every_weight_is_the_mean_and_the_rest_is_the_last_ones():
 
 def test_a_model_averaged_with_itself_answers_as_it_did_and_has_a_golden_test_of_its_own():
     counts = np.random.default_rng(0).poisson(0.3, (4, 4, 8, 10)).astype(np.uint8)
-    tested = replace(ORIGINAL, golden=golden.record(Estimator(ORIGINAL), counts)).with_digest()
+    tested = replace(ORIGINAL, golden=self_test.record(Estimator(ORIGINAL), counts)).with_digest()
     made = average([tested, tested])
-    golden.check(Estimator(made))
+    self_test.check(Estimator(made))
     np.testing.assert_array_equal(made.golden.twists, tested.golden.twists)
 
 

@@ -23,7 +23,7 @@ from neurove_core.training.loss import scaled_sum
 from neurove_core.training.ranks import ALONE, LostRank, SharedNorm, device_of, together
 from neurove_core.training.run import Run
 from neurove_protocol.errors import BadModel, InvalidField
-from tests.neurove_core.test_training import TINY
+from tests.neurove_core.training.test_training import TINY
 
 CONFIG, RECIPE = TINY, TINY.recipe
 

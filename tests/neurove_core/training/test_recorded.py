@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from neurove_core.geometry.camera import Twists
+from neurove_core.geometry.motion import Twists
 from neurove_core.io import UnknownSource, open_source, write_mcap
 from neurove_core.models import bundle
 from neurove_core.training import config as configs
@@ -16,7 +16,7 @@ from neurove_core.training.recorded import Recorded, pieces
 from neurove_core.training.run import Run
 from neurove_protocol.errors import InvalidField
 from tests.builders import make_events
-from tests.neurove_core.test_training import MODEL, TINY
+from tests.neurove_core.training.test_training import MODEL, TINY
 from tests.recordings import ecd_text
 
 SOURCE = "sim://street?seed=3&seconds=1.3&camera=pinhole:24x18:75"

@@ -8,11 +8,12 @@ import pytest
 import torch
 from pydantic import ValidationError
 
+from neurove_core import self_test
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.estimator import Estimator
 from neurove_core.geometry.camera import lookup_table
 from neurove_core.io.errors import BrokenRecording
-from neurove_core.models import bundle, golden
+from neurove_core.models import bundle
 from neurove_core.sim.motion.trajectory import Mounted, rotation
 from neurove_core.sim.render.camera import named_camera
 from neurove_core.sim.render.pixels import PixelConfig
@@ -384,7 +385,7 @@ def test_the_trained_bundle_tells_how_it_was_made_and_brings_windows_it_was_trai
     seen = [sequences.counts(index, 0, 10) for index in range(3)]
     busiest = max(seen, key=np.count_nonzero)
     np.testing.assert_array_equal(made.golden.counts, busiest)
-    golden.check(Estimator(made))
+    self_test.check(Estimator(made))
 
 
 class Busy:

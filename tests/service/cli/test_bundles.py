@@ -9,9 +9,10 @@ import pytest
 import safetensors.torch
 import torch
 
+from neurove_core import self_test
 from neurove_core.estimator import Estimator
 from neurove_core.models import bundle, golden
-from neurove_core.models.about import About, Limits, MadeBy
+from neurove_core.models.about import About, BundleLimits, MadeBy
 from neurove_service.cli import main
 from tests.bundles import CONFIG, DATA, ORIGINAL, with_fields, with_tensors
 
@@ -19,7 +20,7 @@ TOLD = About(
     release=3,
     figures={"heldout_re_v_l": 0.188123456},
     made_by=MadeBy(program="neurove train night", seed=5, commit="93cc177", recipe={"steps": 4400}),
-    limits=Limits(mean_dv_m_s=1.5),
+    limits=BundleLimits(mean_dv_m_s=1.5),
 )
 
 
@@ -32,7 +33,7 @@ def run(run, tmp_path, monkeypatch):
 @pytest.fixture(scope="session")
 def told_bytes():
     counts = np.random.default_rng(0).poisson(0.3, (4, 4, 8, 10)).astype(np.uint8)
-    test = golden.record(Estimator(ORIGINAL), counts)
+    test = self_test.record(Estimator(ORIGINAL), counts)
     return replace(ORIGINAL, name="night", about=TOLD, golden=test).to_bytes()
 
 

@@ -17,7 +17,7 @@ from neurove_service.streams.lanes import RingSize
 from neurove_service.streams.stream import Arrival, Stream
 from tests.builders import make_packets
 from tests.service.conftest import SMALL
-from tests.service.test_swap import LAX, feed, said, wait_until
+from tests.service.models.test_swap import LAX, feed, said, wait_until
 
 PACKETS = make_packets(6_000, n=50, step_us=25_000)
 FEW = RingSize(8)

@@ -12,13 +12,13 @@ from neurove_core.models import bundle
 from neurove_protocol import Flag
 from neurove_protocol.errors import Conflict, Diverged, InvalidField, NoMemory, NothingBefore, TooSlow
 from neurove_service.models.slot import ModelSlot, Rules
-from neurove_service.streams.comparison import Limits
+from neurove_service.streams.comparison import TrialLimits
 from neurove_service.streams.stream import Arrival, Stream
 from tests.builders import make_packets
 from tests.service.conftest import SMALL
 
 WINDOW_US = 50_000
-LAX = Limits(divergence=1e9, rate_ratio=1e9, latency_share=1e9)
+LAX = TrialLimits(divergence=1e9, rate_ratio=1e9, latency_share=1e9)
 
 
 @pytest.fixture(scope="module")
@@ -242,7 +242,7 @@ def test_a_canary_that_is_rolled_back_leaves_no_trace_in_the_feed(slots):
 
 
 def test_a_shadow_changes_nothing_in_the_feed_and_a_model_that_agrees_is_activated(slots):
-    slot, told = slots(shadow=Limits(divergence=0.05, latency_share=1e9)), []
+    slot, told = slots(shadow=TrialLimits(divergence=0.05, latency_share=1e9)), []
     packets = make_packets(4_000, n=50, step_us=25_000)
     stream = Stream("cam0", slot)
     with Live(stream, packets) as live:
@@ -259,8 +259,8 @@ def test_a_shadow_changes_nothing_in_the_feed_and_a_model_that_agrees_is_activat
 @pytest.mark.parametrize(
     ("limits", "words"),
     [
-        (Limits(divergence=1.0, latency_share=1e9), "divergence on stream cam0"),
-        (Limits(divergence=1e9, latency_share=1e-9), "latency_ms on stream cam0"),
+        (TrialLimits(divergence=1.0, latency_share=1e9), "divergence on stream cam0"),
+        (TrialLimits(divergence=1e9, latency_share=1e-9), "latency_ms on stream cam0"),
     ],
 )
 def test_a_shadow_that_breaks_a_limit_is_refused_with_the_figure_and_nothing_changes(slots, limits, words):
@@ -424,8 +424,8 @@ def test_a_model_that_fails_on_probation_is_rolled_back_without_losing_the_windo
 @pytest.mark.parametrize(
     ("limits", "words"),
     [
-        (Limits(divergence=3.0, rate_ratio=1e9, latency_share=1e9), "divergence"),
-        (Limits(divergence=1e9, rate_ratio=1e9, latency_share=1e-9), "latency_ms"),
+        (TrialLimits(divergence=3.0, rate_ratio=1e9, latency_share=1e9), "divergence"),
+        (TrialLimits(divergence=1e9, rate_ratio=1e9, latency_share=1e-9), "latency_ms"),
     ],
 )
 def test_a_model_that_breaks_a_limit_on_probation_is_rolled_back_by_itself(slots, limits, words):

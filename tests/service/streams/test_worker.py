@@ -4,7 +4,7 @@ import pytest
 
 from neurove_protocol import CameraInfo, TwistEstimate
 from neurove_protocol.errors import Malformed
-from neurove_protocol.events import Limits, encode_packet
+from neurove_protocol.events import PacketLimits, encode_packet
 from neurove_service.streams.stream import Stream
 from neurove_service.streams.worker import Inbox, Outlet, Sample, StreamWorker
 from tests.builders import make_packets
@@ -80,7 +80,7 @@ def published():
 
 @pytest.fixture
 def worker(slot, published):
-    worker = StreamWorker(Stream("cam0", slot), published.open, Inbox(60, 1 << 26), Limits())
+    worker = StreamWorker(Stream("cam0", slot), published.open, Inbox(60, 1 << 26), PacketLimits())
     yield worker
     worker.stop()
     worker.join(5)
@@ -133,7 +133,7 @@ def test_a_camera_that_can_not_be_read_is_refused_and_the_stream_goes_on(slot):
         raise Malformed("camera info", "planted")
 
     published = Published(broken)
-    worker = StreamWorker(Stream("cam0", slot), published.open, Inbox(60, 1 << 26), Limits())
+    worker = StreamWorker(Stream("cam0", slot), published.open, Inbox(60, 1 << 26), PacketLimits())
     worker.put_camera(b"garbage", 1)
     good = CameraInfo(stream="cam0", width=64, height=48, lens="pinhole", fx=40, fy=40, cx=32, cy=24)
     worker.put_camera(good.encode(), 1)

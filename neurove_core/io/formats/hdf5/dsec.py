@@ -19,7 +19,7 @@ from typing import Any, Final, Self
 
 import numpy as np
 
-from neurove_core.geometry.camera import Poses, Twists
+from neurove_core.geometry.motion import Poses, Twists
 from neurove_core.io.errors import BrokenRecording
 from neurove_core.io.formats.hdf5.file import Column, dataset, has, opened, value
 from neurove_core.io.formats.hdf5.tables import EventTable, ImuTable, TableRecording, seek_indexed

@@ -6,7 +6,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from neurove_core.files import written_whole
+from neurove_core.files import atomic_path
 from neurove_core.io.formats.hdf5 import file as hdf5
 from neurove_core.io.formats.hdf5.dsec import LENS_FIELDS
 from neurove_core.io.recording import Recording
@@ -48,7 +48,7 @@ def write_dsec(recording: Recording, path: Path, progress: Callable[[int], None]
     if recording.endless:
         raise InvalidField("write_dsec", "recording", recording.name, "one that ends is expected")
     h5py = hdf5.library()
-    with written_whole(path) as part, h5py.File(part, "w") as file:
+    with atomic_path(path) as part, h5py.File(part, "w") as file:
         n = _write_events(recording, file, progress)
         streams = ("events", *_write_truth(recording, file), *_write_imu(recording, file))
     return Written(n, streams, tuple(stream for stream in recording.streams if stream not in streams))

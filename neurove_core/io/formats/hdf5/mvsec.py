@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.geometry import rotations
-from neurove_core.geometry.camera import Poses
+from neurove_core.geometry.motion import Poses
 from neurove_core.io.errors import BrokenRecording
 from neurove_core.io.formats.hdf5.file import Column, dataset, has, opened, read_rows
 from neurove_core.io.formats.hdf5.tables import EventTable, ImuTable, TableRecording, chosen_topic

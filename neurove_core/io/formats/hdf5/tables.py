@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.geometry.camera import Twists, twists
+from neurove_core.geometry.motion import Twists, twists
 from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.formats.hdf5.file import FAULTS, Column, opened, read_rows
 from neurove_core.io.recording import CHUNK_EVENTS, SUPPORTED, EventsOnly, Imu, later

@@ -24,7 +24,7 @@ from typing import Any, Final, NamedTuple
 import msgpack
 import numpy as np
 
-from neurove_core.geometry.camera import Poses, Twists
+from neurove_core.geometry.motion import Poses, Twists
 from neurove_core.io.recording import Frame, Imu, Triggers
 from neurove_protocol import camera, events
 

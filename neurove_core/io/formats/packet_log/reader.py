@@ -7,7 +7,7 @@ from typing import Any, Final, NamedTuple, Self, TypeVar
 
 import numpy as np
 
-from neurove_core.geometry.camera import Poses, Twists
+from neurove_core.geometry.motion import Poses, Twists
 from neurove_core.io.checked import checked
 from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.formats.containers.mcap import McapFile, Record
@@ -16,9 +16,9 @@ from neurove_core.io.formats.packet_log.layout import BadColumns
 from neurove_core.io.recording import SUPPORTED, EventsOnly, Frame, Imu, Triggers, later
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import NeuroVEError
-from neurove_protocol.events import EventPacket, Events, Limits, Sensor, decode_packet
+from neurove_protocol.events import EventPacket, Events, PacketLimits, Sensor, decode_packet
 
-LIMITS: Final = Limits(max_events=16_000_000, max_side_px=1 << 15)
+LIMITS: Final = PacketLimits(max_events=16_000_000, max_side_px=1 << 15)
 """Caps on packets: those of the wire are the service's to set, and a recording may come from any."""
 
 T = TypeVar("T")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
 from neurove_core.io.formats.prophesee import evt, triggers
-from neurove_core.io.recording import BLOCK_BYTES, CHUNK_EVENTS, SUPPORTED, EventsOnly, Triggers, room
+from neurove_core.io.recording import BLOCK_BYTES, CHUNK_EVENTS, SUPPORTED, EventsOnly, Triggers, empty_events
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
 
@@ -142,7 +142,7 @@ class PropheseeRecording(EventsOnly):
             while block := file.read(BLOCK_BYTES):
                 words = np.frombuffer(block, dtype, len(block) // dtype.itemsize)
                 while words.size:
-                    out = room(CHUNK_EVENTS)
+                    out = empty_events(CHUNK_EVENTS)
                     state, read, n, verdict = decode(words, state, self.sensor.width, self.sensor.height, out)
                     if n:
                         yield out.span(0, n)

@@ -10,10 +10,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.ingest import counting
+from neurove_core.io.formats.prophesee import evt, triggers
 from neurove_core.io.formats.ros.libcaer import WORD_EVENTS, LibcaerState, libcaer_decode
 from neurove_core.io.formats.ros.messages import DVS, BadMessage, EventMessage
-from neurove_core.io.recording import CHUNK_EVENTS, Triggers, room
+from neurove_core.io.recording import CHUNK_EVENTS, Triggers, empty_events
 from neurove_protocol.events import Events, Sensor
 
 ENCODINGS: Final = ("evt3", "libcaer", "libcaer_cmp", "mono")
@@ -45,8 +45,8 @@ class Decoder:
         self._sensor = sensor
         self._anchor = anchor
         self._seq: int | None = None
-        self._evt3 = counting.Evt3State()
-        self._triggers = counting.TriggerState()
+        self._evt3 = evt.Evt3State()
+        self._triggers = triggers.TriggerState()
         self._libcaer = LibcaerState()
         self._shift_us: int | None = 0 if anchor is None else None  # None: to be found, after a gap
 
@@ -83,28 +83,28 @@ class Decoder:
         self._heed_a_gap(message)
         for _ in self._decoded(message):  # the clock goes on by the events, and a bad word is told
             pass
-        self._triggers, (t, channel, level) = counting.evt3_triggers(_words(message), self._triggers)
+        self._triggers, (t, channel, level) = triggers.evt3_triggers(_words(message), self._triggers)
         if t.size:
             yield Triggers(t + self._shift(message, int(t[0])), channel, level)
 
     def _heed_a_gap(self, message: EventMessage) -> None:
         """After lost messages it is not known what the camera said last of row, column and time."""
         if self._seq is not None and message.seq not in (self._seq + 1, -1):
-            self._evt3, self._triggers, self._shift_us = counting.Evt3State(), counting.TriggerState(), None
+            self._evt3, self._triggers, self._shift_us = evt.Evt3State(), triggers.TriggerState(), None
             self._libcaer = LibcaerState()
         self._seq = message.seq
 
     def _of_evt3(self, message: EventMessage) -> Iterator[Events]:
         words, done = _words(message), 0
         while words.size:
-            out = room(min(CHUNK_EVENTS, max(words.size * counting.VECTOR_EVENTS, counting.VECTOR_EVENTS)))
+            out = empty_events(min(CHUNK_EVENTS, max(words.size * evt.VECTOR_EVENTS, evt.VECTOR_EVENTS)))
             width, height = self._sensor.width, self._sensor.height
-            self._evt3, read, n, verdict = counting.evt3_decode(words, self._evt3, width, height, out)
+            self._evt3, read, n, verdict = evt.evt3_decode(words, self._evt3, width, height, out)
             if n:
                 yield self._counted_on(out.span(0, n), message)
-            if verdict == counting.OUTSIDE:
+            if verdict == evt.OUTSIDE:
                 raise BadMessage(f"an event at x={out.x[n]} y={out.y[n]} lies outside the sensor {self._sensor}")
-            if verdict != counting.OK:
+            if verdict != evt.OK:
                 raise BadMessage(f"its word {done + read}, 0x{int(words[read]):04x}, is of no known type")
             words, done = words[read:], done + read
 
@@ -127,12 +127,12 @@ class Decoder:
         words = _words(message)
         for first in range(0, words.size, _WORDS):
             part = words[first : first + _WORDS]
-            out = room(part.size * WORD_EVENTS)
+            out = empty_events(part.size * WORD_EVENTS)
             self._libcaer, read, n, verdict = libcaer_decode(part, self._libcaer, base_us, width, height, out)
             yield out.span(0, n)
-            if verdict == counting.OUTSIDE:
+            if verdict == evt.OUTSIDE:
                 raise BadMessage(f"an event at x={out.x[n]} y={out.y[n]} lies outside the sensor {self._sensor}")
-            if verdict != counting.OK:
+            if verdict != evt.OK:
                 raise BadMessage(f"its word {first + read}, 0x{int(part[read]):04x}, is of no known type")
 
 

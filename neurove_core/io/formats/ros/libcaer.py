@@ -20,7 +20,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.ingest.counting import ILLEGAL, OK, OUTSIDE, compiled
+from neurove_core.compiled import compiled
+from neurove_core.io.formats.prophesee.evt import ILLEGAL, OK, OUTSIDE
 from neurove_protocol.events import Events
 
 WORD_EVENTS: Final = 8

@@ -8,8 +8,8 @@ from typing import Final, Self, TypeVar
 
 import numpy as np
 
-from neurove_core.geometry import camera
-from neurove_core.geometry.camera import Poses, Twists
+from neurove_core.geometry import motion
+from neurove_core.geometry.motion import Poses, Twists
 from neurove_core.io.checked import checked
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
 from neurove_core.io.formats.containers.bags import BagFile, BagFolder, BagMessage, SqliteBag, in_recorded_order
@@ -258,7 +258,7 @@ class RosbagRecording(EventsOnly):
     def twists(self) -> Twists | None:
         """How the tracked body moved, by its poses; None where these are too few. See `geometry.twists`."""
         poses = self.poses()
-        return camera.twists(poses) if poses is not None and poses.t.size > 1 else None
+        return motion.twists(poses) if poses is not None and poses.t.size > 1 else None
 
     def _beside(self, *types: str) -> str | None:
         """The topic of one of these types whose name has most in common with that of the events."""
