@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import ConfigDict, Field
 
 from neurove_protocol.codec import Count, Message, Name, Part
-from neurove_protocol.errors import NeuroVEError
+from neurove_protocol.errors import EXIT_CONFLICT, EXIT_FAILURE, Conflict, NeuroVEError
 
 Verdict = Literal["ok", "lossy", "stalled", "idle"]
 
@@ -240,3 +240,4 @@ class PeerError(NeuroVEError):
     def __init__(self, reply: ErrorReply) -> None:
         super().__init__(reply.message, **reply.details)
         self.code = reply.code  # type: ignore[misc]  # this class stands for any peer's error
+        self.exit_code = EXIT_CONFLICT if reply.code == Conflict.code else EXIT_FAILURE  # type: ignore[misc]

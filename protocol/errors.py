@@ -1,13 +1,38 @@
-"""NeuroVEError and the errors that a peer can be told.
+"""NeuroVEError and the errors that a node reports to a peer.
 
-Every error has a stable `code` (part of the wire contract), a sentence that names field, value and bound, and the same
-three as `details` for machines.
+Every error has a stable `code` (part of the wire contract), a sentence that names the field, the value and the bound,
+the same parts as `details` for machines, and the exit code of a command that fails with it.
+
+    NeuroVEError                     exit code 2: wrong usage
+    +- InternalError
+    +- InputError                    a message, a field or an event is refused
+    |  +- Malformed, UnsupportedVersion, InvalidField, UnknownFormat, BlobLength, EventOutsideSensor, TimeBackwards
+    +- ModelError                    a model is refused, or a model change failed
+    |  +- UnknownModel, BadModel, Untrusted, Downgrade
+    |  +- NoMemory, TooSlow, Diverged, RolledBack, NothingBefore
+    +- TransferError                 a pushed bundle is not stored
+    |  +- NoStore, TooLarge, NoQuota, NoSpace, TransferInterrupted
+    +- RequestError                  the node does not handle the request now
+    |  +- Busy, Conflict (exit code 3)
+    +- PeerError (control.py)        exit code 1, or 3 for a conflict: a node refused our request
+
+`neurove_core` adds RecordingError (io.errors) and MissingExtra; `neurove_service` adds what a client or a node
+reports about its configuration and its connections.
 """
 
 import reprlib
-from typing import ClassVar
+from typing import ClassVar, Final
 
 Detail = str | int | float | bool | None
+
+EXIT_FAILURE: Final = 1
+"""Exit code of a command whose answer is bad news: no service, a broken recording, a refused request."""
+
+EXIT_WRONG_USAGE: Final = 2
+"""Exit code of a command that was called wrongly: an unknown source, setting, file or field."""
+
+EXIT_CONFLICT: Final = 3
+"""Exit code of a command that another client's model change preceded."""
 
 MAX_TEXT_BYTES = 1024
 """Cap of an error's sentence and of each of its details: what a peer is told must fit the caps of a message."""
@@ -46,6 +71,7 @@ class NeuroVEError(Exception):
     """Base of all errors that a user or a peer may see: a stable code, a sentence, and its parts as fields."""
 
     code: ClassVar[str] = "internal"
+    exit_code: ClassVar[int] = EXIT_WRONG_USAGE
 
     def __init__(self, message: str, /, **details: Detail) -> None:
         self.message = _clipped(message)
@@ -53,6 +79,22 @@ class NeuroVEError(Exception):
             name: _clipped(value) if isinstance(value, str) else value for name, value in details.items()
         }
         super().__init__(self.message)
+
+
+class InputError(NeuroVEError):
+    """A message, one of its fields, or an event is refused."""
+
+
+class ModelError(NeuroVEError):
+    """A model is refused, or a model change failed."""
+
+
+class TransferError(NeuroVEError):
+    """A pushed bundle is not stored."""
+
+
+class RequestError(NeuroVEError):
+    """The node does not handle the request now."""
 
 
 class InternalError(NeuroVEError):
@@ -64,7 +106,7 @@ class InternalError(NeuroVEError):
         super().__init__("internal error: see the log of the node that answered")
 
 
-class Malformed(NeuroVEError):
+class Malformed(InputError):
     """The bytes are no message at all: not msgpack, cut short, trailing bytes, or a key twice."""
 
     code = "malformed"
@@ -73,7 +115,7 @@ class Malformed(NeuroVEError):
         super().__init__(f"{what}: not a valid message: {why}", what=what)
 
 
-class UnsupportedVersion(NeuroVEError):
+class UnsupportedVersion(InputError):
     """The message speaks another major version of the protocol."""
 
     code = "unsupported_version"
@@ -83,7 +125,7 @@ class UnsupportedVersion(NeuroVEError):
         super().__init__(f"{what}: protocol version v={value}, this side speaks v={want}", field="v", value=value)
 
 
-class InvalidField(NeuroVEError):
+class InvalidField(InputError):
     """One field is missing, of the wrong type, or out of its bound."""
 
     code = "invalid_field"
@@ -93,7 +135,7 @@ class InvalidField(NeuroVEError):
         super().__init__(f"{what}: {field}={shown(value)}: {bound}", field=field, value=shown(value), bound=bound)
 
 
-class UnknownFormat(NeuroVEError):
+class UnknownFormat(InputError):
     """The event blob is in a layout that this side cannot read."""
 
     code = "unknown_format"
@@ -104,7 +146,7 @@ class UnknownFormat(NeuroVEError):
         )
 
 
-class BlobLength(NeuroVEError):
+class BlobLength(InputError):
     """The event blob is not n times the record size of its format."""
 
     code = "blob_length"
@@ -118,7 +160,7 @@ class BlobLength(NeuroVEError):
         )
 
 
-class EventOutsideSensor(NeuroVEError):
+class EventOutsideSensor(InputError):
     """An event lies outside the sensor that its packet names."""
 
     code = "event_outside_sensor"
@@ -127,7 +169,7 @@ class EventOutsideSensor(NeuroVEError):
         super().__init__(f"event {index} at x={x} y={y} lies outside the sensor {sensor}", index=index, x=x, y=y)
 
 
-class TimeBackwards(NeuroVEError):
+class TimeBackwards(InputError):
     """Times of a packet run backwards."""
 
     code = "time_backwards"
@@ -141,7 +183,7 @@ class TimeBackwards(NeuroVEError):
         )
 
 
-class UnknownModel(NeuroVEError):
+class UnknownModel(ModelError):
     """No model of this name is available on the node."""
 
     code = "unknown_model"
@@ -150,7 +192,7 @@ class UnknownModel(NeuroVEError):
         super().__init__(f"model={name!r}: not on this node; available: {', '.join(available) or 'none'}", value=name)
 
 
-class BadModel(NeuroVEError):
+class BadModel(ModelError):
     """A model file is unreadable, foreign, or does not hold what its header declares."""
 
     code = "bad_model"
@@ -159,7 +201,7 @@ class BadModel(NeuroVEError):
         super().__init__(f"model {name}: {why}", value=name)
 
 
-class Untrusted(NeuroVEError):
+class Untrusted(ModelError):
     """A model's signature does not show that someone trusted made exactly these bytes."""
 
     code = "untrusted"
@@ -168,7 +210,7 @@ class Untrusted(NeuroVEError):
         super().__init__(f"model {name}: signature refused ({reason}): {why}", value=name, reason=reason)
 
 
-class NoStore(NeuroVEError):
+class NoStore(TransferError):
     """The node keeps no pushed models: it was given no folder for them, or one that it can not write to."""
 
     code = "no_store"
@@ -177,7 +219,7 @@ class NoStore(NeuroVEError):
         super().__init__(f"this node keeps no pushed models: {why}", why=why)
 
 
-class TooLarge(NeuroVEError):
+class TooLarge(TransferError):
     """A bundle is larger than a node takes."""
 
     code = "too_large"
@@ -186,7 +228,7 @@ class TooLarge(NeuroVEError):
         super().__init__(f"model {name}: size={size}: a bundle has at most {cap} bytes", value=size, bound=cap)
 
 
-class NoQuota(NeuroVEError):
+class NoQuota(TransferError):
     """With this bundle the node's pushed models would take more than they may."""
 
     code = "no_quota"
@@ -200,7 +242,7 @@ class NoQuota(NeuroVEError):
         )
 
 
-class NoSpace(NeuroVEError):
+class NoSpace(TransferError):
     """The node's disk is full."""
 
     code = "no_space"
@@ -209,7 +251,7 @@ class NoSpace(NeuroVEError):
         super().__init__(f"model {name}: needs {need} bytes, the node's disk has {free}", value=need, bound=free)
 
 
-class Cut(NeuroVEError):
+class TransferInterrupted(TransferError):
     """Whoever pushed a bundle stopped to answer; what came is kept, and the next push goes on from there."""
 
     code = "cut"
@@ -222,7 +264,7 @@ class Cut(NeuroVEError):
         )
 
 
-class Busy(NeuroVEError):
+class Busy(RequestError):
     """The node works on as many requests of this kind as it takes."""
 
     code = "busy"
@@ -231,16 +273,17 @@ class Busy(NeuroVEError):
         super().__init__(f"busy: this node works on at most {at_once} such requests at once", bound=at_once)
 
 
-class Conflict(NeuroVEError):
-    """Somebody else changed the model first, or is about to."""
+class Conflict(RequestError):
+    """Another client changes the model, or changed it first."""
 
     code = "conflict"
+    exit_code = EXIT_CONFLICT
 
     def __init__(self, why: str) -> None:
         super().__init__(f"conflict: {why}", why=why)
 
 
-class NoMemory(NeuroVEError):
+class NoMemory(ModelError):
     """A model is refused, for it might not fit beside the one that serves."""
 
     code = "no_memory"
@@ -254,7 +297,7 @@ class NoMemory(NeuroVEError):
         )
 
 
-class TooSlow(NeuroVEError):
+class TooSlow(ModelError):
     """A model is refused, for this node can not run it in time."""
 
     code = "too_slow"
@@ -269,7 +312,7 @@ class TooSlow(NeuroVEError):
         )
 
 
-class Diverged(NeuroVEError):
+class Diverged(ModelError):
     """A model is refused, for beside the active one on live streams it did not behave alike."""
 
     code = "diverged"
@@ -279,7 +322,7 @@ class Diverged(NeuroVEError):
         super().__init__(f"model {model}: {field}={value}: the bound is {bound}", field=field, value=value, bound=bound)
 
 
-class RolledBack(NeuroVEError):
+class RolledBack(ModelError):
     """A model served, and was taken back by itself on its probation; the one before serves on."""
 
     code = "rolled_back"
@@ -288,7 +331,7 @@ class RolledBack(NeuroVEError):
         super().__init__(f"model change: {why}", why=why)
 
 
-class NothingBefore(NeuroVEError):
+class NothingBefore(ModelError):
     """There is no model to go back to."""
 
     code = "nothing_before"
@@ -297,7 +340,7 @@ class NothingBefore(NeuroVEError):
         super().__init__("nothing to roll back to: this node has no model before the active one")
 
 
-class Downgrade(NeuroVEError):
+class Downgrade(ModelError):
     """A model's release is lower than one that was accepted before, and its signature does not allow that."""
 
     code = "downgrade"

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from neurove_protocol.errors import NeuroVEError
+from neurove_protocol.errors import EXIT_FAILURE, NeuroVEError
 
 
 class UnknownSource(NeuroVEError):
@@ -28,6 +28,7 @@ class BrokenRecording(NeuroVEError):
     """The recording can not be read beyond a place; what lies before it is whole."""
 
     code = "broken_recording"
+    exit_code = EXIT_FAILURE
 
     def __init__(self, path: Path, where: str, why: str) -> None:
         super().__init__(f"{path}: broken at {where}: {why}", value=str(path), where=where, why=why)

@@ -20,7 +20,7 @@ from rich.live import Live
 
 from neurove_protocol import Flag
 from neurove_protocol.control import StreamStatus
-from neurove_protocol.errors import NeuroVEError
+from neurove_protocol.errors import EXIT_FAILURE, NeuroVEError
 from neurove_service.cli.views import Board
 from neurove_service.clients import ask
 from neurove_service.config import ENVIRONMENT, ClientConfig
@@ -38,6 +38,7 @@ class DemoFailed(NeuroVEError):
     """One of the demo's processes ended before its time."""
 
     code = "demo"
+    exit_code = EXIT_FAILURE
 
 
 def run(

@@ -11,10 +11,9 @@ import signal
 import sys
 from collections.abc import Sequence
 
-from neurove_protocol.control import PeerError
 from neurove_protocol.errors import NeuroVEError
 from neurove_service.cli import asking, bench, bundles, changing, experiments, recordings, running, training
-from neurove_service.cli.arguments import BAD_NEWS, CONFLICT, WRONG_USAGE, Command
+from neurove_service.cli.arguments import Command
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -26,19 +25,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return run(args)
     except NeuroVEError as error:
         print(f"neurove: {error.message}", file=sys.stderr)
-        return _exit_code(error)
+        return error.exit_code
     except KeyboardInterrupt:  # before a command took the signals over
         return 128 + signal.SIGINT
     except BrokenPipeError:  # the reader of our output has gone, such as `| head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-
-
-def _exit_code(error: NeuroVEError) -> int:
-    if error.code == "conflict":
-        return CONFLICT
-    bad_news = {"no_service", "broken_recording", "nothing_recorded", "demo"}
-    return BAD_NEWS if isinstance(error, PeerError) or error.code in bad_news else WRONG_USAGE
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
-from neurove_protocol.errors import InvalidField, NeuroVEError
+from neurove_protocol.errors import EXIT_FAILURE, InvalidField, NeuroVEError
 from neurove_protocol.keys import check_name
 from neurove_service.cli.arguments import BAD_NEWS, add_client_flags, client_config, command, seconds, sensor_size
 from neurove_service.lifecycle import stop_on_signals
@@ -24,6 +24,7 @@ class NothingRecorded(NeuroVEError):
     """No packet came while we listened."""
 
     code = "nothing_recorded"
+    exit_code = EXIT_FAILURE
 
 
 def record(args: argparse.Namespace) -> int:

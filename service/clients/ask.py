@@ -22,7 +22,7 @@ from neurove_protocol.control import (
     RollbackRequest,
     StreamStatus,
 )
-from neurove_protocol.errors import NeuroVEError
+from neurove_protocol.errors import EXIT_FAILURE, NeuroVEError
 from neurove_service import logs
 from neurove_service.config import ClientConfig
 from neurove_service.transport import EndpointError, Transport, open_transport
@@ -46,6 +46,7 @@ class NoService(NeuroVEError):
     """Nobody serves there."""
 
     code = "no_service"
+    exit_code = EXIT_FAILURE
 
 
 class SeveralNodes(NeuroVEError):

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from neurove_protocol.control import MAX_CHUNK_BYTES, ChunkRequest, PushRequest
-from neurove_protocol.errors import Cut, NeuroVEError
+from neurove_protocol.errors import NeuroVEError, TransferInterrupted
 from neurove_service.models.progress import OnProgress, Progress
 
 Pull = Callable[[str, ChunkRequest], bytes | None]
@@ -96,7 +96,7 @@ def _pull_rest(
         now = time.monotonic()
         if chunk is None:
             if now - heard > patience_s or stop.wait(_RETRY_S):
-                raise Cut(wanted.name, have, wanted.size, "this node stops" if stop.is_set() else why)
+                raise TransferInterrupted(wanted.name, have, wanted.size, "this node stops" if stop.is_set() else why)
             continue
         file.write(chunk)
         file.flush()  # to where a killed process leaves it

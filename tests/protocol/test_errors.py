@@ -13,23 +13,27 @@ from neurove_protocol.errors import (
     BlobLength,
     Busy,
     Conflict,
-    Cut,
     Detail,
     Diverged,
     Downgrade,
     EventOutsideSensor,
+    InputError,
     InternalError,
     InvalidField,
     Malformed,
+    ModelError,
     NoMemory,
     NoQuota,
     NoSpace,
     NoStore,
     NothingBefore,
+    RequestError,
     RolledBack,
     TimeBackwards,
     TooLarge,
     TooSlow,
+    TransferError,
+    TransferInterrupted,
     UnknownFormat,
     UnknownModel,
     UnsupportedVersion,
@@ -55,7 +59,7 @@ ERRORS: list[NeuroVEError] = [
     TooLarge("spire-9.safetensors", 300_000_000, 268_435_456),
     NoQuota("spire-9.safetensors", 3_000_000, 2_000_000, 4_000_000),
     NoSpace("spire-9.safetensors", 3_000_000, 1_000),
-    Cut("spire-9.safetensors", 1_000, 3_000_000, "whoever pushed it does not answer"),
+    TransferInterrupted("spire-9.safetensors", 1_000, 3_000_000, "whoever pushed it does not answer"),
     Busy(4),
     Conflict("another model change is under way"),
     NoMemory("spire-8", 1_000, 2_000),
@@ -68,6 +72,9 @@ ERRORS: list[NeuroVEError] = [
 every_error = pytest.mark.parametrize("error", ERRORS, ids=lambda error: error.code)
 
 
+MIDDLE = {InputError, ModelError, TransferError, RequestError}
+
+
 def subclasses(kind: type[NeuroVEError]) -> set[type[NeuroVEError]]:
     """All errors of this package below this one; other packages may add their own."""
     below = {kind, *(found for child in kind.__subclasses__() for found in subclasses(child))}
@@ -75,13 +82,20 @@ def subclasses(kind: type[NeuroVEError]) -> set[type[NeuroVEError]]:
 
 
 def test_the_table_of_this_test_is_complete() -> None:
-    assert {type(error) for error in ERRORS} == subclasses(NeuroVEError) - {NeuroVEError, PeerError}
+    assert {type(error) for error in ERRORS} == subclasses(NeuroVEError) - {NeuroVEError, PeerError, *MIDDLE}
 
 
 def test_every_error_has_a_code_of_its_own() -> None:
     codes = [vars(kind)["code"] for kind in {type(error) for error in ERRORS}]
     assert len(set(codes)) == len(codes)
     assert all(code.replace("_", "").isalpha() and code.islower() for code in codes)
+
+
+@every_error
+def test_every_error_has_a_place_in_the_tree_and_an_exit_code(error: NeuroVEError) -> None:
+    assert isinstance(error, (*MIDDLE, InternalError))
+    assert error.exit_code == (3 if error.code == "conflict" else 2)
+    assert PeerError(ErrorReply.of(error)).exit_code == (3 if error.code == "conflict" else 1)
 
 
 def test_an_error_without_a_code_of_its_own_is_an_internal_one() -> None:

@@ -10,7 +10,16 @@ import pytest
 from neurove_core.config import NetworkConfig
 from neurove_core.models import bundle
 from neurove_protocol.control import PushRequest
-from neurove_protocol.errors import BadModel, Cut, Downgrade, NeuroVEError, NoQuota, NoSpace, NoStore, TooLarge
+from neurove_protocol.errors import (
+    BadModel,
+    Downgrade,
+    NeuroVEError,
+    NoQuota,
+    NoSpace,
+    NoStore,
+    TooLarge,
+    TransferInterrupted,
+)
 from neurove_service.models import store as model_store
 from neurove_service.models.library import Library
 from neurove_service.models.pull import LEAST_BYTES, ChunkLength
@@ -83,7 +92,7 @@ def test_a_pushed_bundle_is_whole_on_the_disk_and_can_be_activated(store, tmp_pa
 
 
 def test_a_cut_push_goes_on_where_it_stopped_in_another_process_too(store, tmp_path, data):
-    with pytest.raises(Cut, match=r"cut at \d+ of \d+ bytes: whoever pushed it does not answer"):
+    with pytest.raises(TransferInterrupted, match=r"cut at \d+ of \d+ bytes: whoever pushed it does not answer"):
         fetch(store, wanted(data), source(data, until=len(data) - 1))
     have = store.partial()[wanted(data).digest]
     assert 0 < have < len(data)
@@ -164,7 +173,7 @@ def test_left_over_pushes_give_way_to_a_new_one_but_whole_models_do_not(tmp_path
     store = ModelStore(tmp_path, quota_bytes=2 * len(data), patience_s=0.1)
     other = bytes_of(4, "four")
     third = bytes_of(5, "five")
-    with pytest.raises(Cut):
+    with pytest.raises(TransferInterrupted):
         fetch(store, wanted(other), source(other, until=len(other) - 1))
     fetch(store, wanted(data), source(data))
     assert store.partial()
@@ -205,20 +214,20 @@ def test_a_source_that_answers_wrongly_is_asked_again_and_then_given_up(store, d
     def pull(digest, request):
         return source(data)(digest, request) + b"\0"
 
-    with pytest.raises(Cut, match="asked for were"):
+    with pytest.raises(TransferInterrupted, match="asked for were"):
         fetch(store, wanted(data), pull)
 
     def refuses(_, __):
         raise NeuroVEError("the file has gone")
 
-    with pytest.raises(Cut, match="the file has gone"):
+    with pytest.raises(TransferInterrupted, match="the file has gone"):
         fetch(store, wanted(data), refuses)
 
 
 def test_a_node_that_stops_does_not_wait_for_chunks(tmp_path, data):
     stopping = threading.Event()
     stopping.set()
-    with pytest.raises(Cut, match="this node stops"):
+    with pytest.raises(TransferInterrupted, match="this node stops"):
         fetch(ModelStore(tmp_path, patience_s=600), wanted(data), source(data, until=0), stop=stopping)
 
 
