@@ -1,7 +1,7 @@
-"""What goes over the wire between camera drivers, the NeuroVE service and its consumers.
+"""The messages between camera drivers, the NeuroVE service and its consumers.
 
-A driver or a consumer needs this package alone (numpy, msgpack, pydantic): importing it pulls in neither torch nor
-zenoh. README.md beside this file is the contract.
+A driver or a consumer needs only this package (numpy, msgpack, pydantic). Importing it imports neither torch nor zenoh.
+README.md in this folder is the contract.
 """
 
 from neurove_protocol.camera import CameraInfo

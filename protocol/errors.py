@@ -35,11 +35,11 @@ EXIT_CONFLICT: Final = 3
 """Exit code of a command that another client's model change preceded."""
 
 MAX_TEXT_BYTES = 1024
-"""Cap of an error's sentence and of each of its details: what a peer is told must fit the caps of a message."""
+"""Cap of an error's sentence and of each of its details, so that an error reply fits the caps of a message."""
 
 
 class _Short(reprlib.Repr):
-    """A repr whose length, depth and cost are bounded, for values that a peer sent."""
+    """A repr with bounded length, depth and cost, for values that a peer sent."""
 
     repr_bytes = reprlib.Repr.repr_str
 
@@ -53,7 +53,7 @@ _SHORT = _Short()
 
 
 def shown(value: object) -> str:
-    """The value as a sentence shows it: its repr, at most 80 characters however long or deep the value is.
+    """The value as text for a sentence: its repr, at most 80 characters for any value.
 
     >>> shown([[[1]]])
     '[[...]]'
@@ -63,7 +63,7 @@ def shown(value: object) -> str:
 
 
 def _clipped(text: str) -> str:
-    data = text.encode("utf-8", "backslashreplace")  # a file name may hold what UTF-8 does not
+    data = text.encode("utf-8", "backslashreplace")  # a file name may hold characters that UTF-8 cannot encode
     return (data if len(data) <= MAX_TEXT_BYTES else data[: MAX_TEXT_BYTES - 3] + b"...").decode("utf-8", "ignore")
 
 
@@ -98,7 +98,7 @@ class RequestError(NeuroVEError):
 
 
 class InternalError(NeuroVEError):
-    """A bug on the answering side; its log has the trace back."""
+    """A bug on the answering side; its log has the traceback."""
 
     code = "internal"
 
@@ -107,7 +107,7 @@ class InternalError(NeuroVEError):
 
 
 class Malformed(InputError):
-    """The bytes are no message at all: not msgpack, cut short, trailing bytes, or a key twice."""
+    """The bytes are not a message: not msgpack, truncated, with trailing bytes, or with a duplicate key."""
 
     code = "malformed"
 
@@ -116,13 +116,13 @@ class Malformed(InputError):
 
 
 class UnsupportedVersion(InputError):
-    """The message speaks another major version of the protocol."""
+    """The message has another major version of the protocol."""
 
     code = "unsupported_version"
 
     def __init__(self, what: str, got: object, want: int) -> None:
         value = got if isinstance(got, int) else shown(got)
-        super().__init__(f"{what}: protocol version v={value}, this side speaks v={want}", field="v", value=value)
+        super().__init__(f"{what}: protocol version v={value}, this side supports v={want}", field="v", value=value)
 
 
 class InvalidField(InputError):
@@ -131,12 +131,12 @@ class InvalidField(InputError):
     code = "invalid_field"
 
     def __init__(self, what: str, field: str, value: object, bound: str) -> None:
-        field = field if len(field) <= 80 else field[:77] + "..."  # a misspelt one is the peer's, of any length
+        field = field if len(field) <= 80 else field[:77] + "..."  # a peer may send a field name of any length
         super().__init__(f"{what}: {field}={shown(value)}: {bound}", field=field, value=shown(value), bound=bound)
 
 
 class UnknownFormat(InputError):
-    """The event blob is in a layout that this side cannot read."""
+    """This side does not know the layout of the event blob."""
 
     code = "unknown_format"
 
@@ -184,7 +184,7 @@ class TimeBackwards(InputError):
 
 
 class UnknownModel(ModelError):
-    """No model of this name is available on the node."""
+    """The node has no model of this name."""
 
     code = "unknown_model"
 
@@ -193,7 +193,7 @@ class UnknownModel(ModelError):
 
 
 class BadModel(ModelError):
-    """A model file is unreadable, foreign, or does not hold what its header declares."""
+    """A model file is unreadable, has another format, or does not match its header."""
 
     code = "bad_model"
 
@@ -202,7 +202,7 @@ class BadModel(ModelError):
 
 
 class Untrusted(ModelError):
-    """A model's signature does not show that someone trusted made exactly these bytes."""
+    """No trusted key signed exactly the bytes of this model."""
 
     code = "untrusted"
 
@@ -211,16 +211,16 @@ class Untrusted(ModelError):
 
 
 class NoStore(TransferError):
-    """The node keeps no pushed models: it was given no folder for them, or one that it can not write to."""
+    """The node stores no pushed models: no folder is configured, or the folder is not writable."""
 
     code = "no_store"
 
     def __init__(self, why: str) -> None:
-        super().__init__(f"this node keeps no pushed models: {why}", why=why)
+        super().__init__(f"this node stores no pushed models: {why}", why=why)
 
 
 class TooLarge(TransferError):
-    """A bundle is larger than a node takes."""
+    """A bundle is larger than the node accepts."""
 
     code = "too_large"
 
@@ -229,13 +229,13 @@ class TooLarge(TransferError):
 
 
 class NoQuota(TransferError):
-    """With this bundle the node's pushed models would take more than they may."""
+    """With this bundle the node's pushed models would exceed their quota."""
 
     code = "no_quota"
 
     def __init__(self, name: str, size: int, used: int, quota: int) -> None:
         super().__init__(
-            f"model {name}: size={size}: {used} of {quota} bytes for pushed models are taken",
+            f"model {name}: size={size}: {used} of {quota} bytes for pushed models are in use",
             value=size,
             used=used,
             bound=quota,
@@ -252,25 +252,25 @@ class NoSpace(TransferError):
 
 
 class TransferInterrupted(TransferError):
-    """Whoever pushed a bundle stopped to answer; what came is kept, and the next push goes on from there."""
+    """The client that pushed a bundle stopped answering; the node keeps what arrived, and the next push resumes."""
 
     code = "cut"
 
     def __init__(self, name: str, have: int, size: int, why: str) -> None:
         super().__init__(
-            f"model {name}: cut at {have} of {size} bytes: {why}; the next push goes on from there",
+            f"model {name}: interrupted at {have} of {size} bytes: {why}; the next push resumes there",
             value=have,
             bound=size,
         )
 
 
 class Busy(RequestError):
-    """The node works on as many requests of this kind as it takes."""
+    """The node handles its maximum number of requests of this kind."""
 
     code = "busy"
 
     def __init__(self, at_once: int) -> None:
-        super().__init__(f"busy: this node works on at most {at_once} such requests at once", bound=at_once)
+        super().__init__(f"busy: this node handles at most {at_once} such requests at once", bound=at_once)
 
 
 class Conflict(RequestError):
@@ -284,13 +284,13 @@ class Conflict(RequestError):
 
 
 class NoMemory(ModelError):
-    """A model is refused, for it might not fit beside the one that serves."""
+    """A model is refused because it might not fit into memory together with the active one."""
 
     code = "no_memory"
 
     def __init__(self, model: str, free_bytes: int, need_bytes: int) -> None:
         super().__init__(
-            f"model {model}: free_bytes={free_bytes}: a change of model needs {need_bytes} bytes of memory",
+            f"model {model}: free_bytes={free_bytes}: a model change needs {need_bytes} bytes of memory",
             field="free_bytes",
             value=free_bytes,
             bound=need_bytes,
@@ -298,7 +298,7 @@ class NoMemory(ModelError):
 
 
 class TooSlow(ModelError):
-    """A model is refused, for this node can not run it in time."""
+    """A model is refused because this node cannot run it in time."""
 
     code = "too_slow"
 
@@ -313,7 +313,7 @@ class TooSlow(ModelError):
 
 
 class Diverged(ModelError):
-    """A model is refused, for beside the active one on live streams it did not behave alike."""
+    """A model is refused because its estimates in shadow differ too much from those of the active model."""
 
     code = "diverged"
 
@@ -323,7 +323,7 @@ class Diverged(ModelError):
 
 
 class RolledBack(ModelError):
-    """A model served, and was taken back by itself on its probation; the one before serves on."""
+    """The node rolled a model back during its probation; the previous model serves again."""
 
     code = "rolled_back"
 
@@ -332,19 +332,19 @@ class RolledBack(ModelError):
 
 
 class NothingBefore(ModelError):
-    """There is no model to go back to."""
+    """There is no previous model."""
 
     code = "nothing_before"
 
     def __init__(self) -> None:
-        super().__init__("nothing to roll back to: this node has no model before the active one")
+        super().__init__("cannot roll back: this node has no previous model")
 
 
 class Downgrade(ModelError):
-    """A model's release is lower than one that was accepted before, and its signature does not allow that."""
+    """A model's release is lower than an accepted one, and its signature does not allow a downgrade."""
 
     code = "downgrade"
 
     def __init__(self, name: str, release: int, highest: int) -> None:
-        why = f"release={release}: release {highest} was here before, and its signature does not allow a downgrade"
+        why = f"release={release}: release {highest} was accepted before, and the signature does not allow a downgrade"
         super().__init__(f"model {name}: {why}", value=release, bound=highest)

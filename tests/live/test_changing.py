@@ -117,7 +117,7 @@ def test_a_push_to_all_tells_people_where_the_bundle_is_and_where_it_is_refused(
     code, out, err = run("push", tmp_path / "new.safetensors", "--connect", endpoint, "--all")
     assert code == 1
     assert out.splitlines()[1] == f"n1: new ({'b' * 12}) is there, 1,234 bytes moved"
-    assert err == "neurove: n2: this node keeps no pushed models: it has no state_dir\n"
+    assert err == "neurove: n2: this node stores no pushed models: it has no state_dir\n"
     assert [node.asked for node in nodes.values()] == [["new.safetensors"]] * 2
 
 

@@ -70,7 +70,7 @@ def test_an_operator_pushes_activates_and_rolls_back_while_events_flow_without_a
             back = run("rollback", *at, "--expect", digest[:8])
             assert (back.code, "n1: rolled_back: to default" in back.out) == (0, True)
             nothing = run("rollback", *at)
-            assert (nothing.code, "nothing to roll back to" in nothing.err) == (1, True)
+            assert (nothing.code, "cannot roll back" in nothing.err) == (1, True)
             wait_until(lambda: heard.of("cam0")[-1].model == "default")
         finally:
             stop.set()

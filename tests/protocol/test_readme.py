@@ -28,6 +28,7 @@ from neurove_service.models.progress import Step
 from tests.protocol.messages import KINDS, MODELS, assert_same_packet
 from tests.protocol.test_errors import ERRORS
 
+ROOT = Path(__file__).parents[2]
 README = Path(neurove_protocol.__file__).with_name("README.md").read_text(encoding="utf-8")
 DUMPS = re.findall(r"```hex (\w+)\n(.*?)```\n\n```json\n(.*?)```", README, re.DOTALL)
 EXAMPLES = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
@@ -205,13 +206,27 @@ def test_the_links_of_the_page_lead_to_its_sections() -> None:
     assert set(re.findall(r"\]\(#([^)]*)\)", README)) <= sections
 
 
+# --- the picture
+
+
+def test_the_picture_names_only_files_and_keys_that_exist() -> None:
+    picture = re.findall(r"```mermaid\n(.*?)```", README, re.DOTALL)[0]
+    files = set(re.findall(r"\b(?:service|neurove_core|protocol)/[\w/]+\.py", picture))
+    assert len(files) >= 10
+    assert all((ROOT / file).is_file() for file in files), [file for file in files if not (ROOT / file).is_file()]
+    drawn = {re.sub(r"[{}]", "`", key).replace("`", "") for key in re.findall(r"\{prefix\}[\w/@{}]*", picture)}
+    table_of_keys = {re.sub(r"[<>]", "", key) for key in column(table("key"))}
+    assert len(drawn) >= 8
+    assert drawn <= table_of_keys
+
+
 # --- the examples
 
 
-@pytest.mark.parametrize("example", EXAMPLES, ids=["driver", "consumer"])
-def test_an_example_is_short_and_uses_only_what_the_package_has(example: str) -> None:
-    known = {"camera": camera, "events": events, "keys": Keys}
-    assert len(example.splitlines()) < 30
+@pytest.mark.parametrize(("example", "lines"), list(zip(EXAMPLES, (20, 10), strict=True)), ids=["driver", "consumer"])
+def test_an_example_is_short_and_uses_only_what_the_package_has(example: str, lines: int) -> None:
+    known = {"camera": camera, "events": events, "key": Keys}
+    assert len([line for line in example.splitlines() if line]) <= lines
     for node in ast.walk(ast.parse(example)):
         if isinstance(node, ast.Import):
             assert {name.name for name in node.names} <= {"time", "numpy", "zenoh"}

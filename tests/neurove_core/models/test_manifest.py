@@ -251,7 +251,7 @@ def test_a_release_counter_never_goes_back_unless_a_signed_flag_allows_it(releas
     if want:
         manifest.check_release(signed, highest)
     else:
-        with pytest.raises(Downgrade, match=f"release={release}: release {highest} was here before") as refused:
+        with pytest.raises(Downgrade, match=f"release={release}: release {highest} was accepted before") as refused:
             manifest.check_release(signed, highest)
         assert refused.value.code == "downgrade"
 

@@ -31,7 +31,7 @@ def test_a_system_that_does_not_tell_its_memory_refuses_nothing(tmp_path):
 
 def test_a_model_needs_twice_its_size():
     admission.check_memory("one", 500, 1000)
-    with pytest.raises(NoMemory, match="model one: free_bytes=1000: a change of model needs 1002 bytes"):
+    with pytest.raises(NoMemory, match="model one: free_bytes=1000: a model change needs 1002 bytes"):
         admission.check_memory("one", 501, 1000)
 
 

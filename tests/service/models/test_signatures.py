@@ -54,7 +54,7 @@ def test_what_a_trusted_key_signed_may_serve_and_what_nobody_signed_may_not(fold
 
 
 def test_the_release_that_counts_is_the_signed_one(folder, key_file):
-    with pytest.raises(Downgrade, match="release=3: release 4 was here before"):
+    with pytest.raises(Downgrade, match="release=3: release 4 was accepted before"):
         handlers_of(folder, key_file, highest_release=4).activate(ActivateRequest(model="one").encode())
     handlers_of(folder, key_file, highest_release=3).activate(ActivateRequest(model="one").encode())
 

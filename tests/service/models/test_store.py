@@ -92,7 +92,9 @@ def test_a_pushed_bundle_is_whole_on_the_disk_and_can_be_activated(store, tmp_pa
 
 
 def test_a_cut_push_goes_on_where_it_stopped_in_another_process_too(store, tmp_path, data):
-    with pytest.raises(TransferInterrupted, match=r"cut at \d+ of \d+ bytes: whoever pushed it does not answer"):
+    with pytest.raises(
+        TransferInterrupted, match=r"interrupted at \d+ of \d+ bytes: whoever pushed it does not answer"
+    ):
         fetch(store, wanted(data), source(data, until=len(data) - 1))
     have = store.partial()[wanted(data).digest]
     assert 0 < have < len(data)
@@ -144,7 +146,7 @@ def test_what_can_not_be_kept_is_refused_before_the_first_byte(tmp_path, data, m
         fetch(ModelStore(None), wanted(data), never)
     with pytest.raises(TooLarge, match=f"at most {bundle.MAX_BYTES} bytes"):
         fetch(ModelStore(tmp_path), wanted(data, size=bundle.MAX_BYTES + 1), never)
-    with pytest.raises(NoQuota, match=f"0 of {len(data) - 1} bytes for pushed models are taken"):
+    with pytest.raises(NoQuota, match=f"0 of {len(data) - 1} bytes for pushed models are in use"):
         fetch(ModelStore(tmp_path, quota_bytes=len(data) - 1), wanted(data), never)
     monkeypatch.setattr(model_store, "SPARE_BYTES", 1 << 62)  # no disk of a test is full
     with pytest.raises(NoSpace, match=f"needs {len(data)} bytes"):

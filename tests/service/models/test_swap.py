@@ -462,7 +462,7 @@ def test_a_fault_of_a_model_that_is_not_on_probation_changes_nothing(slots):
 
 def test_a_model_that_might_not_fit_into_memory_is_refused_before_it_is_made_ready(slots):
     slot = slots(free_bytes=lambda: 1000)
-    with pytest.raises(NoMemory, match="free_bytes=1000: a change of model needs"):
+    with pytest.raises(NoMemory, match="free_bytes=1000: a model change needs"):
         slot.activate("two")
     assert slot.active.epoch == 0
 

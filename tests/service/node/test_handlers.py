@@ -206,7 +206,7 @@ def test_a_pushed_model_is_staged_until_it_serves(storing, told):
 def test_an_older_release_is_neither_taken_nor_activated_unless_a_trusted_signature_allows_it(storing, told, tmp_path):
     handlers = storing(highest_release=7)
     request, pull = push_of("eight")
-    with pytest.raises(Downgrade, match="release=0: release 7 was here before"):
+    with pytest.raises(Downgrade, match="release=0: release 7 was accepted before"):
         handlers.push(request, told, pull, RUNS)
     assert told.steps[-1] == "refused"
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
