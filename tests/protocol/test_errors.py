@@ -113,7 +113,7 @@ def test_code_sentence_and_details_survive_the_wire(error: NeuroVEError) -> None
 
 
 @every_error
-def test_every_detail_stands_in_the_sentence(error: NeuroVEError) -> None:
+def test_the_sentence_contains_every_detail(error: NeuroVEError) -> None:
     for name, value in error.details.items():
         assert str(value) in error.message, name
 

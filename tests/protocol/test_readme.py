@@ -171,7 +171,7 @@ def test_the_table_of_steps_has_all_steps() -> None:
     assert column(table("`step`")) == list(get_args(Step))
 
 
-def test_the_verdicts_and_the_lenses_are_all_told() -> None:
+def test_the_page_lists_all_verdicts_and_lenses() -> None:
     cells = {row[0]: code(row[3]) for rows in tables() for row in rows if rows[0][0] == "field"}
     assert cells["`verdict`"] == list(get_args(Verdict))
     assert cells["`lens`"] == list(get_args(camera.CameraInfo.model_fields["lens"].annotation))
@@ -194,7 +194,7 @@ def test_the_caps_are_those_of_the_code() -> None:
         assert found == int(value), name
 
 
-def test_the_order_of_a_twist_is_told() -> None:
+def test_the_page_gives_the_order_of_a_twist() -> None:
     assert f"{' '.join(AXES[:3])} [m/s] and {' '.join(AXES[3:])} [rad/s]" in section("### TwistEstimate")
     assert f"default `{TwistEstimate.model_fields['frame_id'].default}`" in section("### TwistEstimate")
 
