@@ -59,7 +59,7 @@ def _rules(role: str, name: str, prefix: str) -> list[Rule]:
     """List what a participant may send (IN) and receive (OUT): flow, kinds of message, key expressions."""
     node = f"{prefix}/@node/*"
     events, camera = f"{prefix}/*/events", f"{prefix}/*/camera"
-    told = [f"{prefix}/*/velocity", f"{prefix}/*/status"]
+    results = [f"{prefix}/*/velocity", f"{prefix}/*/status"]
     asked = [f"{node}/health", f"{node}/models"]
     change, chunks = f"{node}/model/**", f"{prefix}/@push/**"
     own = f"{prefix}/@node/{name}"
@@ -72,13 +72,13 @@ def _rules(role: str, name: str, prefix: str) -> list[Rule]:
         return [
             *_hears([events, camera]),
             *_asks([camera, chunks]),
-            *_publishes(told, heard_as=told),
+            *_publishes(results, heard_as=results),
             *_answers([f"{own}/health", f"{own}/models", f"{own}/model/**"], asked_as=[*asked, change]),
             (IN, ["reply"], [change]),  # an error reply has the key of the query, maybe for all nodes
             (IN, ["liveliness_token"], [f"{own}/alive", f"{own}/serves/*"]),
         ]
     reads = [
-        *_hears(told),
+        *_hears(results),
         *_asks(asked),
         (IN, ["liveliness_query", "declare_liveliness_subscriber"], [f"{node}/alive", f"{node}/serves/*"]),
         (OUT, ["liveliness_token"], [f"{node}/alive", f"{node}/serves/*"]),
@@ -95,7 +95,7 @@ def _hears(keys: list[str]) -> list[Rule]:
 
 
 def _publishes(keys: list[str], *, heard_as: list[str]) -> list[Rule]:
-    return [(IN, ["put"], keys), (OUT, ["declare_subscriber"], heard_as)]  # otherwise it would not learn of a subscriber
+    return [(IN, ["put"], keys), (OUT, ["declare_subscriber"], heard_as)]  # else it learns of no subscriber
 
 
 def _asks(keys: list[str]) -> list[Rule]:
@@ -109,8 +109,8 @@ def _answers(keys: list[str], *, asked_as: list[str]) -> list[Rule]:
 def listens(certificate: Path) -> bool:
     """Return whether others may connect to the holder; make-ca.sh marks certificates that it made with hosts."""
     command = ["openssl", "x509", "-in", str(certificate), "-noout", "-purpose"]
-    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    return "SSL server : Yes" in told
+    purposes = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    return "SSL server : Yes" in purposes
 
 
 def config(folder: Path, name: str, access: dict[str, object], endpoint: str) -> str:
