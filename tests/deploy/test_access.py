@@ -1,4 +1,4 @@
-"""Who may: certificates and the access list as shipped, against those who may not. What THREATS.md refers to."""
+"""Access control: the shipped certificates and access list refuse clients without a right (see THREATS.md)."""
 
 import contextlib
 import re
@@ -160,10 +160,10 @@ class TestWhoMayNot:
         assert anywhere.epoch() == before
 
     def test_the_command_names_missing_permission_as_a_possible_reason(self, place):
-        told = neurove("activate", "untrained", *place.flags("consumer-planner"))
-        assert (told.returncode, told.stdout) == (1, "")
-        assert "does its access list let you ask?" in told.stderr
-        assert told.stderr.count("\n") == 1
+        result = neurove("activate", "untrained", *place.flags("consumer-planner"))
+        assert (result.returncode, result.stdout) == (1, "")
+        assert "does its access list let you ask?" in result.stderr
+        assert result.stderr.count("\n") == 1
 
     @pytest.mark.parametrize("name", [*NOT_OPERATORS, "operator-alice"])
     def test_no_client_publishes_on_a_key_of_another_with_or_without_wildcards(self, place, name):
@@ -293,10 +293,10 @@ class TestWhoDoesNotGetIn:
             bare(anywhere.endpoint.replace("tls/", "tcp/"))
 
     def test_the_command_names_certificates_as_a_possible_reason(self, place, foreign):
-        told = neurove("health", "--connect", place.endpoint, "--zenoh-config", str(foreign / "operator-alice.json5"))
-        assert told.returncode == 1
-        assert "or one side refuses the other's certificate (zenoh_config)" in told.stderr
-        assert told.stderr.count("\n") == 1
+        result = neurove("health", "--connect", place.endpoint, "--zenoh-config", str(foreign / "operator-alice.json5"))
+        assert result.returncode == 1
+        assert "or one side refuses the other's certificate (zenoh_config)" in result.stderr
+        assert result.stderr.count("\n") == 1
 
     def test_a_stolen_client_certificate_does_not_make_a_router(self, place, tmp_path):
         """Nobody speaks to a listener whose certificate was not made for listening."""

