@@ -162,7 +162,7 @@ class TestWhoMayNot:
     def test_the_command_says_that_it_may_be_for_want_of_permission(self, place):
         told = neurove("activate", "untrained", *place.flags("consumer-planner"))
         assert (told.returncode, told.stdout) == (1, "")
-        assert "does its access list let you ask?" in told.stderr
+        assert "does its access list admit you?" in told.stderr
         assert told.stderr.count("\n") == 1
 
     @pytest.mark.parametrize("name", [*NOT_OPERATORS, "operator-alice"])
