@@ -50,7 +50,8 @@ class _Version(argparse.Action):
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
         import importlib.metadata
 
-        parser.exit(0, f"neurove {importlib.metadata.version('neurove')}, Python {platform.python_version()}\n")
+        print(f"neurove {importlib.metadata.version('neurove')}, Python {platform.python_version()}")
+        parser.exit()
 
 
 def build_parser(chosen: Container[str]) -> Parser:

@@ -18,6 +18,9 @@ _LISTEN_S: Final = 2.0
 _OLD_PACKET_S: Final = 2.0
 """A stream whose newest packet is older has stopped."""
 
+_WIDE: Final = 200
+"""Columns of the table where no terminal limits them."""
+
 
 def doctor(args: argparse.Namespace) -> int:
     """Check connection, streams, compiled kernels, processor and installed extras."""
@@ -53,7 +56,7 @@ def _check_network(config: ClientConfig) -> list[Check]:
         estimates = _newest_estimates(transport, config, set(statuses))
     found = [_check_node(reply, where) for reply in replies]
     for name, status in sorted(statuses.items()):
-        found += _check_stream(status, estimates.get(name))
+        found += check_stream(status, estimates.get(name))
     return found or [Check("connection", f"no node at {where}", "bad", "start `neurove serve`")]
 
 
@@ -82,7 +85,13 @@ def _check_node(reply: HealthReply, where: str) -> Check:
     return Check(f"node {reply.node}", f"{state}: {reply.why}", "bad", "run `neurove health`; see the log of the node")
 
 
-def _check_stream(status: StreamStatus, estimate: TwistEstimate | None) -> list[Check]:
+def check_stream(status: StreamStatus, estimate: TwistEstimate | None) -> list[Check]:
+    """Clock, calibration and camera height of one stream.
+
+    Args:
+        status: of the node that serves the stream.
+        estimate: the newest one; None if none arrived.
+    """
     name = f"stream {status.stream}"
     return [
         _check_clock(f"{name}: clock", status),
@@ -121,9 +130,11 @@ def _print_table(checks: list[Check]) -> None:
     table = Table("", "check", "state", "what to do", box=None, padding=(0, 2, 0, 0), header_style="dim")
     styles = {"ok": "green", "bad": "bold red", "info": "dim"}
     for check in checks:
-        table.add_row(Text(check.level, style=styles[check.level]), Text(check.what), Text(check.state), Text(check.advice))
+        table.add_row(
+            Text(check.level, style=styles[check.level]), Text(check.what), Text(check.state), Text(check.advice)
+        )
     console = Console()
-    console.print(table, width=None if console.is_terminal else 200)
+    (console if console.is_terminal else Console(width=_WIDE)).print(table)
 
 
 def add_doctor(parser: argparse.ArgumentParser) -> None:

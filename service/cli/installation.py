@@ -64,7 +64,7 @@ def check_processor() -> Check:
 
 
 def cpu_features(cpuinfo: Path = Path("/proc/cpuinfo")) -> list[str]:
-    """AVX2, AVX-512, VNNI, AVX-VNNI and NEON, as far as this processor has them; empty where Linux does not list them."""
+    """Those of AVX2, AVX-512, VNNI, AVX-VNNI and NEON that this processor has; empty if the file does not exist."""
     try:
         lines = cpuinfo.read_text(errors="replace").splitlines()
     except OSError:

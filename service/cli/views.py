@@ -4,18 +4,20 @@ import threading
 import time
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Group, RenderableType
 from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from neurove_core.io.summary import Summary
 from neurove_protocol import Flag, Twist, TwistEstimate
 from neurove_protocol.control import HealthReply, ModelsReply, StreamStatus
 from neurove_protocol.velocity import AXES
 from neurove_service.latency import latency
+
+if TYPE_CHECKING:
+    from neurove_core.io.summary import Summary
 
 _VERDICT_STYLE = {"ok": "green", "lossy": "yellow", "stalled": "bold red", "idle": "dim"}
 _RATE_ESTIMATES = 40
@@ -197,7 +199,7 @@ def _streams_table(streams: tuple[StreamStatus, ...]) -> Table:
     return table
 
 
-def survey_table(summary: Summary) -> RenderableType:
+def survey_table(summary: "Summary") -> RenderableType:
     """The contents of a recording."""
     table = Table(show_header=False, **_PLAIN)
     table.add_row("sensor", str(summary.sensor))

@@ -36,7 +36,15 @@ SOURCE = "sim://street?seed=3&seconds=0.8&camera=pinhole:24x18:75"
 def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("train")
     (folder / "tiny.toml").write_text(CONFIG)
-    arguments = ["train", str(folder / "tiny.toml"), "--out", str(folder / "out"), "--calibration-sequences", "16", "--json"]
+    arguments = [
+        "train",
+        str(folder / "tiny.toml"),
+        "--out",
+        str(folder / "out"),
+        "--calibration-sequences",
+        "16",
+        "--json",
+    ]
     assert main.main(arguments) == 0
     return folder
 

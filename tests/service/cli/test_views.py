@@ -93,7 +93,12 @@ def test_health_shows_verdict_reason_and_streams(stream):
 def test_models_marks_active_and_previous_and_names_unreadable_files():
     other = INFO.model_copy(update={"name": "two", "digest": "cd" * 32, "trained": True})
     reply = ModelsReply(
-        node="n1", active=INFO, previous=other, epoch=1, available=(INFO, other), unreadable={"x.safetensors": "truncated"}
+        node="n1",
+        active=INFO,
+        previous=other,
+        epoch=1,
+        available=(INFO, other),
+        unreadable={"x.safetensors": "truncated"},
     )
     text = drawn(models_table([reply]))
     assert any("active" in line and "one" in line and "no" in line for line in text.splitlines())
