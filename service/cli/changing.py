@@ -137,7 +137,7 @@ def add_rollback(parser: argparse.ArgumentParser) -> None:
 def _add_nodes(parser: argparse.ArgumentParser) -> None:
     add_client_flags(parser)
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("--node", help="name of one node; default: the only node that runs")
+    where.add_argument("--node", help="name of one node; default: the only node that is alive")
     where.add_argument("--all", action="store_true", help="change every node, one after the other")
 
 

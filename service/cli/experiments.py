@@ -44,7 +44,7 @@ def reproduce_repriming(args: argparse.Namespace) -> int:
 
 
 def reproduce_sine(args: argparse.Namespace) -> int:
-    """Tables I and II: regression and forecast of a sine by ASLSTM, ASLSTM-w/o, SLSTM and LTC."""
+    """Repeat Tables I and II: regression and forecast of a sine by ASLSTM, ASLSTM-w/o, SLSTM and LTC."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -112,7 +112,7 @@ def _real_rows(model: str, recordings: Path, out: Path | None) -> tuple[list[dic
 
 
 def reproduce_velocity(args: argparse.Namespace) -> int:
-    """Tables III and IV: velocity by NeuroVE, NeuroVE w/o, ANN, SNN-ANG and untrained baselines."""
+    """Repeat Tables III and IV: velocity by NeuroVE, NeuroVE w/o, ANN, SNN-ANG and baselines that do not learn."""
     import torch
 
     from neurove_core.experiments.velocity import figures as velocity_figures
@@ -212,7 +212,7 @@ def _add_velocity(parser: argparse.ArgumentParser) -> None:
     about = "number of updates; default: that of the configuration"
     parser.add_argument("--steps", type=int, metavar="N", help=about)
     parser.add_argument("--data", type=Path, metavar="DIR", help="folder for the sequences; default OUT/data")
-    about = "folder with MVSEC's poses, for Table III; default: no such rows"
+    about = "folder with MVSEC's poses, for Table III"
     parser.add_argument("--recordings", type=Path, metavar="DIR", help=about)
     _add_out(parser, "folder for methods, tables and figures; default runs/velocity")
     about = "number of processes that simulate; default 1"

@@ -52,12 +52,11 @@ def serve(args: argparse.Namespace) -> int:
 def drive(args: argparse.Namespace) -> int:
     """Publish a recording or a synthetic source as one stream; publish a packet log as it was recorded."""
     from neurove_core.io import open_source
+    from neurove_service.clients import ask
 
     stop = stop_on_signals(with_parent=args.with_parent)
     config = client_config(args)
     recording = open_source(args.source, args.sensor, args.topic)
-    from neurove_service.clients import ask
-
     with ask.connect(config, patience_s=max(ask.CONNECT_S, args.wait), stop=stop) as transport:
         player = _player(args, recording, transport, config.keys)
         if args.wait and not player.wait_for_listener(args.wait, stop) and not stop.is_set():
