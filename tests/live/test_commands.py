@@ -167,6 +167,11 @@ def children(pid):
         return []
 
 
+def running_as(command, parent):
+    """Children that run one of our commands; a child that has not started its program yet is none of them."""
+    return [pid for pid in children(parent) if command in Path(f"/proc/{pid}/cmdline").read_text().split("\0")]
+
+
 def test_killing_the_demo_leaves_no_process_behind():
     demo = Process("demo", "pattern://", "--seconds", "60", "--json")
     wait_until(lambda: len(children(demo.child.pid)) == 2, timeout_s=90)
@@ -187,10 +192,8 @@ def test_a_service_that_waits_for_a_router_ends_in_order_when_told():
 @pytest.mark.parametrize(("victim", "telling"), [("serve", "the service ended"), ("drive", "the driver ended")])
 def test_a_demo_that_loses_one_of_its_processes_says_which(victim, telling):
     demo = Process("demo", "pattern://", "--seconds", "60", "--json")
-    wait_until(lambda: len(children(demo.child.pid)) == 2, timeout_s=90)
-    for pid in children(demo.child.pid):
-        if victim in Path(f"/proc/{pid}/cmdline").read_text():
-            os.kill(pid, signal.SIGKILL)
+    wait_until(lambda: len(running_as(victim, demo.child.pid)) == len(children(demo.child.pid)) - 1 == 1, timeout_s=90)
+    os.kill(*running_as(victim, demo.child.pid), signal.SIGKILL)
     out, errors = demo.child.communicate(timeout=60)
     assert (demo.child.returncode, out) == (1, "")
     assert errors.startswith(f"neurove: {telling}")
