@@ -128,7 +128,7 @@ def _summary_text(summary: dict[str, Any]) -> str:
         return "stopped before the driver had started"
     lost = ", ".join(f"{name} {count}" for name, count in summary["lost"].items()) or "nothing"
     latency = f"p50 {numbers['p50']:.1f} ms, p99 {numbers['p99']:.1f} ms" if numbers else "no estimate"
-    model = summary["model"] if summary["trained"] else f"{summary['model']}, UNTRAINED: the velocities have no meaning"
+    model = summary["model"] if summary["trained"] else f"{summary['model']}, UNTRAINED: the estimates have no meaning"
     lines = (
         f"source     {summary['source']} ({sensor['width']}x{sensor['height']})",
         f"packets    {summary['packets_received']:,} of {summary['packets_sent']:,}",

@@ -142,7 +142,7 @@ def _title(name: str, received: Received) -> Text:
     if last is not None:
         title.append(f"model {last.model}  ", style="default")
         if Flag.UNTRAINED in last.flags:
-            title.append("UNTRAINED: the numbers have no meaning", style="bold magenta")
+            title.append("UNTRAINED: the estimates have no meaning", style="bold magenta")
     return title
 
 

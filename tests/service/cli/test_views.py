@@ -38,7 +38,7 @@ def test_a_board_shows_the_newest_velocity_its_flags_and_every_loss(stream):
     newest = board.of("cam0").last.twist
     assert f"{newest.vx:+7.3f} m/s" in text
     assert f"{newest.wz:+7.3f} rad/s" in text
-    for word in ("cam0", "lossy", "64x48", "UNTRAINED: the numbers have no meaning", "gap_packets 3", "uncalibrated"):
+    for word in ("cam0", "lossy", "64x48", "UNTRAINED: the estimates have no meaning", "gap_packets 3", "uncalibrated"):
         assert word in text
 
 
