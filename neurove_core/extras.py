@@ -9,4 +9,4 @@ class MissingExtra(NeuroVEError):
     code = "missing_extra"
 
     def __init__(self, library: str, extra: str = "experiments") -> None:
-        super().__init__(f"{library} is not installed: pip install 'neurove[{extra}]'", library=library)
+        super().__init__(f"{library} is not installed: pip install 'neurove[{extra}]'", library=library, extra=extra)

@@ -208,6 +208,7 @@ class Untrusted(ModelError):
 
     def __init__(self, name: str, reason: str, why: str) -> None:
         super().__init__(f"model {name}: signature refused ({reason}): {why}", value=name, reason=reason)
+        self.why = why
 
 
 class NoStore(TransferError):

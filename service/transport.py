@@ -43,6 +43,10 @@ class EndpointError(NeuroVEError):
     code = "endpoint"
 
 
+class Unreachable(EndpointError):
+    """No router and no service listens at the endpoints."""
+
+
 class Reply(NamedTuple):
     """One reply to a query."""
 
@@ -313,7 +317,7 @@ def open_transport(
                     f"can not open a Zenoh session: {_where(listen, connect)}: {_reason(error)}"
                 ) from None
         if time.monotonic() >= deadline or stop.is_set():
-            raise EndpointError(_unreached(connect))
+            raise Unreachable(_unreached(connect))
         if not waiting:
             log.info("waiting for a router", connect=", ".join(connect), why=_unreached(connect))
             waiting = True

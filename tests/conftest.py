@@ -1,4 +1,4 @@
-"""One thread and bounded property tests: a run depends neither on cores nor, in CI, on chance. How commands are run."""
+"""One thread and bounded property tests, so that a run depends neither on cores nor, in CI, on randomness; fixtures."""
 
 import logging
 import os
@@ -16,9 +16,9 @@ torch.set_num_threads(1)
 
 
 def pytest_collection_modifyitems(items):
-    """For `--dist loadgroup`: a file stays together, for its fixtures; live tests stay in one process, one by one.
+    """For `--dist loadgroup`: tests of a file stay together, for its fixtures; live tests run one by one in one process.
 
-    They come first, because they take longest and mostly wait.
+    Live tests come first, because they take longest and mostly wait.
     """
     for item in items:
         group = "live" if item.get_closest_marker("live") else str(item.path)

@@ -51,7 +51,7 @@ def read_private(data: bytes, name: str) -> Ed25519PrivateKey:
         why = "it is locked by a pass phrase; unlock a copy with `openssl pkey -in FILE -out COPY`"
         raise InvalidField(_WHAT, "file", name, why) from None
     except (ValueError, UnsupportedAlgorithm):
-        raise InvalidField(_WHAT, "file", name, "not a private key in PEM, as `neurove model keygen` makes") from None
+        raise InvalidField(_WHAT, "file", name, "not a private key in PEM, as `neurove bundle keygen` makes") from None
     if not isinstance(key, Ed25519PrivateKey):
         raise InvalidField(_WHAT, "file", name, "a private key, but not an Ed25519 one")
     return key
@@ -70,7 +70,7 @@ def read_public(data: bytes, name: str) -> Ed25519PublicKey:
     try:
         key = serialization.load_pem_public_key(data)
     except (ValueError, UnsupportedAlgorithm):
-        raise InvalidField(_WHAT, "file", name, "not a public key in PEM, as `neurove model keygen` makes") from None
+        raise InvalidField(_WHAT, "file", name, "not a public key in PEM, as `neurove bundle keygen` makes") from None
     if not isinstance(key, Ed25519PublicKey):
         raise InvalidField(_WHAT, "file", name, "a public key, but not an Ed25519 one")
     return key

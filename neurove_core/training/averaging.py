@@ -47,7 +47,7 @@ def average(bundles: Sequence[Bundle]) -> Bundle:
     of = ", ".join(one.digest[:12] for one in bundles)
     made = replace(
         last,
-        provenance=f"neurove model average of {of}; the last: {last.provenance}"[:_PROVENANCE_CHARS],
+        provenance=f"neurove bundle average of {of}; the last: {last.provenance}"[:_PROVENANCE_CHARS],
         network=network.eval(),
         about=About(made_by=_made_by(last, of)),
         uncertainty=None,
@@ -66,7 +66,7 @@ def _mean(bundles: Sequence[Bundle], name: str) -> Tensor:
 
 def _made_by(last: Bundle, of: str) -> MadeBy:
     """As the last one was made, by another program."""
-    program = f"neurove model average of {of}"
+    program = f"neurove bundle average of {of}"
     if last.about.made_by is None:
         return MadeBy(program=program, seed=0, commit=commit(), torch=torch.__version__)
     return last.about.made_by.model_copy(update={"program": program, "commit": commit(), "torch": torch.__version__})

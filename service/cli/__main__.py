@@ -1,4 +1,4 @@
-"""`python -m neurove_service.cli`."""
+"""Run the command line: `python -m neurove_service.cli`."""
 
 import sys
 

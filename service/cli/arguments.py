@@ -1,73 +1,99 @@
-"""What the commands' arguments have in common: types, flags, and the settings that they make."""
+"""Arguments that several commands share: their types, their flags, and the settings that they give."""
 
 import argparse
 import math
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from neurove_protocol import Sensor
 from neurove_protocol.errors import NeuroVEError
 from neurove_service import logs
 from neurove_service.config import ClientConfig, ServiceConfig, load
 
-BAD_NEWS: Final = 1
-WRONG_USAGE: Final = 2
-CONFLICT: Final = 3
-"""Exit codes; 0 is fine."""
-
-Command = Callable[[argparse.Namespace], int]
-"""Runs one command and gives its exit code."""
+Run = Callable[[argparse.Namespace], int]
+"""Runs one command and returns its exit code."""
 
 
-def command(commands: Any, name: str, run: Command, *, as_json: bool = True) -> argparse.ArgumentParser:
-    """A parser of one command, which is described by the first line of what it runs."""
-    about = (run.__doc__ or "").splitlines()[0]
-    parser: argparse.ArgumentParser = commands.add_parser(name, help=about, description=about)
+def command(parser: argparse.ArgumentParser, run: Run, *, as_json: bool = True) -> argparse.ArgumentParser:
+    """Let a parser run a command, and add `--json` if the command prints JSON too."""
     parser.set_defaults(run=run)
     if as_json:
-        parser.add_argument("--json", action="store_true", help="for machines")
+        parser.add_argument("--json", action="store_true", help="print JSON instead of text")
     return parser
 
 
+def subcommand(commands: Any, name: str, run: Run, *, as_json: bool = True) -> argparse.ArgumentParser:
+    """Add a command to a group; the first line of its function's docstring is its help."""
+    about = (run.__doc__ or "").splitlines()[0]
+    return command(commands.add_parser(name, help=about, description=about), run, as_json=as_json)
+
+
 def add_source(parser: argparse.ArgumentParser, **source: Any) -> None:
-    """The source of events and how it is read."""
-    parser.add_argument("source", metavar="SOURCE", help="a recording, or sim:// (the built-in simulator)", **source)
-    parser.add_argument("--sensor", type=sensor_size, metavar="WxH", help="sensor size, where the recording lacks it")
-    parser.add_argument("--topic", metavar="T", help="which of several event streams, where the recording has names")
-    parser.add_argument("--loop", action="store_true", help="begin again at the end")
+    """Add the source of events and how to read it."""
+    default = f"; default {source['default']}" if source else ""
+    about = f"recording, pattern:// or sim:// (the built-in simulator){default}"
+    parser.add_argument("source", metavar="SOURCE", help=about, **source)
+    add_recording_flags(parser)
+    parser.add_argument("--loop", action="store_true", help="start again at the end")
+
+
+def add_recording_flags(parser: argparse.ArgumentParser) -> None:
+    """Add what a recording may not say itself: the sensor's size, and which of its event streams to read."""
+    parser.add_argument("--sensor", type=sensor_size, metavar="WxH", help="sensor size, if the recording lacks it")
+    parser.add_argument("--topic", metavar="T", help="event stream to read; default: the recording's first")
+
+
+def add_playback_flags(parser: argparse.ArgumentParser, seconds_help: str) -> None:
+    """Add how fast and how long a source is played."""
+    parser.add_argument(
+        "--speed", type=speed, default=1.0, metavar="R", help="sensor seconds per second, or max; default 1.0"
+    )
+    parser.add_argument("--seconds", type=seconds, metavar="S", help=seconds_help)
 
 
 def add_client_flags(parser: argparse.ArgumentParser) -> None:
-    """Where the service is."""
-    for name in ("connect", "prefix", "zenoh_config"):
-        field = ClientConfig.model_fields[name]
-        parser.add_argument("--" + name.replace("_", "-"), metavar=name.upper(), help=field.description)
+    """Add where the service is."""
+    _add_settings(parser, ClientConfig, ("connect", "prefix", "zenoh_config"))
 
 
 def add_service_flags(parser: argparse.ArgumentParser) -> None:
-    """Every setting of the service."""
+    """Add every setting of the service."""
     parser.add_argument("--config", type=Path, metavar="FILE", help="settings as TOML")
-    for name, field in ServiceConfig.model_fields.items():
-        flag = "--" + name.replace("_", "-")
-        parser.add_argument(flag, metavar=name.upper(), help=f"{field.description} Default: {field.default}")
+    _add_settings(parser, ServiceConfig, tuple(ServiceConfig.model_fields))
+
+
+def _add_settings(
+    parser: argparse.ArgumentParser, kind: type[ServiceConfig] | type[ClientConfig], names: tuple[str, ...]
+) -> None:
+    for name in names:
+        field = kind.model_fields[name]
+        about = f"{field.description} Default: {_default_text(field.default)}.".replace("%", "%%")
+        parser.add_argument("--" + name.replace("_", "-"), metavar=name.upper(), help=about)
+
+
+def _default_text(value: object) -> str:
+    """A default as people write it."""
+    if value is None or value == ():
+        return "none"
+    return ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
 
 
 def client_config(args: argparse.Namespace) -> ClientConfig:
-    """Settings of a client, and its log made ready."""
+    """The settings of a client; configures its log."""
     config, _ = load(ClientConfig, flags(args, ClientConfig))
     logs.configure(config.log_level if "NEUROVE_LOG_LEVEL" in os.environ else "warning")
     return config
 
 
 def flags(args: argparse.Namespace, kind: type[ServiceConfig] | type[ClientConfig]) -> dict[str, Any]:
-    """What the command line says of these settings; None where it says nothing."""
+    """The settings that the command line gives; None for each that it does not give."""
     return {name: getattr(args, name, None) for name in kind.model_fields}
 
 
 def sensor_size(text: str) -> Sensor:
-    """WIDTHxHEIGHT."""
+    """A sensor size from the text WIDTHxHEIGHT."""
     width, _, height = text.partition("x")
     try:
         return Sensor(int(width), int(height))
@@ -76,7 +102,7 @@ def sensor_size(text: str) -> Sensor:
 
 
 def speed(text: str) -> float:
-    """A factor above 0, or max, which is infinity."""
+    """A factor above 0, or infinity for the text max."""
     try:
         factor = math.inf if text in ("max", "inf") else float(text)
     except ValueError:
@@ -87,7 +113,7 @@ def speed(text: str) -> float:
 
 
 def seconds(text: str) -> float:
-    """Seconds above 0."""
+    """A number of seconds above 0."""
     try:
         value = float(text)
     except ValueError:
@@ -98,7 +124,7 @@ def seconds(text: str) -> float:
 
 
 def commit() -> str:
-    """The commit of the code that runs, with a + where it was changed since; or the version of the package."""
+    """The commit of the running code, with a + after local changes; outside a git checkout the package's version."""
     import importlib.metadata
     import subprocess
 

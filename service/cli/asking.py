@@ -1,4 +1,4 @@
-"""The commands that ask a running service: watch, health, models."""
+"""The commands that query a running service: watch, health, models."""
 
 import argparse
 import contextlib
@@ -11,13 +11,14 @@ from typing import Any
 from neurove_protocol import TwistEstimate
 from neurove_protocol.codec import MessageT
 from neurove_protocol.control import StreamStatus
-from neurove_service.cli.arguments import BAD_NEWS, add_client_flags, client_config, command
+from neurove_protocol.errors import EXIT_FAILURE
+from neurove_service.cli.arguments import add_client_flags, client_config, command
 from neurove_service.config import ClientConfig
 from neurove_service.lifecycle import stop_on_signals
 
 
 def watch(args: argparse.Namespace) -> int:
-    """Live estimates of all streams."""
+    """Show live estimates of all streams."""
     from neurove_service.clients import ask
 
     stop = stop_on_signals()
@@ -38,17 +39,17 @@ def _watch_lines(args: argparse.Namespace, config: ClientConfig, transport: Any,
 
     estimates: queue.SimpleQueue[TwistEstimate] = queue.SimpleQueue()
     ask.listen(transport, config, estimates.put, _ignore_status)
-    shown = 0
-    while not stop.is_set() and shown < args.count:
+    printed = 0
+    while not stop.is_set() and (args.count is None or printed < args.count):
         with contextlib.suppress(queue.Empty):
             estimate = estimates.get(timeout=0.2)
             print(estimate.model_dump_json() if args.json else _line(estimate), flush=True)
-            shown += 1
+            printed += 1
     return 0
 
 
 def _ignore_status(_: StreamStatus) -> None:
-    """Lines show estimates only."""
+    """The lines show estimates only."""
 
 
 def _line(estimate: TwistEstimate) -> str:
@@ -72,34 +73,34 @@ def _watch_table(config: ClientConfig, transport: Any, stop: threading.Event) ->
 
 
 def health(args: argparse.Namespace) -> int:
-    """How every node is."""
+    """Show the health of every node."""
     from neurove_service.cli import views
     from neurove_service.clients import ask
 
-    replies = _asked(args, ask.health, views.health_table)
-    return 0 if all(reply.ok for reply in replies) else BAD_NEWS
+    replies = _query(args, ask.health, views.health_table)
+    return 0 if all(reply.ok for reply in replies) else EXIT_FAILURE
 
 
 def models(args: argparse.Namespace) -> int:
-    """Which models every node has."""
+    """List the models of every node."""
     from neurove_service.cli import views
     from neurove_service.clients import ask
 
-    _asked(args, ask.models, views.models_table)
+    _query(args, ask.models, views.models_table)
     return 0
 
 
-def _asked(
+def _query(
     args: argparse.Namespace,
-    question: Callable[[Any, ClientConfig, str], list[MessageT]],
+    query: Callable[[Any, ClientConfig, str], list[MessageT]],
     table: Callable[[list[MessageT]], Any],
 ) -> list[MessageT]:
-    """Every node's reply to a question, printed."""
+    """Query the nodes, print their replies and return them."""
     from neurove_service.clients import ask
 
     config = client_config(args)
     with ask.connect(config) as transport:
-        replies = question(transport, config, args.node)
+        replies = query(transport, config, args.node)
     if args.json:
         print(json.dumps([reply.model_dump() for reply in replies]))
     else:
@@ -109,12 +110,22 @@ def _asked(
     return replies
 
 
-def add(commands: Any) -> None:
-    """Add these commands to the parser."""
-    parser = command(commands, "watch", watch)
+def add_watch(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `neurove watch`."""
+    add_client_flags(command(parser, watch))
+    parser.add_argument("--count", type=int, metavar="N", help="end after N lines; default: until Ctrl-C")
+
+
+def add_health(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `neurove health`."""
+    _add_query(command(parser, health))
+
+
+def add_models(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `neurove models`."""
+    _add_query(command(parser, models))
+
+
+def _add_query(parser: argparse.ArgumentParser) -> None:
     add_client_flags(parser)
-    parser.add_argument("--count", type=int, default=sys.maxsize, metavar="N", help="end after so many lines")
-    for name, run in (("health", health), ("models", models)):
-        parser = command(commands, name, run)
-        add_client_flags(parser)
-        parser.add_argument("--node", default="*", help="one node; default all")
+    parser.add_argument("--node", default="*", help="name of one node; default: all nodes")

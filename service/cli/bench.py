@@ -1,4 +1,4 @@
-"""The command bench: how fast this is on this machine, as ratios of one run."""
+"""The command bench: speed on this machine, as ratios within one run."""
 
 import argparse
 import json
@@ -8,10 +8,10 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from neurove_protocol.errors import NeuroVEError
-from neurove_service.cli.arguments import BAD_NEWS, command, commit
+from neurove_protocol.errors import EXIT_FAILURE, NeuroVEError
+from neurove_service.cli.arguments import command, commit
 
 if TYPE_CHECKING:
     from neurove_core.bench import Row
@@ -31,11 +31,11 @@ ALL = (
 )
 
 NARROW = {"ONEDNN_MAX_CPU_ISA": "AVX2", "ATEN_CPU_CAPABILITY": "avx2", "NUMBA_CPU_NAME": "haswell"}
-"""What makes an x86-64 machine compute as one without AVX-512 and AMX; read when the libraries are loaded."""
+"""Variables that restrict an x86-64 machine to AVX2; the libraries read them when they are loaded."""
 
 
 def bench(args: argparse.Namespace) -> int:
-    """Speed, ours and the peers' in one process: the same input, interleaved, and the answers compared."""
+    """Measure our speed and the peers' in one process: same input, interleaved runs, answers compared."""
     import torch
 
     from neurove_core.bench import chart, machine
@@ -43,21 +43,21 @@ def bench(args: argparse.Namespace) -> int:
     torch.set_num_threads(1)
     stamp = machine.stamp(commit())
     print(stamp, file=sys.stderr)
-    found: list[Row] = []
+    rows: list[Row] = []
     missing: list[str] = []
     for name in args.what or ALL:
         for row in _rows(name, args, missing):
-            found.append(row)
+            rows.append(row)
             if not args.json:
                 print(_sentence(row), flush=True)
     if missing:
-        print(f"not measured, for they could not be loaded: {'; '.join(dict.fromkeys(missing))}", file=sys.stderr)
+        print(f"not measured: {'; '.join(dict.fromkeys(missing))}", file=sys.stderr)
     if args.json:
-        print(json.dumps([row._asdict() for row in found]))
+        print(json.dumps([row._asdict() for row in rows]))
     if args.plot:
-        for file in chart.save(found, stamp, args.plot):
+        for file in chart.save(rows, stamp, args.plot):
             print(f"wrote {file}", file=sys.stderr)
-    return BAD_NEWS if any(row.equal is False for row in found) else 0
+    return EXIT_FAILURE if any(row.equal is False for row in rows) else 0
 
 
 def _rows(name: str, args: argparse.Namespace, missing: list[str]) -> Iterator["Row"]:
@@ -82,15 +82,15 @@ def _rows(name: str, args: argparse.Namespace, missing: list[str]) -> Iterator["
 
 
 def _narrow(args: argparse.Namespace, missing: list[str]) -> "list[Row]":
-    """The benchmark `window` in a process that sees no wider instruction sets than AVX2.
+    """Run the benchmark `window` in a process that uses AVX2 at most.
 
     Raises:
-        NeuroVEError: it could not be run; its own reason has gone to stderr.
+        NeuroVEError: the process failed; it printed its reason to stderr.
     """
     from neurove_core.bench import Row
 
     if platform.machine().lower() not in ("x86_64", "amd64"):
-        missing.append(f"narrow (this machine is {platform.machine()}, AVX2 is x86-64's)")
+        missing.append(f"narrow (this machine is {platform.machine()}, AVX2 exists on x86-64 only)")
         return []
     flags = [flag for flag, given in (("--peers", args.peers), ("--quick", args.quick)) if given]
     command = [sys.executable, "-m", "neurove_service.cli", "bench", "window", "--json", *flags]
@@ -98,7 +98,7 @@ def _narrow(args: argparse.Namespace, missing: list[str]) -> "list[Row]":
     try:
         found = [Row(**row) for row in json.loads(run.stdout)]
     except (ValueError, TypeError):
-        raise NeuroVEError(f"bench narrow: its process ended with {run.returncode}") from None
+        raise NeuroVEError(f"bench narrow: its process ended with exit code {run.returncode}") from None
     return [row._replace(name=f"{row.name}, AVX2 at most") for row in found]
 
 
@@ -107,16 +107,25 @@ def _rounds(args: argparse.Namespace, usual: int) -> int:
 
 
 def _sentence(row: "Row") -> str:
-    agree = {True: "equal answers", False: "DIFFERENT ANSWERS", None: "another computation by design"}[row.equal]
+    agree = {True: "equal answers", False: "DIFFERENT ANSWERS", None: "a different computation by design"}[row.equal]
     share = "" if row.share_of_limit is None else f", {row.share_of_limit:.0%} of this machine's limit"
     against = f"{row.ratio:.2f} times as fast as {row.peer} ({row.peer_ms:.3g} ms; {agree})"
     return f"{row.name}: {row.ours_ms:.3g} ms{share}; {against}"
 
 
-def add(commands: Any) -> None:
-    """Add the command to the parser."""
-    parser = command(commands, "bench", bench)
-    parser.add_argument("what", nargs="*", choices=[*ALL, []], metavar="WHAT", help=f"of {', '.join(ALL)}; default all")
-    parser.add_argument("--peers", action="store_true", help="measure the peers of the extra `bench` too")
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="a chart, as FILE.png and FILE.svg")
-    parser.add_argument("--quick", action="store_true", help="tiny and once: are answers equal? Its times mean nothing")
+def add_bench(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `neurove bench`."""
+    command(parser, bench)
+    names = ", ".join(ALL)
+    parser.add_argument("what", nargs="*", type=_benchmark, metavar="WHAT", help=f"any of {names}; default: all")
+    parser.add_argument("--peers", action="store_true", help="measure the peers of the extra 'bench' too")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw a chart as FILE.png and FILE.svg")
+    parser.add_argument(
+        "--quick", action="store_true", help="small input, once, to compare the answers; its times mean nothing"
+    )
+
+
+def _benchmark(text: str) -> str:
+    if text not in ALL:
+        raise argparse.ArgumentTypeError(f"unknown benchmark {text!r}; known are {', '.join(ALL)}")
+    return text

@@ -1,6 +1,6 @@
-"""The commands of model bundles, which need no service: model new, average, inspect, keygen, sign, verify.
+"""The command bundle, which needs no service: new, average, inspect, keygen, sign, verify.
 
-Exit codes: 0 fine; 1 the model or its signature does not hold; 2 wrong usage, such as a missing file.
+Exit codes: 0 fine; 1 the bundle or its signature is not valid; 2 wrong usage, such as a missing file.
 """
 
 import argparse
@@ -11,20 +11,20 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurove_core import self_test
-from neurove_protocol.errors import BadModel, InvalidField, Untrusted
-from neurove_service.cli.arguments import BAD_NEWS, Command, command
-from neurove_service.cli.bundle_views import about, release_told, told
+from neurove_protocol.errors import EXIT_FAILURE, BadModel, InvalidField, Untrusted
+from neurove_service.cli.arguments import Run, subcommand
+from neurove_service.cli.bundle_views import fields, lines, release_line
+from neurove_service.cli.parser import Parser
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 
-def _judging(run: Command) -> Command:
-    """A command that says why a model or its signature does not hold, and then ends with 1."""
+def _checking(run: Run) -> Run:
+    """A command that reports why a bundle or its signature is not valid, and then ends with exit code 1."""
 
     @functools.wraps(run)
-    def judged(args: argparse.Namespace) -> int:
+    def checked(args: argparse.Namespace) -> int:
         try:
             return run(args)
         except (BadModel, Untrusted) as error:
@@ -32,41 +32,41 @@ def _judging(run: Command) -> Command:
                 print(json.dumps({"ok": False, "code": error.code, "message": error.message, **error.details}))
             else:
                 print(f"neurove: {error.message}", file=sys.stderr)
-            return BAD_NEWS
+            return EXIT_FAILURE
 
-    return judged
+    return checked
 
 
-def new_model(args: argparse.Namespace) -> int:
-    """Write a bundle with random weights, to try a change of model with."""
+def new(args: argparse.Namespace) -> int:
+    """Write a bundle with random weights, for trials of a model change."""
     from neurove_core.models import bundle
 
     path: Path = args.file
     if path.suffix != bundle.SUFFIX:
-        raise InvalidField("model new", "FILE", str(path), f"its name must end in {bundle.SUFFIX}")
+        raise InvalidField("bundle new", "FILE", str(path), f"its name must end in {bundle.SUFFIX}")
     made = bundle.untrained(args.seed, name=path.stem)
     try:
         bundle.save(made, path)
     except OSError as error:
-        raise InvalidField("model new", "FILE", str(path), error.strerror or str(error)) from None
+        raise InvalidField("bundle new", "FILE", str(path), error.strerror or str(error)) from None
     print(f"{path}: {made.name}, {made.digest[:12]}, untrained")
     return 0
 
 
-@_judging
-def average_models(args: argparse.Namespace) -> int:
-    """Write the mean of several trainings of one model; calibrate it, for its errors are its own."""
+@_checking
+def average(args: argparse.Namespace) -> int:
+    """Write the mean of several trainings of one model; calibrate it next, because its errors differ."""
     from neurove_core.models import bundle
-    from neurove_core.training.averaging import average
+    from neurove_core.training import averaging
 
     path: Path = args.out
     if path.suffix != bundle.SUFFIX:
-        raise InvalidField("model average", "out", str(path), f"its name must end in {bundle.SUFFIX}")
-    made = average([bundle.from_bytes(_bundle(file), file.name) for file in args.files])
+        raise InvalidField("bundle average", "--out", str(path), f"its name must end in {bundle.SUFFIX}")
+    made = averaging.average([bundle.from_bytes(_bundle(file), file.name) for file in args.files])
     try:
         bundle.save(made, path)
     except OSError as error:
-        raise InvalidField("model average", "out", str(path), error.strerror or str(error)) from None
+        raise InvalidField("bundle average", "--out", str(path), error.strerror or str(error)) from None
     if args.json:
         print(json.dumps({"ok": True, "bundle": str(path), "digest": made.digest}))
     else:
@@ -74,9 +74,9 @@ def average_models(args: argparse.Namespace) -> int:
     return 0
 
 
-@_judging
-def inspect_model(args: argparse.Namespace) -> int:
-    """What a bundle's file holds: header, tensors, digest, size, and who signed it."""
+@_checking
+def inspect(args: argparse.Namespace) -> int:
+    """Show what a bundle holds: header, tensors, digest, size and signature."""
     from neurove_core.models import bundle, manifest
 
     data, signature = _bundle(args.file), _signature(args.file)
@@ -88,69 +88,70 @@ def inspect_model(args: argparse.Namespace) -> int:
             signed = manifest.verify(data, signature, trusted) if trusted else manifest.read(signature)
             state = {"state": "valid" if trusted else "unchecked", **signed.model_dump()}
         except Untrusted as error:
-            state = {"state": "refused", "reason": error.details["reason"], "why": error.message.partition(": ")[2]}
-    everything = about(found, data) | {"signature": state}
-    print(json.dumps(everything) if args.json else "\n".join(told(everything)))
-    return BAD_NEWS if state["state"] == "refused" else 0
+            state = {"state": "refused", "reason": error.details["reason"], "why": error.why}
+    everything = fields(found, data) | {"signature": state}
+    print(json.dumps(everything) if args.json else "\n".join(lines(everything)))
+    return EXIT_FAILURE if state["state"] == "refused" else 0
 
 
 def keygen(args: argparse.Namespace) -> int:
-    """Make a pair of keys: the private one signs models, nodes trust the public one."""
+    """Make a pair of keys: the private key signs bundles, nodes trust the public key."""
     from neurove_core.models import signing_keys
 
     key = signing_keys.new()
     private, public = args.out / f"{args.name}.key", args.out / f"{args.name}.pub"
     for path in (private, public):
         if path.exists():
-            raise InvalidField("model keygen", "file", str(path), "it is there already, and a key is never overwritten")
+            raise InvalidField("bundle keygen", "file", str(path), "the file exists, and a key is never overwritten")
     try:
         args.out.mkdir(parents=True, exist_ok=True)
         _write_new(private, signing_keys.private_pem(key), 0o600)
         _write_new(public, signing_keys.public_pem(key.public_key()), 0o644)
     except OSError as error:
-        raise InvalidField("model keygen", "--out", str(args.out), error.strerror or str(error)) from None
+        raise InvalidField("bundle keygen", "--out", str(args.out), error.strerror or str(error)) from None
     made = {"key_id": signing_keys.key_id(key.public_key()), "private": str(private), "public": str(public)}
     if args.json:
         print(json.dumps(made))
     else:
         print(f"key {made['key_id']}")
-        print(f"{private}: private, yours alone; who has it can sign models")
-        print(f"{public}: public, for those who are to trust it")
+        print(f"{private}: private; keep it secret: its owner can sign bundles")
+        print(f"{public}: public; give it to the nodes that are to trust you")
     return 0
 
 
-@_judging
-def sign_model(args: argparse.Namespace) -> int:
-    """Sign a bundle: writes BUNDLE.sig beside it."""
+@_checking
+def sign(args: argparse.Namespace) -> int:
+    """Sign a bundle: write BUNDLE.sig next to it."""
     from neurove_core.files import write_atomically
     from neurove_core.models import bundle, manifest, signing_keys
 
     key = signing_keys.read_private(_read(args.key, signing_keys.MAX_KEY_BYTES), str(args.key))
     data, path = _bundle(args.bundle), args.bundle.with_name(args.bundle.name + manifest.SUFFIX)
-    bundle.from_bytes(data, args.bundle.name)  # nobody vouches for what no node would load
+    bundle.from_bytes(data, args.bundle.name)  # sign nothing that no node would load
     signature = manifest.sign(data, key, release=args.release, allow_downgrade=args.allow_downgrade)
     try:
         write_atomically(path, signature)
     except OSError as error:
-        raise InvalidField("model sign", "file", str(path), error.strerror or str(error)) from None
+        raise InvalidField("bundle sign", "file", str(path), error.strerror or str(error)) from None
     signed = manifest.read(signature)
     if args.json:
         print(json.dumps({"file": str(path), **signed.model_dump()}))
     else:
-        print(f"{path}: {signed.name} {signed.sha256[:12]}, {release_told(signed.model_dump())}")
+        print(f"{path}: {signed.name} {signed.sha256[:12]}, {release_line(signed.model_dump())}")
     return 0
 
 
-@_judging
-def verify_model(args: argparse.Namespace) -> int:
-    """Whether a node that trusts these keys would take a bundle: signature, contents, golden test."""
+@_checking
+def verify(args: argparse.Namespace) -> int:
+    """Check that a node that trusts these keys would accept a bundle: signature, contents, golden test."""
+    from neurove_core import self_test
     from neurove_core.estimator import Estimator
     from neurove_core.models import bundle, manifest
 
     data, name = _bundle(args.bundle), args.bundle.name
     trusted, signature = [_public(path) for path in args.trust], _signature(args.bundle)
     if signature is None:
-        raise Untrusted(name, "unsigned", f"there is no {name}{manifest.SUFFIX} beside it")
+        raise Untrusted(name, "unsigned", f"there is no {name}{manifest.SUFFIX} next to it")
     signed = manifest.verify(data, signature, trusted, name)
     found = bundle.from_bytes(data, name)
     self_test.check(Estimator(found))
@@ -158,17 +159,17 @@ def verify_model(args: argparse.Namespace) -> int:
         print(json.dumps({"ok": True, **signed.model_dump(), "golden": found.golden is not None}))
     else:
         test = "its golden test holds" if found.golden else "it has no golden test"
-        print(f"{args.bundle}: good: {signed.name} {signed.sha256[:12]}, {release_told(signed.model_dump())}; {test}")
+        print(f"{args.bundle}: good: {signed.name} {signed.sha256[:12]}, {release_line(signed.model_dump())}; {test}")
     return 0
 
 
 def _read(path: Path, most: int) -> bytes:
-    """The bytes of a file that the command line names, one more than `most` at most; a missing one is wrong usage."""
+    """Read at most `most` + 1 bytes of a file that the command line names; a missing file is wrong usage."""
     try:
         with path.open("rb") as file:
             return file.read(most + 1)
     except OSError as error:
-        raise InvalidField("model", "file", str(path), error.strerror or str(error)) from None
+        raise InvalidField("bundle", "file", str(path), error.strerror or str(error)) from None
 
 
 def _bundle(path: Path) -> bytes:
@@ -181,7 +182,7 @@ def _bundle(path: Path) -> bytes:
 
 
 def _signature(path: Path) -> bytes | None:
-    """The bytes of the signature file beside a bundle, or None; one byte more than allowed where it is too large."""
+    """The bytes of a bundle's signature file, at most one more than allowed; None if there is no such file."""
     from neurove_core.models import manifest
 
     try:
@@ -190,7 +191,7 @@ def _signature(path: Path) -> bytes | None:
     except FileNotFoundError:
         return None
     except OSError as error:
-        raise InvalidField("model", "file", path.name + manifest.SUFFIX, error.strerror or str(error)) from None
+        raise InvalidField("bundle", "file", path.name + manifest.SUFFIX, error.strerror or str(error)) from None
 
 
 def _public(path: Path) -> "Ed25519PublicKey":
@@ -206,32 +207,35 @@ def _write_new(path: Path, data: bytes, mode: int) -> None:
         os.fsync(file.fileno())
 
 
-def add(commands: Any) -> None:
-    """Add these commands to the parser."""
-    parser = commands.add_parser("model", help="Model bundles.").add_subparsers(required=True, metavar="COMMAND")
-    trust = "public keys of those who may make models"
-    new = command(parser, "new", new_model, as_json=False)
-    new.add_argument("file", type=Path, metavar="FILE", help="bundle to write, ending in .safetensors")
-    new.add_argument("--seed", type=int, default=0, help="of the weights")
-    mean = command(parser, "average", average_models)
-    mean.add_argument("files", type=Path, nargs="+", metavar="FILE", help="bundles of one network, 2 to 8")
-    mean.add_argument("--out", type=Path, required=True, metavar="FILE", help="where to write the mean")
-    inspect = command(parser, "inspect", inspect_model)
-    inspect.add_argument("file", type=Path, metavar="BUNDLE", help="to read, and BUNDLE.sig where there is one")
-    inspect.add_argument("--trust", type=Path, action="extend", nargs="+", default=[], metavar="PUB", help=trust)
-    keys = command(parser, "keygen", keygen)
-    keys.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="folder to write them to; default here")
-    keys.add_argument(
-        "--name", type=_key_name, default="neurove", help="of the files; default neurove.key, neurove.pub"
-    )
-    sign = command(parser, "sign", sign_model)
-    sign.add_argument("bundle", type=Path, metavar="BUNDLE", help="to sign")
-    sign.add_argument("--key", type=Path, required=True, metavar="KEY", help="private key from `neurove model keygen`")
-    sign.add_argument("--release", type=_release, metavar="N", help="counter; default: the one in the bundle's header")
-    sign.add_argument("--allow-downgrade", action="store_true", help="nodes may take it after a higher release")
-    verify = command(parser, "verify", verify_model)
-    verify.add_argument("bundle", type=Path, metavar="BUNDLE", help="to check, with BUNDLE.sig beside it")
-    verify.add_argument("--trust", type=Path, action="extend", nargs="+", required=True, metavar="PUB", help=trust)
+def add_bundle(parser: Parser) -> None:
+    """Add the commands of `neurove bundle`."""
+    commands = parser.add_commands()
+    one = subcommand(commands, "new", new, as_json=False)
+    one.add_argument("file", type=Path, metavar="FILE", help="bundle to write, ending in .safetensors")
+    one.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the weights; default 0")
+    one = subcommand(commands, "inspect", inspect)
+    one.add_argument("file", type=Path, metavar="BUNDLE", help="bundle to show, with BUNDLE.sig if it exists")
+    _add_trust(one, default=[])
+    one = subcommand(commands, "average", average)
+    one.add_argument("files", type=Path, nargs="+", metavar="BUNDLE", help="2 to 8 bundles of one network")
+    one.add_argument("--out", type=Path, required=True, metavar="FILE", help="bundle to write")
+    one = subcommand(commands, "sign", sign)
+    one.add_argument("bundle", type=Path, metavar="BUNDLE", help="bundle to sign")
+    one.add_argument("--key", type=Path, required=True, metavar="KEY", help="private key from `neurove bundle keygen`")
+    one.add_argument("--release", type=_release, metavar="N", help="release counter; default: that of the bundle")
+    one.add_argument("--allow-downgrade", action="store_true", help="let nodes accept it after a higher release")
+    one = subcommand(commands, "verify", verify)
+    one.add_argument("bundle", type=Path, metavar="BUNDLE", help="bundle to check, with BUNDLE.sig next to it")
+    _add_trust(one, required=True)
+    one = subcommand(commands, "keygen", keygen)
+    one.add_argument("--out", type=Path, default=Path(), metavar="DIR", help="folder to write to; default: this folder")
+    about = "name of the two files; default neurove: neurove.key and neurove.pub"
+    one.add_argument("--name", type=_key_name, default="neurove", help=about)
+
+
+def _add_trust(parser: argparse.ArgumentParser, **options: Any) -> None:
+    about = "public keys whose signatures are accepted"
+    parser.add_argument("--trust", type=Path, action="extend", nargs="+", metavar="PUB", help=about, **options)
 
 
 def _release(text: str) -> int:

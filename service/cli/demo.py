@@ -1,4 +1,4 @@
-"""The main job on one machine: a driver, the service and a consumer, three processes joined by Zenoh on loopback."""
+"""The demo: a driver, the service and a consumer on one machine, three processes joined by Zenoh on loopback."""
 
 import contextlib
 import io
@@ -35,7 +35,7 @@ _POLL_S = 0.1
 
 
 class DemoFailed(NeuroVEError):
-    """One of the demo's processes ended before its time."""
+    """One of the demo's processes ended early."""
 
     code = "demo"
     exit_code = EXIT_FAILURE
@@ -54,22 +54,25 @@ def run(
     console: Console,
     screenshot: str | None = None,
 ) -> dict[str, Any]:
-    """Play a source through the whole service and tell what came of it.
+    """Run driver, service and consumer on any source, and return a summary.
 
     Args:
         source: as io.open_source.
-        sensor: WIDTHxHEIGHT, where the source lacks it.
+        sensor: WIDTHxHEIGHT, if the source lacks it.
         topic: as io.open_source.
         speed: as `neurove drive --speed`.
-        loop: play it again at its end.
-        duration_s: sensor time to play; infinity until its end or the stop event.
+        loop: start again at the end.
+        duration_s: sensor time to play [s]; infinity: until the source ends or the stop event.
         model: as `neurove serve --model`.
         stop: ends the demo early.
-        console: where the live table goes; drawn on a terminal only.
-        screenshot: SVG file for the last table.
+        console: receives the live table, if it is a terminal.
+        screenshot: SVG file to write the last table to.
+
+    Returns:
+        counts, losses, latency and model, as `neurove demo --json` prints them.
 
     Raises:
-        DemoFailed: the service or the driver ended with an error; its own lines are on stderr.
+        DemoFailed: the service or the driver ended with an error, which it printed to stderr.
     """
     endpoint = f"tcp/127.0.0.1:{_free_port()}"
     config = ClientConfig(connect=(endpoint,))
@@ -79,7 +82,7 @@ def run(
     drive += ["--sensor", sensor] if sensor else []
     drive += ["--topic", topic] if topic else []
     drive += ["--loop"] if loop else []
-    drive += ["--duration", str(duration_s)] if math.isfinite(duration_s) else []
+    drive += ["--seconds", str(duration_s)] if math.isfinite(duration_s) else []
     with _process(*serve) as service, _session(config, service, stop, console) as transport:
         ask.listen(transport, config, board.on_estimate, board.on_status)
         with _process(*drive, stdout=subprocess.PIPE) as driver:
@@ -101,7 +104,7 @@ def _free_port() -> int:
 
 @contextlib.contextmanager
 def _process(*arguments: str, stdout: int | None = None) -> Iterator[subprocess.Popen[str]]:
-    """One of our commands as a child that ends with the block, and with us if we are killed."""
+    """Run one of our commands as a child process that ends with the block, and with this process if it is killed."""
     command = [sys.executable, "-m", "neurove_service.cli", *arguments, "--with-parent"]
     quiet = {name: value for name, value in os.environ.items() if not name.startswith(ENVIRONMENT)}
     quiet |= {f"{ENVIRONMENT}LOG_LEVEL": "warning"}
@@ -130,7 +133,7 @@ def _process(*arguments: str, stdout: int | None = None) -> Iterator[subprocess.
 def _session(
     config: ClientConfig, service: subprocess.Popen[str], stop: threading.Event, console: Console
 ) -> Iterator[Transport]:
-    """A session with the service, as soon as it is up."""
+    """A session with the service, once it answers."""
     with console.status("starting the service") if console.is_terminal else contextlib.nullcontext():
         transport = _connected(config, service, stop)
     with transport:
@@ -147,7 +150,7 @@ def _connected(config: ClientConfig, service: subprocess.Popen[str], stop: threa
             transport.close()
         stop.wait(_POLL_S)
     if stop.is_set():
-        raise DemoFailed("stopped before the service was up")
+        raise DemoFailed("stopped before the service had started")
     raise DemoFailed(
         f"the service did not start within {_START_S:.0f} s" if service.poll() is None else "the service ended"
     )
@@ -164,7 +167,7 @@ def _show(board: Board, console: Console, running: Any, stop: threading.Event) -
 
 
 def _sent(driver: subprocess.Popen[str], stop: threading.Event) -> dict[str, Any]:
-    """The driver's own account, after asking it to end; of nothing if we stopped it before it began."""
+    """The driver's own summary, after a request to end; an empty one if it had not started yet."""
     driver.terminate()
     out, _ = driver.communicate(timeout=_END_S)
     try:
@@ -178,7 +181,7 @@ def _sent(driver: subprocess.Popen[str], stop: threading.Event) -> dict[str, Any
 def _drained(
     transport: Transport, config: ClientConfig, sent: dict[str, Any], stop: threading.Event
 ) -> StreamStatus | None:
-    """The service's account of the stream, once it has seen all that was sent or some seconds have passed."""
+    """The status of the stream, once the service has received all that was sent or a few seconds have passed."""
     deadline = time.monotonic() + (_POLL_S if stop.is_set() else _DRAIN_S)
     status: StreamStatus | None = None
     while time.monotonic() < deadline:
@@ -192,7 +195,7 @@ def _drained(
 
 
 def _draw(board: Board, file: str) -> None:
-    """The last table as a picture that needs nothing from the network."""
+    """Write the last table as a picture that loads nothing from the network."""
     console = Console(record=True, width=100, file=io.StringIO())
     console.print(board)
     svg = console.export_svg(title="neurove demo")
@@ -200,29 +203,29 @@ def _draw(board: Board, file: str) -> None:
 
 
 def _summary(source: str, sent: dict[str, Any], status: StreamStatus | None, board: Board) -> dict[str, Any]:
-    heard = board.of(STREAM)
+    received = board.of(STREAM)
     lost = status.lost.nonzero() if status else {}
-    received = status.packets_received if status else 0
-    undelivered = sent["packets"] - received - sum(lost.get(name, 0) for name in _PACKET_LOSSES)
+    packets = status.packets_received if status else 0
+    undelivered = sent["packets"] - packets - sum(lost.get(name, 0) for name in _PACKET_LOSSES)
     lost |= {"undelivered_packets": undelivered} if undelivered > 0 else {}
-    missed = (status.estimates if status else 0) - heard.count
+    missed = (status.estimates if status else 0) - received.count
     lost |= {"estimates": missed} if missed > 0 else {}
-    numbers = latency(heard.latencies_ms)
+    numbers = latency(received.latencies_ms)
     return {
         "source": source,
         "sensor": sent["sensor"],
         "packets_sent": sent["packets"],
-        "packets_received": received,
+        "packets_received": packets,
         "events_sent": sent["events"],
         "events_received": status.events_received if status else 0,
         "windows": status.windows if status else 0,
-        "estimates": heard.count,
+        "estimates": received.count,
         "lost": lost,
         "latency_ms": {name: round(value, 3) for name, value in numbers.model_dump().items()} if numbers else None,
-        "rate_hz": round(heard.mean_rate_hz, 3),
-        "model": heard.last.model if heard.last else None,
-        "model_digest": heard.last.digest if heard.last else None,
-        "trained": bool(heard.last and Flag.UNTRAINED not in heard.last.flags),
+        "rate_hz": round(received.mean_rate_hz, 3),
+        "model": received.last.model if received.last else None,
+        "model_digest": received.last.digest if received.last else None,
+        "trained": bool(received.last and Flag.UNTRAINED not in received.last.flags),
         "broken": sent["broken"],
     }
 

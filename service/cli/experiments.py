@@ -1,4 +1,4 @@
-"""The commands of experiments, which need no service: reproduce."""
+"""The command reproduce, which repeats experiments and needs no service."""
 
 import argparse
 import json
@@ -7,12 +7,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from neurove_service.cli.arguments import command, commit
+from neurove_protocol.errors import EXIT_FAILURE
+from neurove_service.cli.arguments import commit, subcommand
 from neurove_service.cli.bars import progress
+from neurove_service.cli.parser import Parser
 
 
 def reproduce_firing(args: argparse.Namespace) -> int:
-    """How often ALIF, LIF and LTC fire under one random current."""
+    """Compare how often ALIF, LIF and LTC fire under one random current."""
     from neurove_core.experiments import firing
 
     report = firing.run(args.seed)
@@ -24,32 +26,32 @@ def reproduce_firing(args: argparse.Namespace) -> int:
 
 
 def reproduce_repriming(args: argparse.Namespace) -> int:
-    """How settled a model's first estimates are after a change of model."""
+    """Measure how settled the first estimates are after a model change."""
     from neurove_core.experiments import repriming
 
-    told = sys.stderr.isatty()
+    on_terminal = sys.stderr.isatty()
     report = repriming.run(
         args.model,
         args.streets,
         args.primed or repriming.PRIMED,
-        progress=lambda name: print(name, file=sys.stderr) if told else None,
+        progress=lambda name: print(name, file=sys.stderr) if on_terminal else None,
     )
     files = repriming.save(report, args.out) if args.out else []
     print(repriming.to_json(report) if args.json else repriming.to_markdown(report), end="")
     for file in files:
         print(f"wrote {file}", file=sys.stderr)
-    return 0 if report.least_primed is not None else 1
+    return 0 if report.least_primed is not None else EXIT_FAILURE
 
 
 def reproduce_sine(args: argparse.Namespace) -> int:
-    """Tables I and II: regression and forecast of a sine by ASLSTM, ASLSTM-w/o, SLSTM and LTC."""
+    """Repeat Tables I and II: regression and forecast of a sine by ASLSTM, ASLSTM-w/o, SLSTM and LTC."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     from neurove_core.experiments.sine import report as sine_report
 
     models, seeds = args.models.split(","), range(args.seed, args.seed + args.seeds)
-    typed, made_by = shlex.join(["neurove", *sys.argv[1:]]), commit()
+    command_line, made_by = shlex.join(["neurove", *sys.argv[1:]]), commit()
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
         tasks: dict[tuple[str, int], Any] = {}
@@ -65,7 +67,7 @@ def reproduce_sine(args: argparse.Namespace) -> int:
         for run in sine_report.reproduce(models, seeds, changes=dict(args.set), quick=args.quick, progress=progress):
             runs.append(run)
             if args.out:
-                files |= dict.fromkeys(sine_report.save_run(runs, args.out, command=typed, commit=made_by))
+                files |= dict.fromkeys(sine_report.save_run(runs, args.out, command=command_line, commit=made_by))
     if args.out:
         files |= dict.fromkeys(sine_report.save(runs, args.out))
     figures = [run.figures for run in runs]
@@ -77,7 +79,7 @@ def reproduce_sine(args: argparse.Namespace) -> int:
 
 
 def reproduce_real(args: argparse.Namespace) -> int:
-    """What a model makes of real events that nobody tuned it on."""
+    """Check a model on real events that it was not tuned on."""
     from neurove_core.experiments import real
 
     rows, about = _real_rows(args.model, args.recordings, args.out)
@@ -86,7 +88,11 @@ def reproduce_real(args: argparse.Namespace) -> int:
 
 
 def _real_rows(model: str, recordings: Path, out: Path | None) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """All checks of a model, told one by one as they are made, and how they were made; written into `out`."""
+    """Run all checks of a model, print the name of each, and write them into `out`.
+
+    Returns:
+        the checks, and the model, command and commit that made them.
+    """
     import torch
 
     from neurove_core import models
@@ -106,7 +112,7 @@ def _real_rows(model: str, recordings: Path, out: Path | None) -> tuple[list[dic
 
 
 def reproduce_velocity(args: argparse.Namespace) -> int:
-    """Tables III and IV: velocity by NeuroVE, NeuroVE w/o, its equal in ANN, SNN-ANG, and what learns nothing."""
+    """Repeat Tables III and IV: velocity by NeuroVE, NeuroVE w/o, ANN, SNN-ANG and baselines that do not learn."""
     import torch
 
     from neurove_core.experiments.velocity import figures as velocity_figures
@@ -123,11 +129,11 @@ def reproduce_velocity(args: argparse.Namespace) -> int:
     with progress() as show:
         for one in velocity.reproduce(plan, folder, out, show, args.workers):
             found.append(one)
-            show("judged", len(found), len(plan.methods) * len(seeds), f"{one.row['method']} seed {one.row['seed']}")
-    told = _made_by() | velocity.results(plan, folder, found)
-    print(json.dumps(told) if args.json else velocity_report.markdown(told), end="")
+            show("evaluated", len(found), len(plan.methods) * len(seeds), f"{one.row['method']} seed {one.row['seed']}")
+    report = _made_by() | velocity.results(plan, folder, found)
+    print(json.dumps(report) if args.json else velocity_report.markdown(report), end="")
     tracks = {one.row["method"]: one.tracks for one in reversed(found)}
-    for file in [*velocity_report.save(told, out), *velocity_figures.save(told, tracks, out)]:
+    for file in [*velocity_report.save(report, out), *velocity_figures.save(report, tracks, out)]:
         print(f"wrote {file}", file=sys.stderr)
     if args.recordings:
         _real_rows("default", args.recordings, out)
@@ -135,7 +141,7 @@ def reproduce_velocity(args: argparse.Namespace) -> int:
 
 
 def _made_by() -> dict[str, str]:
-    """The command as it was typed, and the code's commit."""
+    """The command line and the commit of the code."""
     return {"command": shlex.join(["neurove", *sys.argv[1:]]), "commit": commit()}
 
 
@@ -143,57 +149,83 @@ def _numbers(text: str) -> tuple[int, ...]:
     try:
         return tuple(int(part) for part in text.split(","))
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r}: whole numbers joined by commas") from None
+        raise argparse.ArgumentTypeError(f"{text!r}: give whole numbers separated by commas") from None
 
 
 def _assignment(text: str) -> tuple[str, str]:
     field, separator, value = text.partition("=")
     if not separator:
-        raise argparse.ArgumentTypeError(f"{text!r}: FIELD=VALUE is expected")
+        raise argparse.ArgumentTypeError(f"{text!r}: give FIELD=VALUE")
     return field, value
 
 
-def add(commands: Any) -> None:
-    """Add these commands to the parser."""
-    parser = commands.add_parser("reproduce", help="The paper's experiments.").add_subparsers(required=True)
-    firing = command(parser, "firing", reproduce_firing)
-    firing.add_argument("--seed", type=int, default=0, help="of the first of ten runs; default 0")
-    firing.add_argument("--out", type=Path, metavar="DIR", help="write table and figure (PNG, SVG) into this folder")
-    repriming = command(parser, "repriming", reproduce_repriming)
-    repriming.add_argument("--model", default="default", help="name of a built-in model, or a bundle's file")
-    repriming.add_argument("--streets", type=int, default=6, metavar="N", help="so many held-out streets; default 6")
-    repriming.add_argument(
-        "--primed", type=_numbers, metavar="N,...", help="numbers of windows to replay; default 8,16,32,64"
-    )
-    repriming.add_argument("--out", type=Path, metavar="DIR", help="write table, figures and picture into this folder")
-    sine = command(parser, "sine", reproduce_sine)
-    sine.add_argument("--models", default="aslstm,aslstm-spiking,aslstm-wo,slstm,ltc", help="which, joined by commas")
-    sine.add_argument("--seed", type=int, default=0, help="the first seed; default 0")
-    sine.add_argument("--seeds", type=int, default=1, metavar="N", help="so many seeds, one after the other; default 1")
-    sine.add_argument(
-        "--set", type=_assignment, action="append", default=[], metavar="FIELD=VALUE", help="a trial: another recipe"
-    )
-    sine.add_argument("--quick", action="store_true", help="a few updates, to see that it runs: figures mean nothing")
-    sine.add_argument("--out", type=Path, metavar="DIR", help="write figures, tables, pictures and networks there")
-    real = command(parser, "real", reproduce_real)
-    real.add_argument("model", nargs="?", default="default", metavar="BUNDLE", help="a bundle's file; `default`")
-    real.add_argument("--recordings", type=Path, required=True, metavar="DIR", help="where the recordings lie")
-    real.add_argument("--out", type=Path, metavar="DIR", help="write real.json and real.md there")
-    _add_velocity(parser)
+def add_reproduce(parser: Parser) -> None:
+    """Add the commands of `neurove reproduce`."""
+    commands = parser.add_commands()
+    _add_firing(subcommand(commands, "firing", reproduce_firing))
+    _add_repriming(subcommand(commands, "repriming", reproduce_repriming))
+    _add_sine(subcommand(commands, "sine", reproduce_sine))
+    _add_real(subcommand(commands, "real", reproduce_real))
+    _add_velocity(subcommand(commands, "velocity", reproduce_velocity))
 
 
-def _add_velocity(parser: Any) -> None:
-    velocity = command(parser, "velocity", reproduce_velocity)
-    velocity.add_argument("--methods", default="nve,nve-wo,ann,snn-ang", help="which to train, joined by commas")
-    velocity.add_argument("--seed", type=int, default=0, help="the first seed; default 0")
-    velocity.add_argument("--seeds", type=int, default=1, metavar="N", help="so many, one after the other; default 1")
-    velocity.add_argument("--config", metavar="CONFIG", help="another recipe, a TOML file or a name")
-    velocity.add_argument("--steps", type=int, metavar="N", help="so many updates, not those of the configuration")
-    velocity.add_argument(
-        "--data", type=Path, metavar="DIR", help="simulated sequences are kept there; default OUT/data"
-    )
-    velocity.add_argument("--recordings", type=Path, metavar="DIR", help="where MVSEC's poses lie, for Table III")
-    velocity.add_argument("--out", type=Path, metavar="DIR", help="methods, tables, figures; default runs/velocity")
-    velocity.add_argument("--workers", type=int, default=1, metavar="N", help="processes that simulate; default 1")
-    velocity.add_argument("--threads", type=int, default=1, metavar="N", help="threads that learn; default 1")
-    velocity.add_argument("--quick", action="store_true", help="tiny networks and sequences, to see that it runs")
+def _add_firing(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the first of ten runs; default 0")
+    _add_out(parser, "folder for table and figure (PNG, SVG)")
+
+
+def _add_repriming(parser: argparse.ArgumentParser) -> None:
+    about = "name of a built-in model, or file of a bundle; default `default`"
+    parser.add_argument("--model", default="default", metavar="BUNDLE", help=about)
+    parser.add_argument("--streets", type=int, default=6, metavar="N", help="number of held-out streets; default 6")
+    about = "numbers of windows to replay; default 8,16,32,64"
+    parser.add_argument("--primed", type=_numbers, metavar="N,...", help=about)
+    _add_out(parser, "folder for table, figures and picture")
+
+
+def _add_sine(parser: argparse.ArgumentParser) -> None:
+    default = "aslstm,aslstm-spiking,aslstm-wo,slstm,ltc"
+    about = f"models to train, separated by commas; default {default}"
+    parser.add_argument("--models", default=default, metavar="MODEL,...", help=about)
+    _add_seeds(parser)
+    about = "change one field of the recipe; may be repeated"
+    parser.add_argument("--set", type=_assignment, action="append", default=[], metavar="FIELD=VALUE", help=about)
+    about = "a few updates, to check that the command works; its figures mean nothing"
+    parser.add_argument("--quick", action="store_true", help=about)
+    _add_out(parser, "folder for figures, tables, pictures and networks")
+
+
+def _add_real(parser: argparse.ArgumentParser) -> None:
+    about = "file of a bundle, or the name of a built-in model; default `default`"
+    parser.add_argument("model", nargs="?", default="default", metavar="BUNDLE", help=about)
+    parser.add_argument("--recordings", type=Path, required=True, metavar="DIR", help="folder of the recordings")
+    _add_out(parser, "folder for real.json and real.md")
+
+
+def _add_velocity(parser: argparse.ArgumentParser) -> None:
+    default = "nve,nve-wo,ann,snn-ang"
+    about = f"methods to train, separated by commas; default {default}"
+    parser.add_argument("--methods", default=default, metavar="METHOD,...", help=about)
+    _add_seeds(parser)
+    about = "another recipe, a TOML file or a name; default: that of the experiment"
+    parser.add_argument("--config", metavar="CONFIG", help=about)
+    about = "number of updates; default: that of the configuration"
+    parser.add_argument("--steps", type=int, metavar="N", help=about)
+    parser.add_argument("--data", type=Path, metavar="DIR", help="folder for the sequences; default OUT/data")
+    about = "folder with MVSEC's poses, for Table III"
+    parser.add_argument("--recordings", type=Path, metavar="DIR", help=about)
+    _add_out(parser, "folder for methods, tables and figures; default runs/velocity")
+    about = "number of processes that simulate; default 1"
+    parser.add_argument("--workers", type=int, default=1, metavar="N", help=about)
+    parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads that train; default 1")
+    about = "tiny networks and sequences, to check that the command works; its figures mean nothing"
+    parser.add_argument("--quick", action="store_true", help=about)
+
+
+def _add_seeds(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="first seed; default 0")
+    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="number of seeds; default 1")
+
+
+def _add_out(parser: argparse.ArgumentParser, about: str) -> None:
+    parser.add_argument("--out", type=Path, metavar="DIR", help=about)

@@ -1,1 +1,1 @@
-"""What talks to a service: queries, camera drivers, recorders."""
+"""Clients of a service: queries, camera drivers, recorders."""

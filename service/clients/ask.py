@@ -1,4 +1,4 @@
-"""What a client asks a node, and what it hears: health, models, model changes as they go on, live estimates."""
+"""Queries to nodes and what nodes publish: health, models, model changes with progress, live estimates."""
 
 import threading
 from collections.abc import Callable
@@ -25,7 +25,7 @@ from neurove_protocol.control import (
 from neurove_protocol.errors import EXIT_FAILURE, NeuroVEError
 from neurove_service import logs
 from neurove_service.config import ClientConfig
-from neurove_service.transport import EndpointError, Transport, open_transport
+from neurove_service.transport import Transport, Unreachable, open_transport
 
 log = logs.get(__name__)
 
@@ -38,28 +38,33 @@ ReplyT = TypeVar("ReplyT", bound=Message)
 OnProgressReply = Callable[[ProgressReply], None]
 
 
-def _quietly(_: ProgressReply) -> None:
-    """Progress that nobody wants to hear."""
+def _ignore(_: ProgressReply) -> None:
+    """Ignore the progress."""
 
 
 class NoService(NeuroVEError):
-    """Nobody serves there."""
+    """No service answers."""
 
     code = "no_service"
     exit_code = EXIT_FAILURE
 
 
 class SeveralNodes(NeuroVEError):
-    """A change could be meant for one of several nodes, or for all."""
+    """Several nodes are alive, and the user named neither one nor all."""
 
     code = "several_nodes"
 
 
 def connect(config: ClientConfig, patience_s: float = CONNECT_S, stop: threading.Event | None = None) -> Transport:
-    """A session towards a service or a router.
+    """Open a session with a service or a router.
+
+    Args:
+        config: endpoints, and Zenoh's configuration.
+        patience_s: how long to retry while nothing listens there.
+        stop: ends the retries.
 
     Raises:
-        NoService: nobody listens there.
+        NoService: nothing listens at the endpoints. EndpointError: an endpoint or the configuration is wrong.
     """
     try:
         return open_transport(
@@ -69,44 +74,47 @@ def connect(config: ClientConfig, patience_s: float = CONNECT_S, stop: threading
             patience_s=patience_s,
             stop=stop,
         )
-    except EndpointError as error:
-        if error.message.startswith("nobody"):
-            raise NoService(f"no service: {error.message}; start one with `neurove serve`") from None
-        raise
+    except Unreachable as error:
+        raise NoService(f"no service: {error.message}; start one with `neurove serve`") from None
 
 
 def health(transport: Transport, config: ClientConfig, node: str = "*") -> list[HealthReply]:
-    """How every node is, or one of them."""
-    return _ask(transport, config.keys.health(node), HealthRequest(), HealthReply, ANSWER_S)
+    """The health of one node, or of every node.
+
+    Raises:
+        NoService: no node answers.
+    """
+    return _query(transport, config.keys.health(node), HealthRequest(), HealthReply, ANSWER_S)
 
 
 def models(transport: Transport, config: ClientConfig, node: str = "*") -> list[ModelsReply]:
-    """Which models every node has, or one of them."""
-    return _ask(transport, config.keys.models(node), ModelsRequest(), ModelsReply, 5 * ANSWER_S)
+    """The models of one node, or of every node.
+
+    Raises:
+        NoService: no node answers.
+    """
+    return _query(transport, config.keys.models(node), ModelsRequest(), ModelsReply, 5 * ANSWER_S)
 
 
 def nodes(transport: Transport, config: ClientConfig, node: str | None, every: bool = True) -> list[str]:
-    """Names of the nodes that a change is for.
+    """Names of the nodes that a change applies to.
 
     Args:
-        transport: session.
-        config: where they are.
-        node: the one that was named; None: whoever is alive.
-        every: whether all of them are meant, where there are several.
+        transport: an open session.
+        config: the deployment's prefix and endpoints.
+        node: name of one node; None for the nodes that are alive.
+        every: whether the change applies to all nodes if several are alive.
 
     Raises:
-        NoService: nobody is alive. SeveralNodes: several are, and it was not said that all are meant.
+        NoService: no node is alive. SeveralNodes: several nodes are alive, and `every` is false.
     """
     if node is not None:
         return [node]
     alive = sorted({config.keys.node_of(key) for key in transport.tokens(config.keys.alive(), ANSWER_S)})
     if not alive:
-        behind = ", ".join(config.connect)
-        raise NoService(
-            f"no service behind {behind}; is `neurove serve` running there, and does its access list know you?"
-        )
+        raise _no_node(config)
     if len(alive) > 1 and not every:
-        raise SeveralNodes(f"several nodes are alive: {', '.join(alive)}; name one with --node, or say --all")
+        raise SeveralNodes(f"several nodes are alive: {', '.join(alive)}; give --node NAME or --all")
     return alive
 
 
@@ -119,12 +127,22 @@ def activate(
     expect: str | None = None,
     shadow_s: float = 0.0,
     canary: tuple[str, ...] = (),
-    on_progress: OnProgressReply = _quietly,
+    on_progress: OnProgressReply = _ignore,
 ) -> ActivateReply:
-    """Change the model of a node, and hear how it goes.
+    """Change the model of a node.
+
+    Args:
+        transport: an open session.
+        config: the deployment's prefix.
+        model: name, or the first 8 or more digits of its digest.
+        node: name of the node.
+        expect: first digits of the active model's digest; the node refuses if another model is active.
+        shadow_s: time that the model runs in shadow before it becomes active [s].
+        canary: streams to change; empty for all.
+        on_progress: receives each step.
 
     Raises:
-        PeerError: it refused; nothing changed there. NoService: it does not answer, or left on the way.
+        PeerError: the node refused; its model is unchanged. NoService: it does not answer, or left during the change.
     """
     request = ActivateRequest(model=model, expect=expect, shadow_s=shadow_s, canary=canary)
     key, timeout_s = config.keys.activate(node), CHANGE_S + shadow_s
@@ -137,12 +155,12 @@ def rollback(
     node: str,
     *,
     expect: str | None = None,
-    on_progress: OnProgressReply = _quietly,
+    on_progress: OnProgressReply = _ignore,
 ) -> ActivateReply:
-    """Put a node back to the model before.
+    """Activate the previous model of a node again.
 
     Raises:
-        PeerError, NoService: as activate.
+        PeerError, NoService: as `activate`.
     """
     request = RollbackRequest(expect=expect)
     return _change(transport, config.keys.rollback(node), node, request, ActivateReply, CHANGE_S, on_progress)
@@ -153,12 +171,12 @@ def push(
     config: ClientConfig,
     request: PushRequest,
     node: str,
-    on_progress: OnProgressReply = _quietly,
+    on_progress: OnProgressReply = _ignore,
 ) -> PushReply:
-    """Tell a node of a bundle, and hear how it pulls it; somebody must answer its chunks meanwhile.
+    """Offer a bundle to a node and wait until the node has pulled it; meanwhile `PushSource` must answer its chunks.
 
     Raises:
-        PeerError, NoService: as activate.
+        PeerError, NoService: as `activate`.
     """
     return _change(transport, config.keys.push(node), node, request, PushReply, PUSH_S, on_progress)
 
@@ -172,45 +190,49 @@ def _change(
     timeout_s: float,
     on_progress: OnProgressReply,
 ) -> ReplyT:
-    said = None
+    last = None
     try:
         for answer in transport.ask_streaming(key, request.encode(), timeout_s):
             if answer.schema != PROGRESS_SCHEMA:
                 return kind.decode(answer.payload)
-            said = ProgressReply.decode(answer.payload)
-            on_progress(said)
+            last = ProgressReply.decode(answer.payload)
+            on_progress(last)
     except PeerError as error:
         raise PeerError(
             ErrorReply(code=error.code, message=f"{node}: {error.message}", details=error.details)
         ) from None
-    if said is None:
-        raise NoService(
-            f"no service answers {key}; is `neurove serve` running there, and does its access list let you ask?"
-        )
-    raise NoService(f"{node} left or took over {timeout_s:g} s; the last that was heard: {said.step}: {said.text}")
+    if last is None:
+        raise _no_answer(key)
+    raise NoService(f"{node} left or needs more than {timeout_s:g} s; its last step: {last.step}: {last.text}")
 
 
-def _ask(transport: Transport, key: str, request: Message, reply: type[ReplyT], timeout_s: float) -> list[ReplyT]:
+def _query(transport: Transport, key: str, request: Message, reply: type[ReplyT], timeout_s: float) -> list[ReplyT]:
     answers = transport.ask(key, request.encode(), timeout_s)
     if not answers:
-        # Zenoh tells a denied question from one that nobody answers as little as we can here.
-        raise NoService(
-            f"no service answers {key}; is `neurove serve` running there, and does its access list let you ask?"
-        )
+        raise _no_answer(key)
     return sorted((reply.decode(answer.payload) for answer in answers), key=lambda one: str(getattr(one, "node", "")))
 
 
+def _no_answer(key: str) -> NoService:
+    """The error for a query without an answer; Zenoh does not report whether an access list denied it."""
+    return NoService(f"no service answers {key}; is `neurove serve` running there, and does its access list admit you?")
+
+
+def _no_node(config: ClientConfig) -> NoService:
+    where = ", ".join(config.connect)
+    return NoService(
+        f"no service behind {where}; is `neurove serve` running there, and does its access list admit you?"
+    )
+
+
 def need_service(transport: Transport, config: ClientConfig) -> None:
-    """Check that some node is alive.
+    """Check that at least one node is alive.
 
     Raises:
-        NoService: none is.
+        NoService: no node is alive.
     """
     if not transport.tokens(config.keys.alive(), ANSWER_S):
-        behind = ", ".join(config.connect)
-        raise NoService(
-            f"no service behind {behind}; is `neurove serve` running there, and does its access list know you?"
-        )
+        raise _no_node(config)
 
 
 def listen(
@@ -219,7 +241,14 @@ def listen(
     on_estimate: Callable[[TwistEstimate], None],
     on_status: Callable[[StreamStatus], None],
 ) -> None:
-    """Hear every estimate and status, called on Zenoh's thread; what can not be read is logged and left out."""
+    """Receive every estimate and status; a message that cannot be decoded is logged and ignored.
+
+    Args:
+        transport: an open session; the subscriptions last as long as it.
+        config: the deployment's prefix.
+        on_estimate: called on Zenoh's thread.
+        on_status: called on Zenoh's thread.
+    """
 
     def decoded(kind: type[ReplyT], use: Callable[[ReplyT], None]) -> Callable[[str, bytes, int], None]:
         def on_sample(key: str, payload: bytes, _: int) -> None:

@@ -1,4 +1,4 @@
-"""Packets over a real Zenoh link to windows, against the floor: to receive them and view their blob, nothing else."""
+"""The time from packets on a real Zenoh link to windows, compared with the time to receive them and view their blob."""
 
 import itertools
 import multiprocessing
@@ -32,7 +32,7 @@ Receive = Callable[[bytes], None]
 
 
 class _FloorHeader(BaseModel):
-    """What the cheapest reader checks before it looks at a blob."""
+    """The fields that the cheapest reader checks before it views a blob."""
 
     model_config = ConfigDict(strict=True)
 
@@ -50,9 +50,13 @@ class Times(NamedTuple):
 
 
 def wire(rounds: int, *, quick: bool) -> list[Row]:
-    """One window of 10 million events a second in packets of 1 ms, from another process: received, and counted.
+    """Receive and count one window of 10 million events per second, in packets of 1 ms, from another process.
 
-    The floor is that of a reader that takes the bytes, unpacks and checks the header and views the blob.
+    The floor is a reader that receives the bytes, unpacks and checks the header and views the blob.
+
+    Args:
+        rounds: measured repetitions.
+        quick: small input without warm-up; the times mean nothing.
     """
     events = draw(5_000 if quick else 500_000)
     packets = _packets(events)
@@ -73,7 +77,7 @@ def wire(rounds: int, *, quick: bool) -> list[Row]:
         closed.clear()
         state = windows.WindowsState()
 
-    for packet in packets:  # compiles
+    for packet in packets:  # compile
         ours(packet)
     with _Link(packets) as link:
         times = _interleaved(link, ours, begin, rounds, warm_up=0 if quick else 2)
@@ -103,7 +107,7 @@ def _view(payload: bytes) -> None:
 
 
 def _packets(events: Events) -> list[bytes]:
-    """The window in packets of 1 ms, then the tick that closes it."""
+    """The window as packets of 1 ms, then an empty packet that closes it."""
     edges = np.searchsorted(events.t, np.arange(0, DURATION_US + 1, PACKET_US)).tolist()
     packets = [
         EventPacket("bench", seq, SENSOR, seq * PACKET_US, events.span(first, stop))
@@ -114,10 +118,10 @@ def _packets(events: Events) -> list[bytes]:
 
 
 class _Link:
-    """A driver in another process, and this one, which receives from it.
+    """A driver in another process that sends to this one.
 
     Args:
-        packets: what the driver sends at each run, 1 ms apart.
+        packets: packets that the driver sends in each run, 1 ms apart.
     """
 
     def __init__(self, packets: list[bytes]) -> None:
@@ -130,31 +134,34 @@ class _Link:
         endpoint = f"tcp/127.0.0.1:{_free_port()}"
         self._transport: Transport = open_transport("peer", listen=(endpoint,))
         self._transport.subscribe("bench/events", self._on_sample)
-        spawn = multiprocessing.get_context("spawn")  # a fork would take Zenoh's threads apart
-        self._told, other = spawn.Pipe()
+        spawn = multiprocessing.get_context("spawn")  # a fork would copy Zenoh without its threads
+        self._control, other = spawn.Pipe()
         self._driver = spawn.Process(target=_drive, args=(endpoint, self._packets, other), daemon=True)
         self._driver.start()
         other.close()
-        self._told.recv()  # it is connected
+        self._control.recv()  # the driver is connected
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._told.close()
+        self._control.close()
         self._driver.join(PATIENCE_S)
         self._transport.close()
 
     def run(self, receive: Receive) -> float:
-        """Have all packets sent, and hand each to `receive`; CPU time of this process for one of them [ms].
+        """Receive all packets once, and return this process's CPU time per packet [ms].
+
+        Args:
+            receive: called with each packet.
 
         Raises:
-            TimeoutError: not all of them came.
+            TimeoutError: not all packets arrived.
         """
         self._receive, self._left = receive, len(self._packets)
         self._done.clear()
         began = time.process_time()
-        self._told.send("go")
+        self._control.send("go")
         if not self._done.wait(PATIENCE_S):
-            raise TimeoutError(f"{self._left} of {len(self._packets)} packets did not come in {PATIENCE_S:.0f} s")
+            raise TimeoutError(f"{self._left} of {len(self._packets)} packets did not arrive within {PATIENCE_S:.0f} s")
         return 1e3 * (time.process_time() - began) / len(self._packets)
 
     def _on_sample(self, _key: str, payload: bytes, _received_ns: int) -> None:
@@ -166,23 +173,23 @@ class _Link:
             self._done.set()
 
 
-def _drive(endpoint: str, packets: list[bytes], told: Connection) -> None:  # pragma: no cover (another process)
+def _drive(endpoint: str, packets: list[bytes], control: Connection) -> None:  # pragma: no cover (another process)
     with open_transport("client", connect=(endpoint,), patience_s=PATIENCE_S) as transport:
         publisher = transport.publisher("bench/events", SCHEMA)
         while not publisher.matching:
             time.sleep(0.01)
-        told.send("ready")
-        for _ in _asked(told):
+        control.send("ready")
+        for _ in _requests(control):
             began = time.monotonic()
             for index, packet in enumerate(packets):
                 time.sleep(max(0.0, began + index * PACKET_US * 1e-6 - time.monotonic()))
                 transport.put("bench/events", packet, SCHEMA)
 
 
-def _asked(told: Connection) -> Iterator[str]:  # pragma: no cover (another process)
+def _requests(control: Connection) -> Iterator[str]:  # pragma: no cover (another process)
     while True:
         try:
-            yield told.recv()
+            yield control.recv()
         except EOFError:
             return
 

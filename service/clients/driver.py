@@ -1,4 +1,4 @@
-"""A camera driver: a recording or synthetic source becomes event packets on Zenoh, paced by its own clock."""
+"""A camera driver: publish a recording or a synthetic source as event packets, paced by its sensor clock."""
 
 import math
 import threading
@@ -18,18 +18,18 @@ from neurove_service.transport import Transport
 POLL_S = 0.02
 
 
-class Summary(NamedTuple):
-    """What a driver has sent."""
+class PlaySummary(NamedTuple):
+    """The packets and events that a driver or a replay has published."""
 
     packets: int
     events: int
-    first_us: int | None
-    last_us: int | None
-    broken: BrokenRecording | None  # where and why the recording ended early
+    first_us: int | None  # sensor clock; None before the first packet
+    last_us: int | None  # of the newest event
+    broken: BrokenRecording | None  # where and why the recording ended early; None if it did not
 
 
 def repeated(recording: Recording) -> Iterator[Events]:
-    """The recording again and again, each turn's times following the last one's."""
+    """The recording in an endless loop; the times of each turn continue those of the turn before."""
     shift_us, end_us, first_us = 0, 0, None
     while True:
         for chunk in recording.chunks():
@@ -45,10 +45,10 @@ class Driver:
     """Publishes one stream.
 
     Args:
-        recording: what it plays.
+        recording: the source of events.
         stream: name of the stream.
         transport: an open session.
-        keys: of the deployment.
+        keys: keys of the deployment.
     """
 
     def __init__(self, recording: Recording, stream: str, transport: Transport, keys: Keys) -> None:
@@ -66,11 +66,15 @@ class Driver:
 
     @property
     def label(self) -> str:
-        """The stream, for people."""
+        """Name of the stream, for messages."""
         return self._stream
 
     def wait_for_listener(self, timeout_s: float, stop: threading.Event) -> bool:
-        """Wait until some service listens, for a real camera would be on before it is used."""
+        """Wait until a service subscribes to the stream.
+
+        Returns:
+            whether one did before the timeout and the stop event.
+        """
         deadline = time.monotonic() + timeout_s
         while not self._publisher.matching:
             if time.monotonic() >= deadline or stop.wait(POLL_S):
@@ -84,29 +88,29 @@ class Driver:
         speed: float = 1.0,
         loop: bool = False,
         duration_s: float = math.inf,
-    ) -> Summary:
+    ) -> PlaySummary:
         """Publish the recording until its end, the duration, or the stop event.
 
         Args:
-            stop: ends it early.
-            speed: sensor seconds per second; infinity sends as fast as it reads.
-            loop: begin again at the end.
+            stop: ends the playback early.
+            speed: sensor seconds per second; infinity publishes as fast as the recording is read.
+            loop: start again at the end.
             duration_s: sensor time to play [s].
         """
         chunks = repeated(self._recording) if loop and not self._recording.endless else self._recording.chunks()
-        sent = Summary(0, 0, None, None, None)
+        sent = PlaySummary(0, 0, None, None, None)
         began = 0.0
         try:
             for piece in slices(chunks):
                 if sent.first_us is None:
-                    began = time.monotonic()  # not before: opening and decoding takes its time
+                    began = time.monotonic()  # not earlier: opening and decoding take time
                 first_us = piece.t0_us if sent.first_us is None else sent.first_us
                 elapsed_s = (piece.end_us - first_us) / 1e6
                 if elapsed_s > duration_s or _stopped(stop, began + elapsed_s / speed):
                     break
                 self._send(sent.packets, piece)
                 last_us = int(piece.events.t[-1]) if piece.events.n else sent.last_us
-                sent = Summary(sent.packets + 1, sent.events + piece.events.n, first_us, last_us, None)
+                sent = PlaySummary(sent.packets + 1, sent.events + piece.events.n, first_us, last_us, None)
         except BrokenRecording as error:
             return sent._replace(broken=error)
         return sent
@@ -117,5 +121,5 @@ class Driver:
 
 
 def _stopped(stop: threading.Event, due: float) -> bool:
-    """Wait until `due` on the monotonic clock; whether the stop event came first."""
+    """Wait until `due` on the monotonic clock; return whether the stop event came first."""
     return stop.wait(max(0.0, due - time.monotonic()))

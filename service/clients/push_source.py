@@ -1,4 +1,4 @@
-"""A bundle that is pushed: the file, and the chunks of it that nodes ask for."""
+"""A bundle that a client pushes: its file, and the chunks that nodes request."""
 
 import hashlib
 import mmap
@@ -13,13 +13,13 @@ SIGNATURE = ".sig"
 
 
 class PushSource:
-    """Maps a bundle's file into memory; use it in a `with` block. A signature beside it goes with it.
+    """Maps a bundle's file into memory; use it in a `with` block. Its signature file is part of the request.
 
     Args:
-        path: of the bundle; its signature is `<path>.sig`, where there is one.
+        path: file of the bundle; its signature is `<path>.sig`, if that exists.
 
     Raises:
-        BadModel: it is missing, empty or can not be read. What it holds the node checks.
+        BadModel: the file is missing, empty or unreadable. The node checks its contents.
     """
 
     def __init__(self, path: Path) -> None:
@@ -28,7 +28,7 @@ class PushSource:
                 self._bytes = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
             signature = path.with_name(path.name + SIGNATURE)
             self._signature = signature.read_bytes() if signature.exists() else None
-        except (OSError, ValueError) as error:  # the second: an empty file
+        except (OSError, ValueError) as error:  # ValueError: an empty file
             raise BadModel(path.name, getattr(error, "strerror", None) or str(error)) from None
         if self._signature is not None and len(self._signature) > MAX_SIGNATURE_BYTES:
             size = len(self._signature)
@@ -46,15 +46,18 @@ class PushSource:
 
     @property
     def request(self) -> PushRequest:
-        """What tells a node of it."""
+        """The request that offers the bundle to a node."""
         name = self._name[-128:]
         return PushRequest(digest=self.digest, size=len(self._bytes), name=name, signature=self._signature)
 
     def chunk(self, request: bytes) -> bytes:
-        """The piece that a ChunkRequest asks for.
+        """The bytes that a ChunkRequest asks for.
+
+        Args:
+            request: an encoded ChunkRequest.
 
         Raises:
-            InvalidField: it ends behind the file's end.
+            InvalidField: the chunk ends after the file. Malformed: the bytes are no ChunkRequest.
         """
         wanted = ChunkRequest.decode(request)
         end, size = wanted.offset + wanted.length, len(self._bytes)

@@ -1,4 +1,4 @@
-"""Recording of live traffic: event packets and camera infos as they were published, into one file."""
+"""Recording of live traffic: write event packets and CameraInfos, byte for byte, into one packet log."""
 
 import threading
 import time
@@ -18,7 +18,7 @@ from neurove_service.transport import Transport
 log = logs.get(__name__)
 
 QUEUE_BYTES: Final = 64 << 20
-"""So much may wait to be written; what comes while it is full is dropped and counted."""
+"""Most bytes that wait to be written; a message that does not fit is dropped and counted."""
 
 _ASK_S = 0.5
 _POLL_S = 0.1
@@ -32,23 +32,23 @@ class _Message(NamedTuple):
 
 
 @dataclass
-class Account:
-    """What came of one stream; packets are counted as they stand in the file."""
+class StreamSummary:
+    """Counts of one stream; packets are those in the file."""
 
     packets: int = 0
     events: int = 0
     bytes: int = 0
-    missing: int = 0  # numbers that no readable packet in the file has, whoever lost them
-    dropped: int = 0  # by us, for the disk did not keep up; missing counts them too
-    refused: int = 0  # packets that can not be read: they are in the file as they came
-    restarts: int = 0  # the numbers began anew, or went back
+    missing: int = 0  # sequence numbers that no readable packet in the file has, for any reason
+    dropped: int = 0  # by this recorder, because the disk was too slow; also counted in missing
+    refused: int = 0  # packets that cannot be decoded; they are in the file too
+    restarts: int = 0  # sequence numbers that are lower than expected
     first_us: int | None = None
     last_us: int | None = None
 
 
 @dataclass
 class _Inbox:
-    """What was received and not yet written; filled on Zenoh's thread."""
+    """Messages that were received and not yet written; filled on Zenoh's thread."""
 
     waiting: deque[_Message] = field(default_factory=deque)
     cap: int = QUEUE_BYTES
@@ -75,14 +75,14 @@ class _Inbox:
 
 
 class Recorder:
-    """Writes the streams of a deployment, from the moment it is made.
+    """Writes the streams of a deployment, from its construction on.
 
     Args:
-        writer: of the file.
+        writer: an open packet log.
         transport: an open session.
-        keys: of the deployment.
-        streams: which; None for all that are published.
-        queue_bytes: so much may wait to be written.
+        keys: keys of the deployment.
+        streams: names of the streams; None for all.
+        queue_bytes: most bytes that wait to be written.
     """
 
     def __init__(
@@ -95,14 +95,16 @@ class Recorder:
     ) -> None:
         self._writer, self._keys, self._streams = writer, keys, streams
         self._inbox = _Inbox(cap=queue_bytes)
-        self._accounts: dict[str, Account] = {}
+        self._summaries: dict[str, StreamSummary] = {}
         self._next: dict[str, int] = {}
         self._cameras: dict[str, bytes] = {}
-        self._unix_ns = time.time_ns() - time.monotonic_ns()  # one clock for the whole file: it never jumps
+        self._unix_ns = time.time_ns() - time.monotonic_ns()  # one clock for the whole file, which never jumps
         for stream in streams or ("*",):
             transport.subscribe(keys.events(stream), self._receiver("events"))
             transport.subscribe(keys.camera(stream), self._receiver("camera"))
-            for answer in transport.ask(keys.camera(stream), b"", _ASK_S):  # drivers that spoke before we listened
+            for answer in transport.ask(
+                keys.camera(stream), b"", _ASK_S
+            ):  # of drivers that published before this subscription
                 self._receiver("camera")(answer.key, answer.payload, time.monotonic_ns())
 
     def _receiver(self, kind: str) -> Callable[[str, bytes, int], None]:
@@ -110,33 +112,36 @@ class Recorder:
             try:
                 stream = self._keys.stream_of(key)
             except NeuroVEError:
-                return  # a key whose stream has no valid name is nobody's
+                return  # no stream has such a name
             self._inbox.put(_Message(stream, kind, payload, received_ns))
 
         return on_sample
 
     def run(
-        self, stop: threading.Event, duration_s: float, progress: Callable[[dict[str, Account]], None] | None = None
-    ) -> dict[str, Account]:
-        """Write until the stop event or for so long; then what has been received by then.
+        self,
+        stop: threading.Event,
+        duration_s: float,
+        progress: Callable[[dict[str, StreamSummary]], None] | None = None,
+    ) -> dict[str, StreamSummary]:
+        """Write until the stop event or the duration, then write what has arrived until then.
 
         Args:
-            stop: ends it.
-            duration_s: at most so many seconds from now.
-            progress: told some ten times a second.
+            stop: ends the recording.
+            duration_s: longest recording [s].
+            progress: called five to ten times per second.
 
         Returns:
-            what came, by stream.
+            the counts, by stream.
         """
         deadline = time.monotonic() + duration_s
         while not stop.is_set() and time.monotonic() < deadline:
             self._inbox.filled.wait(_POLL_S)
             self._write()
             if progress:
-                progress(self._accounts)
-            stop.wait(_POLL_S)  # so that a burst is one turn
+                progress(self._summaries)
+            stop.wait(_POLL_S)  # collects a burst into one turn
         self._write()
-        return self._accounts
+        return self._summaries
 
     def _write(self) -> None:
         for message in self._inbox.take():
@@ -148,34 +153,34 @@ class Recorder:
                 self._cameras[message.stream] = message.payload
                 self._writer.add(message.stream, "camera", message.payload, log_ns)
         for stream, dropped in self._inbox.dropped.copy().items():
-            self._account(stream).dropped = dropped
+            self._summary(stream).dropped = dropped
 
-    def _account(self, stream: str) -> Account:
-        return self._accounts.setdefault(stream, Account())
+    def _summary(self, stream: str) -> StreamSummary:
+        return self._summaries.setdefault(stream, StreamSummary())
 
     def _count(self, message: _Message) -> None:
-        account = self._account(message.stream)
-        account.packets += 1
-        account.bytes += len(message.payload)
+        summary = self._summary(message.stream)
+        summary.packets += 1
+        summary.bytes += len(message.payload)
         try:
             packet = decode_packet(message.payload, LIMITS)
         except NeuroVEError as error:
-            if not account.refused:
-                log.warning("packet can not be read", stream=message.stream, why=error.message)
-            account.refused += 1
+            if not summary.refused:
+                log.warning("packet refused", stream=message.stream, why=error.message)
+            summary.refused += 1
             return
         expected = self._next.get(message.stream, packet.seq)
         if packet.seq > expected:
-            account.missing += packet.seq - expected
+            summary.missing += packet.seq - expected
         elif packet.seq < expected:
-            account.restarts += 1
+            summary.restarts += 1
         self._next[message.stream] = packet.seq + 1
-        account.events += packet.events.n
+        summary.events += packet.events.n
         first_us = int(packet.events.t[0]) if packet.events.n else packet.t0_us
-        account.first_us = first_us if account.first_us is None else account.first_us
-        account.last_us = int(packet.events.t[-1]) if packet.events.n else packet.t0_us
+        summary.first_us = first_us if summary.first_us is None else summary.first_us
+        summary.last_us = int(packet.events.t[-1]) if packet.events.n else packet.t0_us
 
 
-def as_json(accounts: dict[str, Account]) -> dict[str, Any]:
-    """The accounts as plain values."""
-    return {stream: asdict(account) for stream, account in sorted(accounts.items())}
+def as_json(summaries: dict[str, StreamSummary]) -> dict[str, Any]:
+    """The counts as plain values for JSON."""
+    return {stream: asdict(summary) for stream, summary in sorted(summaries.items())}

@@ -1,4 +1,4 @@
-"""Replay of our own recordings: the packets that were recorded, bit for bit, paced by their sensor's clock."""
+"""Replay of packet logs: publish the recorded packets bit for bit, paced by their sensor clock."""
 
 import math
 import threading
@@ -12,29 +12,29 @@ from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.events import SCHEMA as EVENTS_SCHEMA
 from neurove_protocol.events import EventPacket, decode_packet
 from neurove_protocol.keys import Keys
-from neurove_service.clients.driver import POLL_S, Summary
+from neurove_service.clients.driver import POLL_S, PlaySummary
 from neurove_service.transport import Publisher, Transport
 
 
 @dataclass
 class _Pace:
-    """When packets of each stream are due: streams have clocks of their own, which are not compared."""
+    """When the packets of each stream are due; each stream has its own clock, and clocks are not compared."""
 
     speed: float
-    began: float = 0.0  # on our monotonic clock
+    began: float = 0.0  # monotonic clock [s]
     first_log_ns: int | None = None
     clocks: dict[str, tuple[float, int, int]] = field(default_factory=dict)  # origin [s], its sensor time, newest [us]
 
     def due(self, recorded: RecordedPacket, packet: EventPacket) -> tuple[float, float]:
-        """When a packet is due, on our monotonic clock, and how far into its stream that is [s]."""
+        """When a packet is due on the monotonic clock [s], and the sensor time since its stream began [s]."""
         t_us = int(packet.events.t[-1]) + 1 if packet.events.n else packet.t0_us
         if self.first_log_ns is None:
             self.began, self.first_log_ns = time.monotonic(), recorded.log_ns
-        if recorded.stream not in self.clocks:  # as much later than the first stream as it was received
+        if recorded.stream not in self.clocks:  # keep the recorded delay after the first stream
             later_s = max(0, recorded.log_ns - self.first_log_ns) / 1e9 / self.speed
             self.clocks[recorded.stream] = (self.began + later_s, packet.t0_us, t_us)
         origin, first_us, newest_us = self.clocks[recorded.stream]
-        if packet.t0_us < first_us or t_us < newest_us - 1_000_000:  # the driver was started anew
+        if packet.t0_us < first_us or t_us < newest_us - 1_000_000:  # the driver was restarted
             origin, first_us = time.monotonic(), packet.t0_us
         self.clocks[recorded.stream] = (origin, first_us, t_us)
         elapsed_s = (t_us - first_us) / 1e6
@@ -42,13 +42,13 @@ class _Pace:
 
 
 class Replay:
-    """Publishes what was recorded, under the names of its own streams.
+    """Publishes the packets of a packet log under the stream names in it.
 
     Args:
-        recording: of ours.
-        only: the one stream to publish; None for all.
+        recording: the packet log.
+        only: name of the stream to publish; None for all streams.
         transport: an open session.
-        keys: of the deployment.
+        keys: keys of the deployment.
     """
 
     def __init__(self, recording: McapRecording, only: str | None, transport: Transport, keys: Keys) -> None:
@@ -68,11 +68,15 @@ class Replay:
 
     @property
     def label(self) -> str:
-        """The streams, for people."""
+        """Names of the streams, for messages."""
         return ", ".join(self._publishers)
 
     def wait_for_listener(self, timeout_s: float, stop: threading.Event) -> bool:
-        """Wait until somebody listens to every stream."""
+        """Wait until every stream has a subscriber.
+
+        Returns:
+            whether that happened before the timeout and the stop event.
+        """
         deadline = time.monotonic() + timeout_s
         while not all(publisher.matching for publisher in self._publishers.values()):
             if time.monotonic() >= deadline or stop.wait(POLL_S):
@@ -81,20 +85,23 @@ class Replay:
 
     def play(
         self, stop: threading.Event, *, speed: float = 1.0, loop: bool = False, duration_s: float = math.inf
-    ) -> Summary:
+    ) -> PlaySummary:
         """Publish the packets until the end, the duration, or the stop event.
 
-        A packet that can not be read is published where it stands, at once.
+        A packet that cannot be decoded is published at once, in its recorded order.
 
         Args:
-            stop: ends it early.
-            speed: sensor seconds per second; infinity sends as fast as it reads.
-            loop: must be False: what was recorded would repeat its numbers and its times.
+            stop: ends the playback early.
+            speed: sensor seconds per second; infinity publishes as fast as the recording is read.
+            loop: must be False, because sequence numbers and times would repeat.
             duration_s: sensor time to play [s].
+
+        Raises:
+            ValueError: `loop` is true.
         """
         if loop:
-            raise ValueError("a replay can not loop")
-        sent = Summary(0, 0, None, None, None)
+            raise ValueError("a replay cannot loop")
+        sent = PlaySummary(0, 0, None, None, None)
         pace = _Pace(speed)
         try:
             for recorded in self._recording.packets(self._only):

@@ -162,7 +162,7 @@ class TestWhoMayNot:
     def test_the_command_names_missing_permission_as_a_possible_reason(self, place):
         result = neurove("activate", "untrained", *place.flags("consumer-planner"))
         assert (result.returncode, result.stdout) == (1, "")
-        assert "does its access list let you ask?" in result.stderr
+        assert "does its access list admit you?" in result.stderr
         assert result.stderr.count("\n") == 1
 
     @pytest.mark.parametrize("name", [*NOT_OPERATORS, "operator-alice"])

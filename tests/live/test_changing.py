@@ -90,12 +90,12 @@ def test_one_of_several_nodes_must_be_named_before_anything_changes(network, run
     nodes = put(n1=done, n2=done)
     code, out, err = run("activate", "new", "--connect", endpoint)
     assert (code, out) == (2, "")
-    assert "several nodes are alive: n1, n2; name one with --node, or say --all" in err
+    assert "several nodes are alive: n1, n2; give --node NAME or --all" in err
     assert [node.asked for node in nodes.values()] == [[], []]
     code, out, _ = run("activate", "new", "--connect", endpoint, "--node", "n2")
     assert (code, out.splitlines()) == (
         0,
-        ["n2: verified: it runs here", f"n2: new ({'b' * 12}) now serves, was old ({'a' * 12})"],
+        ["n2: verified: it runs here", f"n2: new ({'b' * 12}) is active and replaces old ({'a' * 12})"],
     )
     assert [node.asked for node in nodes.values()] == [[], ["new"]]
 
@@ -106,7 +106,7 @@ def test_what_one_node_refuses_is_not_tried_on_the_next_and_both_are_told(networ
     code, out, err = run("activate", "new", "--connect", endpoint, "--all", "--json")
     assert code == 1
     assert [json.loads(line)["node"] for line in out.splitlines()] == ["n1", "n1", "n2"]
-    assert err == "neurove: n2: model='new': not on this node; available: old; not asked then: n3\n"
+    assert err == "neurove: n2: model='new': not on this node; available: old; not changed: n3\n"
     assert [node.asked for node in nodes.values()] == [["new"], ["new"], []]
 
 
@@ -116,7 +116,7 @@ def test_a_push_to_all_tells_people_where_the_bundle_is_and_where_it_is_refused(
     (tmp_path / "new.safetensors").write_bytes(b"whatever it is")
     code, out, err = run("push", tmp_path / "new.safetensors", "--connect", endpoint, "--all")
     assert code == 1
-    assert out.splitlines()[1] == f"n1: new ({'b' * 12}) is there, 1,234 bytes moved"
+    assert out.splitlines()[1] == f"n1: new ({'b' * 12}) is stored, 1,234 bytes transferred"
     assert err == "neurove: n2: this node stores no pushed models: it has no state_dir\n"
     assert [node.asked for node in nodes.values()] == [["new.safetensors"]] * 2
 

@@ -48,7 +48,7 @@ def test_what_was_driven_is_recorded_bit_for_bit_and_replayed_bit_for_bit(router
         with running("record", "--connect", router, "--out", str(file), "--json") as recorder:
             wait_until(lambda: file.with_name("traffic.mcap.part").exists())
             driven = run(
-                "drive", "pattern://?seed=4", "--connect", router, "--duration", "0.6", "--wait", "20", "--json"
+                "drive", "pattern://?seed=4", "--connect", router, "--seconds", "0.6", "--wait", "20", "--json"
             )
             sent = json.loads(driven.out)
             assert sent["packets"] == 150
@@ -114,7 +114,7 @@ def test_a_recorder_counts_what_is_missing_and_keeps_what_can_not_be_read(router
         transport.answer(Keys().camera("left"), lambda _: CAMERA.encode())
         publisher = transport.publisher(Keys().events("left"), "application/msgpack")
         other = transport.publisher(Keys().events("right"), "application/msgpack")
-        record = ("record", "--connect", router, "--out", str(file), "--stream", "left", "--duration", "3")
+        record = ("record", "--connect", router, "--out", str(file), "--stream", "left", "--seconds", "3")
         with running(*record, "--json") as recorder:
             wait_until(lambda: publisher.matching)
             for packet in make_packets(10, stream="left"):
@@ -144,7 +144,7 @@ def test_people_are_told_what_was_recorded_and_what_was_not(router, tmp_path, ru
 
         driver = threading.Thread(target=drive)
         driver.start()
-        code, out, err = run("record", "--connect", router, "--out", tmp_path / "a.mcap", "--duration", "1")
+        code, out, err = run("record", "--connect", router, "--out", tmp_path / "a.mcap", "--seconds", "1")
         driver.join()
     assert (code, out) == (1, "left: 4 packets, 400 events, 1 missing\n")
     assert err.startswith(f"wrote {tmp_path / 'a.mcap'}, ")
@@ -171,7 +171,7 @@ def test_a_replay_that_nobody_listens_to_says_so(router, tmp_path, run):
     two_streams(tmp_path / "two.mcap")
     code, out, err = run("drive", tmp_path / "two.mcap", "--connect", router, "--wait", "0.2")
     assert (code, out) == (1, "")
-    assert "no service took up stream left, right within 0.2 s" in err
+    assert "no service subscribed to stream left, right within 0.2 s" in err
 
 
 def test_what_the_queue_can_not_hold_is_dropped_and_counted(router, tmp_path):
@@ -196,8 +196,8 @@ def test_what_the_queue_can_not_hold_is_dropped_and_counted(router, tmp_path):
 def test_a_recording_is_not_written_over_and_silence_leaves_no_file(router, tmp_path, run):
     (tmp_path / "old.mcap").write_bytes(b"dear")
     refused = run("record", "--connect", router, "--out", str(tmp_path / "old.mcap"))
-    assert (refused.code, "not written over" in refused.err) == (2, True)
-    silent = run("record", "--connect", router, "--out", str(tmp_path / "new.mcap"), "--duration", "0.3")
+    assert (refused.code, "never overwritten" in refused.err) == (2, True)
+    silent = run("record", "--connect", router, "--out", str(tmp_path / "new.mcap"), "--seconds", "0.3")
     assert (silent.code, silent.err.count("\n")) == (1, 1)
     assert "nothing was recorded" in silent.err
     assert [one.name for one in tmp_path.iterdir()] == ["old.mcap"]

@@ -71,7 +71,7 @@ def run(rate_hz: float, seconds: float, sensor: Sensor) -> dict[str, Any]:
         write_evt3(draw(rate_hz, sensor), sensor, path)
         node, transport, config = stack.enter_context(service(endpoint))
         heard = Heard(stack.enter_context(client(endpoint)), config)
-        playing = ("--loop", "--duration", str(seconds), "--stream", STREAM, "--json")
+        playing = ("--loop", "--seconds", str(seconds), "--stream", STREAM, "--json")
         driver = stack.enter_context(running("drive", str(path), "--connect", endpoint, *playing))
         wait_until(lambda: len(heard.of(STREAM)) > 0, 180)
         began, spent_s, start_s = time.monotonic(), cpu_s(node.child.pid), cpu_s(driver.child.pid)

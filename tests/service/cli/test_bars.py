@@ -1,4 +1,4 @@
-"""How far a long command is: for people at a terminal, and for a log."""
+"""Progress of a long command, on a terminal and in a log."""
 
 import sys
 
@@ -11,19 +11,19 @@ def test_a_terminal_shows_a_bar_for_each_task(monkeypatch, capsys):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     with progress() as show:
         show("simulated", 1, 4, "street")
-        show("learned", 0, 10, "")
-        show("learned", 10, 10, "0.5 m/s")
+        show("trained", 0, 10, "")
+        show("trained", 10, 10, "0.5 m/s")
     shown = capsys.readouterr().err
-    for word in ("simulated", "street", "learned", "0.5 m/s"):
+    for word in ("simulated", "street", "trained", "0.5 m/s"):
         assert word in shown
 
 
-def test_a_log_gets_a_line_for_every_sequence_and_now_and_then_one_of_the_learning(capsys):
+def test_a_log_gets_a_line_for_every_sequence_and_for_every_hundredth_training_step(capsys):
     with progress() as show:
         show("simulated", 7, 10, "street")
         for step in range(4, 1011, 4):
-            show("learned", step, 1010, "0.5 m/s")
-        show("learned", 1010, 1010, "0.4 m/s")
+            show("trained", step, 1010, "0.5 m/s")
+        show("trained", 1010, 1010, "0.4 m/s")
     lines = capsys.readouterr().err.splitlines()
-    assert (lines[0], lines[-1]) == ("simulated 7/10: street", "learned 1010/1010: 0.4 m/s")
+    assert (lines[0], lines[-1]) == ("simulated 7/10: street", "trained 1010/1010: 0.4 m/s")
     assert len(lines) == 1 + 10 + 1

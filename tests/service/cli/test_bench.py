@@ -1,4 +1,4 @@
-"""neurove bench: rows for people and for machines, and wrong words refused."""
+"""neurove bench: rows as text and as JSON; unknown benchmarks are refused."""
 
 import json
 
@@ -7,7 +7,7 @@ import pytest
 from neurove_service.cli.main import main
 
 
-def test_bench_as_json_is_a_list_of_rows_and_says_on_which_machine(capsys):
+def test_bench_as_json_is_a_list_of_rows_and_names_the_machine(capsys):
     assert main(["bench", "ingest", "decode", "--quick", "--json"]) == 0
     out, err = capsys.readouterr()
     found = json.loads(out)
@@ -29,22 +29,22 @@ def test_peers_that_are_not_installed_are_named(capsys, monkeypatch):
     assert "faery" in capsys.readouterr().err
 
 
-def test_packets_over_a_real_link_are_counted_as_plain_numpy_counts_them(capsys):
+def test_packets_over_a_real_link_are_counted_as_numpy_counts_them(capsys):
     assert main(["bench", "wire", "--quick", "--json"]) == 0
     (row,) = json.loads(capsys.readouterr().out)
     assert row["peer"] == "receive and frombuffer"
     assert row["equal"]
 
 
-def test_a_machine_of_narrow_vectors_gives_equal_answers(capsys):
+def test_avx2_alone_gives_equal_answers(capsys):
     assert main(["bench", "narrow", "--quick", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert all(row["name"].endswith("AVX2 at most") for row in found)
     assert {row["equal"] for row in found if row["peer"] == "PyTorch, plain"} == {True}
-    assert False not in {row["equal"] for row in found}  # int8 is not compared with float32: it rounds by design
+    assert False not in {row["equal"] for row in found}  # int8 rounds by design, so it is not compared with float32
 
 
-def test_another_processor_has_no_narrow_row_and_says_so(capsys, monkeypatch):
+def test_a_processor_that_is_not_x86_has_no_narrow_row(capsys, monkeypatch):
     monkeypatch.setattr("platform.machine", lambda: "aarch64")
     assert main(["bench", "narrow", "--json"]) == 0
     out, err = capsys.readouterr()

@@ -1,4 +1,4 @@
-"""neurove convert, info and simulate: what they write, what they say, and what they refuse."""
+"""neurove convert, info and simulate: their files, their output and what they refuse."""
 
 import json
 
@@ -10,29 +10,29 @@ from tests.builders import make_events
 from tests.recordings import ecd_text, shared
 
 
-def test_convert_writes_a_recording_of_ours(run, tmp_path):
+def test_convert_writes_a_packet_log(run, tmp_path):
     events = make_events(2000)
     (tmp_path / "events.txt").write_bytes(ecd_text(events))
     out = tmp_path / "a.mcap"
-    code, told, err = run("convert", tmp_path, out, "--sensor", "64x48", "--json")
+    code, found, err = run("convert", tmp_path, out, "--sensor", "64x48", "--json")
     assert (code, err) == (0, "")
-    assert (json.loads(told)["events"], json.loads(told)["streams"]) == (2000, ["events"])
+    assert (json.loads(found)["events"], json.loads(found)["streams"]) == (2000, ["events"])
     assert sum(chunk.n for chunk in open_source(str(out)).chunks()) == 2000
-    code, told, _ = run("convert", out, tmp_path / "b.mcap")
-    assert (code, told.startswith(f"{tmp_path / 'b.mcap'}: 2,000 events of a.mcap")) == (0, True)
+    code, found, _ = run("convert", out, tmp_path / "b.mcap")
+    assert (code, found.startswith(f"{tmp_path / 'b.mcap'}: 2,000 events of a.mcap")) == (0, True)
 
 
 def test_convert_writes_the_layout_of_dsec(run, tmp_path):
     pytest.importorskip("hdf5plugin")
     (tmp_path / "events.txt").write_bytes(ecd_text(make_events(2000)))
-    code, told, err = run("convert", tmp_path, tmp_path / "a.h5", "--sensor", "64x48")
+    code, found, err = run("convert", tmp_path, tmp_path / "a.h5", "--sensor", "64x48")
     assert (code, err) == (0, "")
-    assert "2,000 events" in told
+    assert "2,000 events" in found
     again = open_source(str(tmp_path / "a.h5"), Sensor(64, 48))
     assert sum(chunk.n for chunk in again.chunks()) == 2000
 
 
-def test_convert_keeps_what_lies_beside_the_events_of_a_real_bag(run, tmp_path):
+def test_convert_keeps_the_triggers_of_a_real_bag(run, tmp_path):
     bag = shared("rosbag/test_events_1")
     assert run("convert", bag, tmp_path / "a.mcap", "--topic", "/event_camera/events")[0] == 0
     recording = open_source(str(tmp_path / "a.mcap"))
@@ -40,7 +40,7 @@ def test_convert_keeps_what_lies_beside_the_events_of_a_real_bag(run, tmp_path):
     assert sum(part.t.size for part in recording.triggers()) == 4157
 
 
-def test_a_broken_recording_is_told_and_leaves_no_file(run, tmp_path):
+def test_a_broken_recording_is_reported_and_leaves_no_file(run, tmp_path):
     (tmp_path / "events.txt").write_bytes(ecd_text(make_events(200)) + b"0.9 7 br\n")
     code, _, err = run("convert", tmp_path, tmp_path / "c.mcap")
     assert (code, "line 201" in err, err.count("\n")) == (1, True, 1)
@@ -54,10 +54,10 @@ def test_a_broken_recording_is_told_and_leaves_no_file(run, tmp_path):
         ("pattern://", "a.mcap", [], "it has no end"),
         ("a.txt", "no/a.mcap", [], "No such file or directory"),
         ("a.mcap", "b.mcap", ["--topic", "up"], "no stream 'up'; its streams are cam0"),
-        ("a.mcap", "a.mcap", [], "it is the recording that is read"),
+        ("a.mcap", "a.mcap", [], "it is the input recording"),
     ],
 )
-def test_what_can_not_be_converted_is_one_line(run, tmp_path, monkeypatch, source, out, topic, why):
+def test_an_impossible_conversion_is_one_line(run, tmp_path, monkeypatch, source, out, topic, why):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a.txt").write_bytes(ecd_text(make_events(10)))
     if source == "a.mcap":
@@ -66,47 +66,47 @@ def test_what_can_not_be_converted_is_one_line(run, tmp_path, monkeypatch, sourc
     assert (code, why in err, err.count("\n")) == (2, True, 1), err
 
 
-def test_info_tells_what_a_recording_holds(run, tmp_path):
+def test_info_shows_what_a_recording_holds(run, tmp_path):
     (tmp_path / "events.txt").write_bytes(ecd_text(make_events(2000)))
     picture = tmp_path / "a.png"
-    code, told, err = run("info", tmp_path, "--sensor", "64x48", "--json", "--plot", picture)
-    about = json.loads(told)
+    code, found, err = run("info", tmp_path, "--sensor", "64x48", "--json", "--plot", picture)
+    about = json.loads(found)
     assert (code, err) == (0, f"wrote {picture}\n")
     assert picture.read_bytes().startswith(b"\x89PNG")
     assert (about["sensor"], about["events"], about["streams"]) == ({"width": 64, "height": 48}, 2000, ["events"])
     assert (about["imu"], about["truth"], about["broken"]) == (None, None, None)
     assert about.keys() >= {"on_fraction", "first_us", "last_us", "duration_s"}
-    code, told, _ = run("info", tmp_path, "--sensor", "64x48")
+    code, found, _ = run("info", tmp_path, "--sensor", "64x48")
     assert code == 0
-    assert "2,000" in told
+    assert "2,000" in found
 
 
-def test_info_of_a_real_recording_with_an_inertial_unit(run):
-    code, told, _ = run("info", shared("aedat4/davis346.aedat4"))
+def test_info_of_a_real_recording_with_an_imu(run):
+    code, found, _ = run("info", shared("aedat4/davis346.aedat4"))
     assert code == 0
-    assert all(text in told for text in ("78,830, 52.3 % ON", "2,363 samples at 1,001.2 Hz", "59", "truth"))
+    assert all(text in found for text in ("78,830, 52.3 % ON", "2,363 samples at 1,001.2 Hz", "59", "truth"))
 
 
-def test_info_of_a_broken_recording_is_bad_news(run, tmp_path):
+def test_info_of_a_broken_recording_ends_with_1(run, tmp_path):
     (tmp_path / "events.txt").write_bytes(ecd_text(make_events(2000)) + b"and then\n")
-    code, told, err = run("info", tmp_path, "--sensor", "64x48", "--json")
+    code, found, err = run("info", tmp_path, "--sensor", "64x48", "--json")
     assert code == 1
-    assert json.loads(told)["events"] == 2000
+    assert json.loads(found)["events"] == 2000
     assert "broken at line 2001" in err
 
 
-def test_a_simulation_is_written_with_its_truth(run, tmp_path):
+def test_a_simulation_contains_its_truth(run, tmp_path):
     out = tmp_path / "a.mcap"
-    code, told, err = run("simulate", "wall", "--seconds", 0.2, "--seed", 4, "--out", out, "--json")
+    code, found, err = run("simulate", "wall", "--seconds", 0.2, "--seed", 4, "--out", out, "--json")
     assert (code, err) == (0, "")
-    assert json.loads(told)["streams"] == ["events", "twists"]
+    assert json.loads(found)["streams"] == ["events", "twists"]
     recording = open_source(str(out))
     twists = recording.twists()
-    assert sum(chunk.n for chunk in recording.chunks()) == json.loads(told)["events"] > 0
+    assert sum(chunk.n for chunk in recording.chunks()) == json.loads(found)["events"] > 0
     assert twists.twist[:, 0] == pytest.approx(0.3, abs=1e-6)  # the wall's trajectory slides at 0.3 m/s
     assert recording.camera("cam0").height_m == 1.5
-    code, told, _ = run("info", "sim://wall?seed=4&seconds=0.2", "--json")
-    assert (code, json.loads(told)["truth"]["from"]) == (0, "twists")
+    code, found, _ = run("info", "sim://wall?seed=4&seconds=0.2", "--json")
+    assert (code, json.loads(found)["truth"]["from"]) == (0, "twists")
 
 
 @pytest.mark.parametrize(
@@ -119,7 +119,7 @@ def test_a_simulation_is_written_with_its_truth(run, tmp_path):
         (["street", "--seed", "-1"], "seed='-1'"),
     ],
 )
-def test_what_can_not_be_simulated_is_named_and_leaves_no_file(run, tmp_path, arguments, message):
+def test_an_impossible_simulation_is_named_and_leaves_no_file(run, tmp_path, arguments, message):
     code, _, err = run("simulate", *arguments, "--out", tmp_path / "a.mcap")
     assert (code, message in err) == (2, True), err
     assert list(tmp_path.iterdir()) == []
@@ -130,6 +130,6 @@ def test_simulations_are_written_in_known_formats_only(run, tmp_path):
     assert (code, "must end in .mcap or .h5" in err) == (2, True)
 
 
-def test_recording_from_carla_says_what_it_needs(run, tmp_path):
+def test_a_wrong_address_of_carla_is_named(run, tmp_path):
     code, _, err = run("simulate", "carla", "--out", tmp_path / "a.npz", "--server", "nowhere")
-    assert (code, "--server='nowhere': HOST:PORT is expected" in err) == (2, True)
+    assert (code, "--server='nowhere': give HOST:PORT" in err) == (2, True)

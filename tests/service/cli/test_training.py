@@ -1,4 +1,4 @@
-"""neurove train and neurove evaluate, end to end on a model and sequences that are tiny."""
+"""neurove train, calibrate and evaluate, end to end on a tiny model and tiny sequences."""
 
 import json
 
@@ -36,12 +36,20 @@ SOURCE = "sim://street?seed=3&seconds=0.8&camera=pinhole:24x18:75"
 def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("train")
     (folder / "tiny.toml").write_text(CONFIG)
-    arguments = ["train", str(folder / "tiny.toml"), "--out", str(folder / "out"), "--calibration", "16", "--json"]
+    arguments = [
+        "train",
+        str(folder / "tiny.toml"),
+        "--out",
+        str(folder / "out"),
+        "--calibration-sequences",
+        "16",
+        "--json",
+    ]
     assert main.main(arguments) == 0
     return folder
 
 
-def test_training_leaves_a_bundle_a_checkpoint_and_its_account(trained):
+def test_training_writes_a_bundle_a_checkpoint_and_a_summary(trained):
     out = trained / "out"
     model = bundle.load(out / "tiny.safetensors")
     assert (model.name, model.trained) == ("tiny", True)
@@ -54,7 +62,7 @@ def test_a_finished_run_resumed_gives_the_same_model(trained, run):
     path = trained / "out" / "tiny.safetensors"
     weights = bundle.load(path).network.state_dict()
     code, out, err = run(
-        "train", str(trained / "tiny.toml"), "--out", str(trained / "out"), "--resume", "--calibration", "16"
+        "train", str(trained / "tiny.toml"), "--out", str(trained / "out"), "--resume", "--calibration-sequences", "16"
     )
     assert (code, out.startswith("wrote ")) == (0, True)
     assert "simulated" not in err
@@ -62,17 +70,17 @@ def test_a_finished_run_resumed_gives_the_same_model(trained, run):
     assert all((tensor == again[name]).all() for name, tensor in weights.items())
 
 
-def test_evaluate_tells_machines_all_figures(trained, run):
+def test_evaluate_prints_all_figures_as_json(trained, run):
     code, out, _ = run("evaluate", str(trained / "out" / "tiny.safetensors"), SOURCE, "--json")
-    told = json.loads(out)
+    found = json.loads(out)
     assert code == 0
     for key in ("rmse_v_l_m_s", "rmse_v_a_deg_s", "re_v_l", "re_v_a", "per_axis", "windows", "firing_rate"):
-        assert key in told
-    assert told["zero"]["re_v_l"] == pytest.approx(1)
-    assert told["recordings"][0]["name"].startswith("street driving 3")
+        assert key in found
+    assert found["zero"]["re_v_l"] == pytest.approx(1)
+    assert found["recordings"][0]["name"].startswith("street driving 3")
 
 
-def test_evaluate_tells_people_a_table_and_draws(trained, run, tmp_path):
+def test_evaluate_prints_a_table_and_draws(trained, run, tmp_path):
     model = str(trained / "out" / "tiny.safetensors")
     code, out, err = run("evaluate", model, SOURCE, "--plot", str(tmp_path / "plots"))
     assert code == 0
@@ -93,7 +101,7 @@ def test_a_recording_without_truth_is_refused_in_one_line(run, source, why):
     assert why in err
 
 
-def test_poses_in_a_file_are_a_truth(trained, run, tmp_path):
+def test_a_file_of_poses_can_be_the_truth(trained, run, tmp_path):
 
     poses = open_source(SOURCE).trajectory.poses
     made = poses(np.arange(0, 800_001, 5_000))
@@ -117,14 +125,14 @@ def test_a_wrong_configuration_ends_in_one_line(run, tmp_path):
     assert "recipe.steps" in err
 
 
-def test_a_model_of_another_shape_is_refused_before_anything_is_simulated(run, tmp_path):
+def test_a_start_model_of_another_shape_is_refused_before_the_simulation(run, tmp_path):
     code, _, err = run("train", "velocity-quick", "--start", "default", "--out", str(tmp_path / "out"))
     assert code == 2
     assert err.strip() == "neurove: model default: it has canonical.width=86, the configuration says 22"
     assert not (tmp_path / "out").exists()
 
 
-def test_training_ends_with_a_calibrated_model_and_calibrating_again_tells_how_well_it_holds(trained, run):
+def test_training_ends_with_a_calibrated_model_and_calibrate_reports_its_coverage(trained, run):
     path = trained / "out" / "tiny.safetensors"
     assert bundle.load(path).uncertainty.provenance.startswith("neurove calibrate: 16 simulated sequences")
     arguments = (
@@ -136,24 +144,24 @@ def test_training_ends_with_a_calibrated_model_and_calibrating_again_tells_how_w
         str(trained / "out" / "data"),
     )
     out = trained / "again.safetensors"
-    code, text, err = run(*arguments, "--sequences", "16", "--out", str(out))
+    code, text, err = run(*arguments, "--calibration-sequences", "16", "--out", str(out))
     assert (code, "simulated" in err) == (0, False)
     assert text.startswith(f"wrote {out}\nshare of the truth in the 90% interval")
     assert bundle.load(out).digest == bundle.load(path).digest
-    code, text, _ = run(*arguments, "--sequences", "16", "--out", str(out), "--json")
+    code, text, _ = run(*arguments, "--calibration-sequences", "16", "--out", str(out), "--json")
     assert json.loads(text)["groups"]["as it is"]["vz"]["0.9"] > 0.8
 
 
-def test_a_calibrated_model_is_evaluated_by_its_coverage_and_the_reliability_is_drawn(trained, run, tmp_path):
+def test_evaluate_reports_the_coverage_of_a_calibrated_model_and_draws_its_reliability(trained, run, tmp_path):
     path = trained / "out" / "tiny.safetensors"
     code, text, _ = run("evaluate", str(path), SOURCE, "--plot", str(tmp_path), "--json")
-    told = json.loads(text)["uncertainty"]
+    found = json.loads(text)["uncertainty"]
     assert code == 0
-    assert set(told["coverage"]) == {"vx", "vy", "vz", "wx", "wy", "wz"}
-    assert told["coverage"]["wy"]["0.5"] <= told["coverage"]["wy"]["0.99"] <= 1
-    assert told["per_axis"]["vz"]["median_sigma_m_s"] > 0
+    assert set(found["coverage"]) == {"vx", "vy", "vz", "wx", "wy", "wz"}
+    assert found["coverage"]["wy"]["0.5"] <= found["coverage"]["wy"]["0.99"] <= 1
+    assert found["per_axis"]["vz"]["median_sigma_m_s"] > 0
     assert (tmp_path / "reliability.png").stat().st_size > 1000
     _, text, _ = run("evaluate", str(path), SOURCE)
     assert "share of the truth in its interval" in text
     _, text, _ = run("evaluate", "untrained", SOURCE)
-    assert "neurove calibrate gives it one" in text
+    assert "`neurove calibrate` adds it" in text

@@ -1,4 +1,4 @@
-"""What people read in the tables."""
+"""Tables for people."""
 
 import io
 import time
@@ -15,7 +15,7 @@ from tests.builders import make_packets
 INFO = ModelInfo(name="one", digest="ab" * 32, trained=False, provenance="a test", parameters=1234)
 
 
-def seen(renderable):
+def drawn(renderable):
     console = Console(file=io.StringIO(), width=140, color_system=None)
     console.print(renderable)
     return console.file.getvalue()
@@ -28,31 +28,31 @@ def stream(slot):
 
 def test_a_board_shows_the_newest_velocity_its_flags_and_every_loss(stream):
     board = Board()
-    assert "waiting" in seen(board)
+    assert "waiting" in drawn(board)
     packets = make_packets(60)
     for packet in packets[:30] + packets[33:]:
         for estimate in stream.accept(packet, Arrival(time.monotonic_ns(), time.monotonic_ns())):
             board.on_estimate(estimate)
     board.on_status(stream_status("n1", stream))
-    text = seen(board)
+    text = drawn(board)
     newest = board.of("cam0").last.twist
     assert f"{newest.vx:+7.3f} m/s" in text
     assert f"{newest.wz:+7.3f} rad/s" in text
-    for word in ("cam0", "lossy", "64x48", "UNTRAINED: the numbers mean nothing", "gap_packets 3", "uncalibrated"):
+    for word in ("cam0", "lossy", "64x48", "UNTRAINED: the estimates have no meaning", "gap_packets 3", "uncalibrated"):
         assert word in text
 
 
-def test_a_board_shows_how_far_off_each_axis_may_be(stream):
+def test_a_board_shows_the_standard_deviation_of_each_axis(stream):
     board = Board()
     for estimate in (one for packet in make_packets(60) for one in stream.accept(packet, Arrival(1, 2))):
         covariance = [0.0] * 36
         covariance[0], covariance[35] = 0.0625, 4e8
         board.on_estimate(estimate.model_copy(update={"covariance": tuple(covariance)}))
-    assert "±0.250 m/s" in seen(board)
-    assert "±20000 rad/s" in seen(board)
+    assert "±0.250 m/s" in drawn(board)
+    assert "±20000 rad/s" in drawn(board)
 
 
-def test_a_board_counts_estimates_that_did_not_come(stream):
+def test_a_board_counts_missed_estimates(stream):
     board = Board()
     estimates = [one for packet in make_packets(60) for one in stream.accept(packet, Arrival(1, 2))]
     for estimate in (estimates[0], estimates[3]):
@@ -74,10 +74,10 @@ def test_health_shows_verdict_reason_and_streams(stream):
         refused_streams=0,
         streams=(status,),
         ready=False,
-        change="two was rolled back by itself: stream cam0: not finite",
+        change="two was rolled back: stream cam0: not finite",
         rollbacks=3,
     )
-    text = seen(health_table([reply]))
+    text = drawn(health_table([reply]))
     for word in (
         "n1 not ok",
         "cam0 is lossy",
@@ -85,17 +85,22 @@ def test_health_shows_verdict_reason_and_streams(stream):
         "overload_packets 7",
         "not ready",
         "not finite",
-        "itself: 3",
+        "rollbacks: 3",
     ):
         assert word in text
 
 
-def test_models_marks_the_active_and_the_previous_and_names_what_is_broken():
+def test_models_marks_active_and_previous_and_names_unreadable_files():
     other = INFO.model_copy(update={"name": "two", "digest": "cd" * 32, "trained": True})
     reply = ModelsReply(
-        node="n1", active=INFO, previous=other, epoch=1, available=(INFO, other), unreadable={"x.safetensors": "cut"}
+        node="n1",
+        active=INFO,
+        previous=other,
+        epoch=1,
+        available=(INFO, other),
+        unreadable={"x.safetensors": "truncated"},
     )
-    text = seen(models_table([reply]))
+    text = drawn(models_table([reply]))
     assert any("active" in line and "one" in line and "no" in line for line in text.splitlines())
     assert any("previous" in line and "two" in line and "yes" in line for line in text.splitlines())
-    assert "x.safetensors: cut" in text
+    assert "x.safetensors: truncated" in text

@@ -12,7 +12,7 @@ from neurove_service.clients.driver import repeated
 from tests.builders import make_events
 
 
-def cut(events, cuts):
+def split(events, cuts):
     edges = [0, *sorted(cuts), events.n]
     return [events.span(a, b) for a, b in itertools.pairwise(edges) if b > a]
 
@@ -22,9 +22,9 @@ def same(a, b):
 
 
 @given(st.integers(1, 3000), st.integers(0, 99), st.lists(st.integers(0, 3000), max_size=5))
-def test_slices_hold_every_event_once_within_their_bounds_however_the_reader_chunks(n, seed, cuts):
+def test_slices_hold_every_event_once_for_any_chunks_of_the_reader(n, seed, cuts):
     events = make_events(n, seed=seed, start_us=123_457)
-    pieces = list(slices(iter(cut(events, [one % n for one in cuts]))))
+    pieces = list(slices(iter(split(events, [one % n for one in cuts]))))
     assert same(Events.join([piece.events for piece in pieces]), events)
     for piece in pieces:
         assert piece.end_us - piece.t0_us <= PACKET_US
@@ -48,12 +48,12 @@ def test_a_burst_is_split_by_count():
     assert sizes == [PACKET_EVENTS, PACKET_EVENTS, 1, 0]
 
 
-def test_a_broken_recording_plays_what_is_whole_and_then_breaks():
+def test_a_broken_recording_plays_its_valid_part_and_then_raises():
     events = make_events(500)
 
     def breaking():
         yield events
-        raise BrokenRecording("x.raw", "byte 77", "cut short")
+        raise BrokenRecording("x.raw", "byte 77", "truncated")
 
     pieces = slices(breaking())
     played = [next(pieces).events]
@@ -73,7 +73,7 @@ class Twice:
         yield make_events(100, start_us=205_000)
 
 
-def test_a_looped_recording_goes_on_in_time():
+def test_the_times_of_a_looped_recording_continue():
     times = np.concatenate([chunk.t for chunk in itertools.islice(repeated(Twice()), 6)])
     assert (np.diff(times) >= 0).all()
     assert times[200] == times[199] + 1

@@ -22,7 +22,7 @@ def test_the_chunks_of_a_file_are_its_bytes(file):
         assert b"".join(pieces) == file.read_bytes()
 
 
-def test_a_chunk_that_is_not_in_the_file_is_refused(file):
+def test_a_chunk_outside_the_file_is_refused(file):
     with PushSource(file) as source:
         with pytest.raises(InvalidField, match="offset=90: with length it ends at 101, the bundle at 100"):
             source.chunk(ChunkRequest(offset=90, length=11).encode())
@@ -30,12 +30,12 @@ def test_a_chunk_that_is_not_in_the_file_is_refused(file):
             source.chunk(b"")
 
 
-def test_a_signature_beside_the_file_goes_with_it(file):
-    beside = file.with_name("model.safetensors.sig")
-    beside.write_bytes(b"{}")
+def test_the_signature_file_is_part_of_the_request(file):
+    signature = file.with_name("model.safetensors.sig")
+    signature.write_bytes(b"{}")
     with PushSource(file) as source:
         assert source.request.signature == b"{}"
-    beside.write_bytes(b"x" * (MAX_SIGNATURE_BYTES + 1))
+    signature.write_bytes(b"x" * (MAX_SIGNATURE_BYTES + 1))
     with pytest.raises(BadModel, match="a signature has at most 65536 bytes"):
         PushSource(file)
 
