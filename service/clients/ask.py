@@ -25,7 +25,7 @@ from neurove_protocol.control import (
 from neurove_protocol.errors import EXIT_FAILURE, NeuroVEError
 from neurove_service import logs
 from neurove_service.config import ClientConfig
-from neurove_service.transport import EndpointError, Transport, open_transport
+from neurove_service.transport import Transport, Unreachable, open_transport
 
 log = logs.get(__name__)
 
@@ -69,10 +69,8 @@ def connect(config: ClientConfig, patience_s: float = CONNECT_S, stop: threading
             patience_s=patience_s,
             stop=stop,
         )
-    except EndpointError as error:
-        if error.message.startswith("nobody"):
-            raise NoService(f"no service: {error.message}; start one with `neurove serve`") from None
-        raise
+    except Unreachable as error:
+        raise NoService(f"no service: {error.message}; start one with `neurove serve`") from None
 
 
 def health(transport: Transport, config: ClientConfig, node: str = "*") -> list[HealthReply]:
