@@ -199,6 +199,7 @@ class BadModel(ModelError):
 
     def __init__(self, name: str, why: str) -> None:
         super().__init__(f"model {name}: {why}", value=name)
+        self.why = _clipped(why)
 
 
 class Untrusted(ModelError):

@@ -1,4 +1,4 @@
-"""active.json: which model a node served last, so that it serves it again after a restart."""
+"""active.json: the last active model of a node, which serves again after a restart."""
 
 import hashlib
 import json
@@ -18,21 +18,21 @@ _VERSION = 1
 
 
 class Active(BaseModel):
-    """What is kept over a restart."""
+    """What a node saves for a restart."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid")
 
-    digest: Digest  # of the model that served
-    previous: Digest | None  # of the one before, for a rollback
-    configured: str  # the configured model at that time: another one now is a newer decision than this file
-    highest_release: int = Field(ge=0)  # greatest release counter that has served
+    digest: Digest  # of the active model
+    previous: Digest | None  # of the model before it, for a rollback
+    configured: str  # the configured model at that time; a different one now takes precedence over this file
+    highest_release: int = Field(ge=0)  # highest release that has served
 
 
 class ActiveFile:
-    """Reads and writes it; without a folder nothing is kept, and what is kept in memory ends with the process.
+    """Reads and writes active.json; without a folder the record is only kept in memory.
 
     Args:
-        folder: where active.json lies.
+        folder: of active.json.
     """
 
     def __init__(self, folder: Path | None) -> None:
@@ -41,16 +41,16 @@ class ActiveFile:
 
     @property
     def active(self) -> Active | None:
-        """What was kept last; none before the first change, or where the file was broken."""
+        """The newest record; None before the first change, or if the file is damaged."""
         return self._active
 
     @property
     def highest_release(self) -> int:
-        """Greatest release counter that has served on this node."""
+        """Highest release that has served on this node."""
         return self._active.highest_release if self._active else 0
 
     def keep(self, active: Active) -> bool:
-        """Keep this from now on; whether it is on the disk. The log says why where it is not."""
+        """Save a record; return whether it is on the disk. If it is not, the log has the reason."""
         self._active = active
         if self._path is None:
             return False
@@ -60,7 +60,7 @@ class ActiveFile:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             write_atomically(self._path, text.encode())
         except OSError as error:
-            log.warning("active model not kept over a restart", path=str(self._path), why=error.strerror or str(error))
+            log.warning("active model not saved for a restart", path=str(self._path), why=error.strerror or str(error))
             return False
         return True
 
@@ -68,16 +68,16 @@ class ActiveFile:
         if self._path is None:
             return None
         try:
-            told = json.loads(self._path.read_bytes())
-            if not isinstance(told, dict) or told.get("version") != _VERSION:
-                raise ValueError(f"not of version {_VERSION}")
-            if told.get("sha256") != _sum(told.get("active")):
-                raise ValueError("its checksum does not fit")
-            return Active.model_validate(told["active"])
+            saved = json.loads(self._path.read_bytes())
+            if not isinstance(saved, dict) or saved.get("version") != _VERSION:
+                raise ValueError(f"its version is not {_VERSION}")
+            if saved.get("sha256") != _sum(saved.get("active")):
+                raise ValueError("its checksum does not match")
+            return Active.model_validate(saved["active"])
         except FileNotFoundError:
             return None
         except (OSError, ValueError, RecursionError, ValidationError) as error:
-            log.warning("active model unknown", path=str(self._path), why=str(error), then="the configured model")
+            log.warning("cannot read the last active model", path=str(self._path), why=str(error))
             return None
 
 

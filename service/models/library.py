@@ -1,4 +1,4 @@
-"""Library: every model that a node could activate, found by name or digest."""
+"""Library: every model that a node can activate, found by name or digest."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -11,22 +11,22 @@ from neurove_protocol.control import ModelInfo
 from neurove_protocol.errors import BadModel, UnknownModel
 
 MIN_DIGEST = 8
-"""So many digits of a digest name a model."""
+"""Minimum number of digits of a digest that name a model."""
 
 Files = Callable[[], dict[str, Path]]
-"""Digest to file of the models that were pushed to this node."""
+"""Digest and file of every model that was pushed to this node."""
 
 
 class Available(NamedTuple):
-    """Models that could be activated now."""
+    """Models that can be activated now."""
 
     models: tuple[ModelInfo, ...]
-    unreadable: dict[str, str]  # file name, or digest of a pushed model -> why it is no model
+    unreadable: dict[str, str]  # file name, or digest of a pushed model -> reason
 
 
 class _Read(NamedTuple):
     info: ModelInfo | None
-    why: str  # it is no model
+    why: str  # reason if there is no info
 
 
 def nothing_pushed() -> dict[str, Path]:
@@ -35,9 +35,9 @@ def nothing_pushed() -> dict[str, Path]:
 
 
 class Library:
-    """The built-in models, the one given at start, those of a folder and those that were pushed.
+    """The built-in models, the model given at the start, those of a folder and those that were pushed.
 
-    A file is read once; then it is known by its size and its time of change, until one of them changes.
+    A file is read once, and again when its size or its modification time changes.
 
     Args:
         models_dir: the operator's folder of bundles.
@@ -50,7 +50,7 @@ class Library:
         self._given: Bundle | None = None
 
     def open(self, model: str) -> Bundle:
-        """The model that a node starts with, which stays available: a name as of `find`, or the path of a file.
+        """The model that a node starts with, which stays available: a name as in `find`, or the path of a file.
 
         Raises:
             UnknownModel, BadModel: as find.
@@ -60,8 +60,8 @@ class Library:
         return self._given
 
     def available(self) -> Available:
-        """All of them, and what lies among them but is no model."""
-        found = {one.digest: one.info for one in self._here()}
+        """All models, and the files that are no models."""
+        found = {one.digest: one.info for one in self._in_memory()}
         unreadable = {}
         for name, path, digest in self._files():
             read = self._known(path, digest)
@@ -72,38 +72,38 @@ class Library:
         return Available(tuple(found.values()), unreadable)
 
     def find(self, model: str) -> Bundle:
-        """The model of this name, or of a digest that begins so; only its own file is loaded.
+        """The model with this name, or with a digest that begins with it; loads only the file of that model.
 
         Raises:
             UnknownModel: there is none.
-            BadModel: several have this name, or the file of this name is no model.
+            BadModel: several models have this name, or the file of this name is no model.
         """
-        here = {one.digest: one for one in self._here() if _is(one.info, model)}
+        in_memory = {one.digest: one for one in self._in_memory() if _matches(one.info, model)}
         files = {}
         for name, path, digest in self._files():
             read = self._known(path, digest)
             if read.info is None:
                 if model in (Path(name).stem, name) or (digest or "").startswith(model):
                     raise BadModel(name, read.why)
-            elif _is(read.info, model):
+            elif _matches(read.info, model):
                 files[read.info.digest] = path
-        digests = here.keys() | files.keys()
+        digests = in_memory.keys() | files.keys()
         if len(digests) > 1:
-            raise BadModel(model, f"{len(digests)} models have this name; say which by digest: {', '.join(digests)}")
+            raise BadModel(model, f"{len(digests)} models have this name; use a digest: {', '.join(digests)}")
         for digest in digests:
-            if digest in here:
-                return here[digest]
+            if digest in in_memory:
+                return in_memory[digest]
             found = bundle.load(files[digest])
             if found.digest != digest:
-                raise BadModel(model, f"its file changes while it is read: its sha256 is now {found.digest}")
+                raise BadModel(model, f"the file changed while it was read: its sha256 is now {found.digest}")
             return found
         raise UnknownModel(model, tuple(one.name for one in self.available().models))
 
-    def _here(self) -> list[Bundle]:
+    def _in_memory(self) -> list[Bundle]:
         return [*models.built_in(), *([self._given] if self._given else [])]
 
     def _files(self) -> list[tuple[str, Path, str | None]]:
-        """Name, file, and for pushed models the digest that the file must have."""
+        """Name and file; for pushed models also the digest that the file must have."""
         own = sorted(self._models_dir.glob(f"*{bundle.SUFFIX}")) if self._models_dir else []
         pushed = self._pushed()
         return [
@@ -119,19 +119,19 @@ class Library:
         key = (path, about.st_size, about.st_mtime_ns)
         if key not in self._read:
             self._read = {known: read for known, read in self._read.items() if known[0] != path}
-            self._read[key] = _look(path, digest)
+            self._read[key] = _read(path, digest)
         return self._read[key]
 
 
-def _look(path: Path, digest: str | None) -> _Read:
+def _read(path: Path, digest: str | None) -> _Read:
     try:
         found = bundle.load(path)
     except BadModel as error:
-        return _Read(None, error.message.partition(": ")[2])
+        return _Read(None, error.why)
     if digest not in (None, found.digest):
-        return _Read(None, f"its bytes changed on the disk: their sha256 is {found.digest}")
+        return _Read(None, f"the file changed on the disk: its sha256 is {found.digest}")
     return _Read(found.info, "")
 
 
-def _is(info: ModelInfo, model: str) -> bool:
+def _matches(info: ModelInfo, model: str) -> bool:
     return info.name == model or (len(model) >= MIN_DIGEST and info.digest.startswith(model))

@@ -1,4 +1,4 @@
-"""Progress of a model change: what the caller of a push, an activation or a rollback hears while it goes on."""
+"""Progress of a push, an activation or a rollback: the steps that its caller gets while it runs."""
 
 from collections.abc import Callable
 from typing import Literal, NamedTuple
@@ -27,8 +27,8 @@ class Progress(NamedTuple):
 
 
 OnProgress = Callable[[Progress], None]
-"""Hears each step as it is reached; it must not raise."""
+"""Called at each step; must not raise."""
 
 
 def silent(_: Progress) -> None:
-    """Tell nobody."""
+    """Ignore progress."""

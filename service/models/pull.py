@@ -1,4 +1,4 @@
-"""Pulling a bundle in chunks: the node asks, so it goes at the node's pace and on from where it was cut."""
+"""Pull a bundle in chunks: the node requests each chunk, so it sets the pace and can resume an interrupted push."""
 
 import math
 import threading
@@ -12,38 +12,38 @@ from neurove_protocol.errors import NeuroVEError, TransferInterrupted
 from neurove_service.models.progress import OnProgress, Progress
 
 Pull = Callable[[str, ChunkRequest], bytes | None]
-"""Digest and what piece of it, to that piece; None where nobody answers. May raise NeuroVEError."""
+"""Requests a piece of the bundle with a digest; returns None if no client answers. May raise NeuroVEError."""
 
 PATIENCE_S = 15.0
-"""A push without a chunk for so long was cut."""
+"""A push without a chunk for this time is interrupted [s]."""
 
 _RETRY_S = 0.25
-_TELL_S = 0.5
-LEAST_BYTES = 4 << 10
-LONG_S = 0.001
-QUICK_ONES = 8
+_REPORT_S = 0.5
+MIN_CHUNK_BYTES = 4 << 10
+SLOWER_S = 0.001
+FAST_CHUNKS = 8
 
 
 class ChunkLength:
-    """How long the next chunk is to be: others' events wait on the link while it passes.
+    """Length of the next chunk. Events of other streams wait on the link while a chunk passes.
 
-    It is halved where one took longer than the quickest did by over LONG_S, or by half where the link takes its time
-    for anything, and doubled after QUICK_ONES in a row that took about as long as the quickest.
+    The length is halved after a chunk that took longer than the fastest one by more than SLOWER_S, or by more than half
+    on a link with a long delay. It is doubled after FAST_CHUNKS chunks in a row that took about as long as the fastest.
     """
 
     def __init__(self) -> None:
-        self.bytes = LEAST_BYTES
-        self._quickest_s, self._quick = math.inf, 0
+        self.bytes = MIN_CHUNK_BYTES
+        self._fastest_s, self._fast = math.inf, 0
 
     def took(self, seconds: float) -> None:
-        """Learn how long the last one took [s]."""
-        self._quickest_s = min(self._quickest_s, seconds)
-        more_s, long_s = seconds - self._quickest_s, max(LONG_S, self._quickest_s / 2)
-        self._quick = self._quick + 1 if more_s < long_s / 2 else 0
+        """Adapt the length to the time that a chunk took [s]."""
+        self._fastest_s = min(self._fastest_s, seconds)
+        more_s, long_s = seconds - self._fastest_s, max(SLOWER_S, self._fastest_s / 2)
+        self._fast = self._fast + 1 if more_s < long_s / 2 else 0
         if more_s > long_s:
-            self.bytes = max(self.bytes // 2, LEAST_BYTES)
-        elif self._quick >= QUICK_ONES:
-            self.bytes, self._quick = min(self.bytes * 2, MAX_CHUNK_BYTES), 0
+            self.bytes = max(self.bytes // 2, MIN_CHUNK_BYTES)
+        elif self._fast >= FAST_CHUNKS:
+            self.bytes, self._fast = min(self.bytes * 2, MAX_CHUNK_BYTES), 0
 
 
 def pull_into(
@@ -57,22 +57,23 @@ def pull_into(
     """Append to a file until it has the size of the bundle.
 
     Args:
-        path: the file, which may hold the beginning already.
+        path: the file, which may contain the beginning of the bundle.
         wanted: digest and size.
-        pull: asks for a chunk.
-        stop: ends the waiting for chunks.
-        on_progress: hears how far it is, about twice a second.
-        patience_s: without a chunk for so long it was cut.
+        pull: requests a chunk.
+        stop: ends the wait for chunks.
+        on_progress: called about twice a second.
+        patience_s: a push without a chunk for this time is interrupted [s].
 
     Returns:
-        bytes that were moved.
+        number of bytes that were transferred.
 
     Raises:
-        Cut: no chunk came for that long. OSError: the disk is full, or can not be written to.
+        TransferInterrupted: no chunk arrived for that time.
+        OSError: the disk is full or not writable.
     """
     with path.open("ab") as file:
         if file.tell() > wanted.size:
-            file.truncate(0)  # of a push that lied about the size
+            file.truncate(0)  # left by a push with a wrong size
         begin = file.tell()
         _pull_rest(file, wanted, pull, stop, on_progress, patience_s)
         return wanted.size - begin
@@ -87,7 +88,7 @@ def _pull_rest(
     patience_s: float,
 ) -> None:
     have, length = file.seek(0, 2), ChunkLength()
-    heard = told = time.monotonic()
+    heard = reported = time.monotonic()
     on_progress(Progress("fetching", _so_far(have, wanted.size)))
     while have < wanted.size:
         began = time.monotonic()
@@ -96,28 +97,30 @@ def _pull_rest(
         now = time.monotonic()
         if chunk is None:
             if now - heard > patience_s or stop.wait(_RETRY_S):
-                raise TransferInterrupted(wanted.name, have, wanted.size, "this node stops" if stop.is_set() else why)
+                raise TransferInterrupted(
+                    wanted.name, have, wanted.size, "this node is stopping" if stop.is_set() else why
+                )
             continue
         file.write(chunk)
-        file.flush()  # to where a killed process leaves it
+        file.flush()  # so that the bytes survive a killed process
         have += len(chunk)
         length.took(now - began)
         heard = now
-        if now - told > _TELL_S:
-            told = now
+        if now - reported > _REPORT_S:
+            reported = now
             on_progress(Progress("fetching", _so_far(have, wanted.size)))
 
 
 def _chunk(digest: str, request: ChunkRequest, pull: Pull) -> tuple[bytes | None, str]:
-    """The chunk; or none, and why."""
+    """The chunk; or None and the reason."""
     try:
         data = pull(digest, request)
     except NeuroVEError as error:
         return None, error.message
     if data is None:
-        return None, "whoever pushed it does not answer"
+        return None, "the client that pushed it does not answer"
     if len(data) != request.length:
-        return None, f"a chunk of {len(data)} bytes came, asked for were {request.length}"
+        return None, f"a chunk has {len(data)} bytes instead of {request.length}"
     return data, ""
 
 

@@ -1,4 +1,4 @@
-"""Who made a model: what a node makes of a bundle's signature."""
+"""Signatures of bundles: which models a node accepts."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -10,34 +10,34 @@ from neurove_protocol.errors import InvalidField, Untrusted
 
 
 class Signed(NamedTuple):
-    """What a signature says of a bundle."""
+    """The signature state of a bundle."""
 
     state: SignatureState
     allow_downgrade: bool = False
-    release: int | None = None  # none where nobody trusted says one
+    release: int | None = None  # the signed one; None without a trusted signature
 
     def release_of(self, info: ModelInfo) -> int:
-        """The release that counts: the signed one, where there is one."""
+        """The signed release; without one, the release in the bundle."""
         return info.release if self.release is None else self.release
 
 
 Verify = Callable[[bytes, bytes | None], Signed]
-"""Bundle and signature to what it says; raises NeuroVEError where this node must not use the bundle."""
+"""Bundle and signature to the signature state; raises NeuroVEError if this node must not use the bundle."""
 
 
 def verify_nothing(_: bytes, signature: bytes | None) -> Signed:
-    """What a node that trusts no key makes of a bundle and its signature: nothing is refused, nothing is trusted."""
+    """The rule of a node that trusts no key: it refuses nothing and trusts nothing."""
     return Signed("unsigned" if signature is None else "unchecked")
 
 
 def verifier(keys: tuple[Path, ...]) -> Verify:
-    """How a node judges signatures: one that trusts keys takes only what one of them has signed.
+    """The rule of a node that trusts these keys: it accepts only bundles that one of them signed.
 
     Args:
-        keys: files of public keys, PEM.
+        keys: files of public keys, PEM; none: nothing is verified.
 
     Raises:
-        InvalidField: one can not be read, or is no key.
+        InvalidField: a file is not readable, or is not a key.
     """
     if not keys:
         return verify_nothing
@@ -45,7 +45,7 @@ def verifier(keys: tuple[Path, ...]) -> Verify:
 
     def verify(data: bytes, signature: bytes | None) -> Signed:
         if signature is None:
-            raise Untrusted("bundle", "unsigned", "this node takes only models that are signed")
+            raise Untrusted("bundle", "unsigned", "this node accepts only signed models")
         signed = manifest.verify(data, signature, trusted)
         return Signed("trusted", signed.allow_downgrade, signed.release)
 

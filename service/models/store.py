@@ -1,11 +1,11 @@
 """ModelStore: the models that were pushed to this node, on its disk.
 
-    <folder>/staging/<digest>/bundle.safetensors   a push that goes on or was cut; grows
-    <folder>/pushed/<digest>/bundle.safetensors    whole and verified; never changes
-                             bundle.safetensors.sig   its signature, where one came
+    <folder>/staging/<digest>/bundle.safetensors   a running or interrupted push; grows
+    <folder>/pushed/<digest>/bundle.safetensors    complete and verified; never changes
+                             bundle.safetensors.sig   its signature, if it has one
 
-A folder moves from staging to pushed by one rename, so a crash leaves a whole model or none. The only names that come
-over the network and reach the disk are digests, each matched against 64 digits 0-9 a-f.
+A folder moves from staging to pushed by one rename, so a crash leaves a complete model or none. The only names from the
+network that reach the disk are digests, each matched against 64 digits 0-9 a-f.
 """
 
 import contextlib
@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from neurove_core.files import move_folder, write_atomically
-from neurove_core.models import bundle
+from neurove_core.models import bundle, manifest
 from neurove_core.models.bundle import Bundle
 from neurove_protocol.control import ModelInfo, PushRequest
 from neurove_protocol.errors import BadModel, NeuroVEError, NoQuota, NoSpace, NoStore, TooLarge
@@ -26,35 +26,33 @@ from neurove_service import logs
 from neurove_service.models.progress import OnProgress, Progress
 from neurove_service.models.pull import PATIENCE_S, Pull, pull_into
 from neurove_service.models.signatures import Signed, Verify, verify_nothing
+from neurove_service.models.signed_files import SignedFiles
 
 log = logs.get(__name__)
 
 FILE = "bundle.safetensors"
-SIGNATURE = ".sig"
 SPARE_BYTES = 16 << 20
-"""Left free on the disk, for active.json and the log."""
+"""Space that stays free on the disk, for active.json and the log [bytes]."""
 
 Admit = Callable[[ModelInfo, Signed], None]
-"""Raises NeuroVEError where a node must not have a model that is sound."""
-
-_Stamp = tuple[int, int] | None
+"""Raises NeuroVEError if the node must not have a model, although its bundle is valid."""
 
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 
 
 def _anything(_info: ModelInfo, _signed: Signed) -> None:
-    """Admits every sound model."""
+    """Admit every valid model."""
 
 
 class ModelStore:
-    """Fetches bundles whole or not at all, and finds them again.
+    """Fetches bundles completely or not at all, and lists them.
 
     Args:
-        folder: where they are kept; without one pushes are refused.
-        models_dir: the operator's own bundles, which may have signatures beside them; only read.
-        quota_bytes: most bytes that pushed and staged models take together.
-        verify: what signatures say.
-        patience_s: a push without a chunk for so long was cut.
+        folder: where they are stored; None: pushes are refused.
+        models_dir: the operator's own bundles, which may have signatures next to them; only read.
+        quota_bytes: maximum size of all pushed and staged models [bytes].
+        verify: verifies a signature.
+        patience_s: a push without a chunk for this time is interrupted [s].
     """
 
     def __init__(
@@ -67,17 +65,16 @@ class ModelStore:
     ) -> None:
         self._folder, self._models_dir, self._quota, self._verify = folder, models_dir, quota_bytes, verify
         self._patience_s = patience_s
-        self._fetching: dict[str, int] = {}  # digest -> size that it may grow to
+        self._fetching: dict[str, int] = {}  # digest -> its full size
         self._changed = threading.Condition()
-        self._digests: dict[Path, tuple[_Stamp, str]] = {}  # sha256 of files
-        self._verdicts: dict[Path, tuple[tuple[_Stamp, _Stamp], Signed | NeuroVEError]] = {}  # on them
+        self._signed_files = SignedFiles(self._paths, verify)
 
     def files(self) -> dict[str, Path]:
         """Digest and file of every pushed model."""
         return {folder.name: folder / FILE for folder in self._entries("pushed")}
 
     def partial(self) -> dict[str, int]:
-        """Digest of every push that goes on or was cut, and how many bytes of it are here."""
+        """Digest of every running or interrupted push, and the number of bytes that are stored."""
         return {folder.name: _size(folder / FILE) for folder in self._entries("staging")}
 
     def pushed(self) -> frozenset[str]:
@@ -85,72 +82,53 @@ class ModelStore:
         return frozenset(self.files())
 
     def signed(self, digest: str) -> Signed:
-        """What the signature of a model says; a model without a file of its own, a built-in one, came with the program.
+        """The signature state of a model; a model without a file, such as a built-in one, is unsigned.
 
         Raises:
-            NeuroVEError: this node must not use it, as the configured verification says.
+            NeuroVEError: the configured keys do not allow this model.
         """
-        for path in self._files():
-            if self._digest_of(path) == digest:
-                return self._signed(path)
-        return Signed("unsigned")
-
-    def _signed(self, path: Path) -> Signed:
-        """What the signature beside a file says; found out once, until one of both changes."""
-        signature = path.with_name(path.name + SIGNATURE)
-        key = (_stamp(path), _stamp(signature))
-        known = self._verdicts.get(path)
-        if known is None or known[0] != key:
-            verdict: Signed | NeuroVEError
-            try:
-                verdict = self._verify(path.read_bytes(), signature.read_bytes() if signature.exists() else None)
-            except NeuroVEError as error:
-                verdict = error.with_traceback(None)
-            known = self._verdicts[path] = key, verdict
-        if isinstance(known[1], NeuroVEError):
-            raise known[1]
-        return known[1]
+        return self._signed_files.signed(digest)
 
     def fetch(
         self, wanted: PushRequest, pull: Pull, stop: threading.Event, on_progress: OnProgress, admit: Admit = _anything
     ) -> tuple[Bundle, Signed, int]:
-        """Pull a bundle, check it, and keep it. A push that was cut goes on where it stopped.
+        """Pull a bundle, check it, and store it. An interrupted push resumes where it stopped.
 
         Args:
             wanted: digest, size and signature.
-            pull: asks for a chunk; see neurove_service.models.pull.
-            stop: ends the waiting for chunks.
-            on_progress: hears fetching, staged, verified.
-            admit: refuses a model for what it says of itself, such as its release.
+            pull: requests a chunk, see neurove_service.models.pull.
+            stop: ends the wait for chunks.
+            on_progress: called at the steps fetching, staged, verified.
+            admit: refuses a model because of its description, such as its release.
 
         Returns:
-            the model, what its signature says, and how many bytes were moved.
+            the model, its signature state, and the number of bytes that were transferred.
 
         Raises:
-            NoStore, TooLarge, NoQuota, NoSpace: refused before the first byte, NoSpace also later.
-            Cut: no more chunks came; what is here stays for the next push.
-            BadModel: the bytes are not those of the digest, or no sound bundle; nothing stays.
-            NeuroVEError: refused by its signature or by `admit`; nothing stays.
+            NoStore, TooLarge, NoQuota, NoSpace: refused before the first byte; NoSpace also later.
+            TransferInterrupted: no more chunks arrived; the received bytes stay for the next push.
+            BadModel: the bytes do not match the digest, or are no valid bundle; nothing stays.
+            NeuroVEError: refused because of its signature or by `admit`; nothing stays.
         """
         if self._folder is None:
             raise NoStore("neither models_dir nor state_dir is configured")
         if wanted.size > bundle.MAX_BYTES:
             raise TooLarge(wanted.name, wanted.size, bundle.MAX_BYTES)
         if wanted.digest in self._fetching:
-            on_progress(Progress("fetching", "another push of the same model is under way"))
-        with self._alone(wanted, self._folder), _told_as_ours(wanted, self._folder):
+            on_progress(Progress("fetching", "another push of the same model is in progress"))
+        with self._reserved(wanted, self._folder), _disk_errors(wanted, self._folder):
             target = self._folder / "pushed" / wanted.digest
             if _size(target / FILE) != wanted.size:
                 return self._fetch_anew(wanted, target, pull, stop, on_progress, admit)
-            on_progress(Progress("staged", "it was here already"))
+            on_progress(Progress("staged", "already stored"))
             data = (target / FILE).read_bytes()
             try:
                 model, signed = self._check(data, wanted, admit)
-            except BadModel:  # it rotted on the disk
+            except BadModel:  # the file changed on the disk
                 shutil.rmtree(target)
                 return self._fetch_anew(wanted, target, pull, stop, on_progress, admit)
             if wanted.signature is not None:
-                write_atomically(target / (FILE + SIGNATURE), wanted.signature)
+                write_atomically(target / (FILE + manifest.SUFFIX), wanted.signature)
             on_progress(Progress("verified", _about(model, signed)))
             return model, signed, 0
 
@@ -173,7 +151,7 @@ class ModelStore:
             data = (staging / FILE).read_bytes()
             if not resumed or hashlib.sha256(data).hexdigest() == wanted.digest:
                 break
-            on_progress(Progress("fetching", "what was here from before does not fit; from the start"))
+            on_progress(Progress("fetching", "the bytes of an earlier push do not match; fetching starts again"))
             (staging / FILE).unlink()
         on_progress(Progress("staged", f"{len(data):,} bytes"))
         try:
@@ -182,8 +160,8 @@ class ModelStore:
             shutil.rmtree(staging)
             raise
         if wanted.signature is not None:
-            write_atomically(staging / (FILE + SIGNATURE), wanted.signature)
-        if target.exists():  # of another size than it should be
+            write_atomically(staging / (FILE + manifest.SUFFIX), wanted.signature)
+        if target.exists():  # with a wrong size
             shutil.rmtree(target)
         move_folder(staging, target)
         on_progress(Progress("verified", _about(model, signed)))
@@ -193,19 +171,21 @@ class ModelStore:
     def _check(self, data: bytes, wanted: PushRequest, admit: Admit) -> tuple[Bundle, Signed]:
         digest = hashlib.sha256(data).hexdigest()
         if digest != wanted.digest:
-            raise BadModel(wanted.name, f"the sha256 of what came is {digest}, pushed was {wanted.digest}")
+            raise BadModel(
+                wanted.name, f"the sha256 of the received bytes is {digest}, the push announced {wanted.digest}"
+            )
         signed = self._verify(data, wanted.signature)
         model = bundle.from_bytes(data, wanted.name)
         admit(model.info, signed)
         return model, signed
 
     @contextlib.contextmanager
-    def _alone(self, wanted: PushRequest, folder: Path) -> Iterator[None]:
-        """One fetch of a digest at a time, and none that would break the quota."""
+    def _reserved(self, wanted: PushRequest, folder: Path) -> Iterator[None]:
+        """Reserve space for a bundle; one fetch of a digest at a time."""
         with self._changed:
             self._changed.wait_for(lambda: wanted.digest not in self._fetching)
             if _size(folder / "pushed" / wanted.digest / FILE) != wanted.size:
-                self._make_room(wanted, folder)
+                self._free_space(wanted, folder)
             self._fetching[wanted.digest] = wanted.size
         try:
             yield
@@ -214,8 +194,8 @@ class ModelStore:
                 del self._fetching[wanted.digest]
                 self._changed.notify_all()
 
-    def _make_room(self, wanted: PushRequest, folder: Path) -> None:
-        """Refuse what breaks the quota or fills the disk; staged models that nobody fetches give way, oldest first."""
+    def _free_space(self, wanted: PushRequest, folder: Path) -> None:
+        """Discard interrupted pushes, oldest first, until the bundle fits; refuse it if it does not."""
         staged = {one.name: max(_size(one / FILE), self._fetching.get(one.name, 0)) for one in self._entries("staging")}
         staged.pop(wanted.digest, None)
         used = sum(_size(one / FILE) for one in self._entries("pushed")) + sum(staged.values())
@@ -223,7 +203,7 @@ class ModelStore:
         for old in sorted(left_over, key=lambda one: one.stat().st_mtime):
             if used + wanted.size <= self._quota:
                 break
-            log.warning("cut push given up, for a new one needs its room", digest=old.name, bytes=staged[old.name])
+            log.warning("incomplete push discarded to free space", digest=old.name, bytes=staged[old.name])
             shutil.rmtree(old)
             used -= staged[old.name]
         if used + wanted.size > self._quota:
@@ -234,40 +214,20 @@ class ModelStore:
             raise NoSpace(wanted.name, need, max(0, free - SPARE_BYTES))
 
     def _entries(self, kind: str) -> list[Path]:
-        """Folders of pushed or staged models; what else lies there is not ours."""
+        """Folders of pushed or staged models; other entries are ignored."""
         folder = self._folder / kind if self._folder else None
         if folder is None or not folder.is_dir():
             return []
         return sorted(one for one in folder.iterdir() if _DIGEST.fullmatch(one.name) and one.is_dir())
 
-    def _files(self) -> list[Path]:
+    def _paths(self) -> list[Path]:
+        """All model files that may have a signature."""
         own = sorted(self._models_dir.glob(f"*{bundle.SUFFIX}")) if self._models_dir else []
         return [*(folder / FILE for folder in self._entries("pushed")), *own]
-
-    def _digest_of(self, path: Path) -> str | None:
-        stamp = _stamp(path)
-        if stamp is None or stamp[0] > bundle.MAX_BYTES:
-            return None
-        known = self._digests.get(path)
-        if known is None or known[0] != stamp:
-            try:
-                known = self._digests[path] = stamp, hashlib.sha256(path.read_bytes()).hexdigest()
-            except OSError:
-                return None
-        return known[1]
 
 
 def _about(model: Bundle, signed: Signed) -> str:
     return f"{model.name}, release {model.info.release}, {signed.state}"
-
-
-def _stamp(path: Path) -> _Stamp:
-    """Size and time of change of a file [bytes, ns]; None where there is none."""
-    try:
-        about = path.stat()
-    except OSError:
-        return None
-    return about.st_size, about.st_mtime_ns
 
 
 def _size(path: Path) -> int:
@@ -282,12 +242,12 @@ def _nearest(path: Path) -> Path:
 
 
 @contextlib.contextmanager
-def _told_as_ours(wanted: PushRequest, folder: Path) -> Iterator[None]:
-    """What the disk refuses, as errors that the caller can be told; what filled the disk is taken off it."""
+def _disk_errors(wanted: PushRequest, folder: Path) -> Iterator[None]:
+    """Turn errors of the disk into errors of the protocol; a push that filled the disk is discarded."""
     try:
         yield
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
-            raise NoStore(f"its folder can not be written to: {error.strerror}") from None
+            raise NoStore(f"its folder is not writable: {error.strerror}") from None
         shutil.rmtree(folder / "staging" / wanted.digest, ignore_errors=True)
         raise NoSpace(wanted.name, wanted.size, shutil.disk_usage(_nearest(folder)).free) from None

@@ -1,6 +1,6 @@
-"""Request bytes -> reply bytes, one function per queryable; tested without a network.
+"""Request bytes to reply bytes, one function per queryable; tested without a network.
 
-What takes time gets a way to tell its progress too, each step as the bytes of a ProgressReply.
+A request that takes time also gets `report`, which sends each step as the bytes of a ProgressReply.
 """
 
 import contextlib
@@ -33,7 +33,7 @@ from neurove_service.models.signatures import Signed
 from neurove_service.models.slot import ModelSlot
 from neurove_service.models.store import ModelStore
 from neurove_service.node.health import node_verdict
-from neurove_service.streams.lane import Serving
+from neurove_service.streams.roles import Serving
 
 VERSION = importlib.metadata.version("neurove")
 
@@ -41,16 +41,16 @@ _POLL_S = 0.02
 
 
 class Handlers:
-    """What a node answers.
+    """Answers the queries of a node.
 
     Args:
         node: its name.
         slot: its models.
-        streams: the status of every stream it serves now.
-        refused_streams: how many streams it did not take.
+        streams: status of every stream that is served now.
+        refused_streams: number of refused streams.
         store: the models that were pushed to it.
-        active_file: what it keeps over a restart.
-        ready: whether the next packet gets its estimate.
+        active_file: what it saves for a restart.
+        ready: whether the next packet gets its estimate: the model is warm, and no worker is stuck.
     """
 
     def __init__(
@@ -69,7 +69,7 @@ class Handlers:
         self._began = time.monotonic()
 
     def health(self, request: bytes) -> bytes:
-        """How this node is."""
+        """Health of this node and its streams."""
         HealthRequest.decode(request)
         streams = self._streams()
         refused = self._refused_streams()
@@ -92,7 +92,7 @@ class Handlers:
         return reply.encode()
 
     def models(self, request: bytes) -> bytes:
-        """Which models this node has."""
+        """The models of this node."""
         ModelsRequest.decode(request)
         active, previous, available = self._slot.active, self._slot.previous, self._slot.available()
         serving = {active.estimator.bundle.digest, previous.digest if previous else ""}
@@ -110,26 +110,27 @@ class Handlers:
         )
         return reply.encode()
 
-    def push(self, request: bytes, tell: Callable[[bytes], None], pull: Pull, stop: threading.Event) -> bytes:
-        """Pull a bundle, check it and keep it; it serves once it is activated."""
+    def push(self, request: bytes, report: Callable[[bytes], None], pull: Pull, stop: threading.Event) -> bytes:
+        """Pull a bundle, check it and store it; `activate` lets it serve."""
         wanted = PushRequest.decode(request)
-        with self._progress(tell) as on_progress:
+        with self._progress(report) as on_progress:
             model, signed, fetched = self._store.fetch(wanted, pull, stop, on_progress, self._check_release)
         info = model.info.model_copy(update={"signature": signed.state})
         return PushReply(node=self._node, model=info, fetched=fetched).encode()
 
-    def activate(self, request: bytes, tell: Callable[[bytes], None] = lambda _: None) -> bytes:
-        """Change the model; the old one serves until the new one is ready. Answers when its probation has ended.
+    def activate(self, request: bytes, report: Callable[[bytes], None] = lambda _: None) -> bytes:
+        """Change the model; the previous one serves until the new one is ready. Answers when the probation has ended.
 
         Raises:
-            RolledBack: it did not end well. Besides what ModelSlot.activate raises, and Untrusted, Downgrade.
+            RolledBack: the model did not pass its probation.
+            Untrusted, Downgrade, and the errors of ModelSlot.activate: nothing changed.
         """
         wanted = ActivateRequest.decode(request)
-        with self._progress(tell) as tell_step:
+        with self._progress(report) as report_step:
             ended: list[Progress] = []
 
             def on_progress(progress: Progress) -> None:
-                tell_step(progress)
+                report_step(progress)
                 if progress.step in ("done", "rolled_back"):
                     ended.append(progress)
 
@@ -143,16 +144,17 @@ class Handlers:
                 canary=frozenset(wanted.canary),
                 on_progress=on_progress,
             )
-            while not (ended or wanted.canary or self._slot.closing):
-                time.sleep(_POLL_S)
+            while not (ended or wanted.canary):
+                if self._slot.closing.wait(_POLL_S):
+                    break
             if ended and ended[0].step == "rolled_back":
                 raise RolledBack(ended[0].text)
         return self._changed(previous, serving)
 
-    def rollback(self, request: bytes, tell: Callable[[bytes], None] = lambda _: None) -> bytes:
-        """Back to the model before, whatever its release: it has served on this node."""
+    def rollback(self, request: bytes, report: Callable[[bytes], None] = lambda _: None) -> bytes:
+        """Activate the previous model again, whatever its release: it has served on this node."""
         wanted = RollbackRequest.decode(request)
-        with self._progress(tell) as on_progress:
+        with self._progress(report) as on_progress:
             previous, serving = self._slot.rollback(expect=wanted.expect, on_progress=on_progress)
         return self._changed(previous, serving)
 
@@ -166,13 +168,13 @@ class Handlers:
         return reply.encode()
 
     @contextlib.contextmanager
-    def _progress(self, tell: Callable[[bytes], None]) -> Iterator[OnProgress]:
-        """A way to tell each step; one of the last three is the last one."""
+    def _progress(self, report: Callable[[bytes], None]) -> Iterator[OnProgress]:
+        """Encode and report each step; the last one is `done`, `rolled_back` or `refused`."""
         last: list[str] = []
 
         def on_progress(progress: Progress) -> None:
             last.append(progress.step)
-            tell(ProgressReply(node=self._node, step=progress.step, text=progress.text).encode())
+            report(ProgressReply(node=self._node, step=progress.step, text=progress.text).encode())
 
         try:
             yield on_progress
@@ -182,7 +184,7 @@ class Handlers:
             raise
 
     def _check_release(self, info: ModelInfo, signed: Signed) -> None:
-        """Refuse a release below the highest that has served, unless its maker signed that it may be."""
+        """Refuse a release below the highest that has served, unless a trusted signature allows the downgrade."""
         release, highest = signed.release_of(info), self._active_file.highest_release
         if not manifest.allowed(release, highest, signed.allow_downgrade):
             raise Downgrade(info.name, release, highest)
@@ -190,6 +192,6 @@ class Handlers:
     def _info(self, info: ModelInfo) -> ModelInfo:
         try:
             state = self._store.signed(info.digest).state
-        except (NeuroVEError, OSError):  # it would be refused now
+        except (NeuroVEError, OSError):  # this node would refuse it now
             state = "untrusted"
         return info.model_copy(update={"signature": state})

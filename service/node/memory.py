@@ -1,4 +1,4 @@
-"""Memory that a change of model leaves behind, given back to the system."""
+"""Release the memory that a model change leaves behind."""
 
 import contextlib
 import ctypes
@@ -7,10 +7,10 @@ import sys
 
 
 def release_memory() -> None:
-    """Collect what refers to itself, and have the allocator return the pages that nobody uses.
+    """Collect reference cycles and return unused pages of the allocator to the system.
 
-    Without it a model's second copy, and what its warm-up took, stay with the allocator, which keeps freed memory in
-    the pool of the thread that asked for it. Where the C library is not glibc, only the first.
+    Otherwise the second copy of a model and the memory of its warm-up stay with the allocator, which keeps freed memory
+    in the pool of the thread that allocated it. With a C library other than glibc, only cycles are collected.
     """
     gc.collect()
     if sys.platform == "linux":

@@ -1,1 +1,1 @@
-"""A packet's path: queue, worker, stream, models at work."""
+"""The path of a packet: registry, worker with its queue, stream, lanes with the models at work."""

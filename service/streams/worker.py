@@ -1,4 +1,4 @@
-"""One stream's queue and thread: bytes in from Zenoh's thread, estimates out; the newest packets win."""
+"""The queue and the thread of one stream: bytes in from Zenoh's thread, estimates out."""
 
 import threading
 import time
@@ -17,13 +17,13 @@ from neurove_service.streams.stream import Arrival, Stream
 log = logs.get(__name__)
 
 _IDLE_BEAT_S = 0.5
-_NO_SPARE_S = 0.002
-_MOST_PAUSE_S = 0.02
+_RETRY_STANDBY_S = 0.002
+_MAX_PAUSE_S = 0.02
 _SAMPLE_BYTES = 256
 
 
 class Sample(NamedTuple):
-    """One message as it came from the network."""
+    """One message from the network."""
 
     payload: bytes
     received_ns: int
@@ -31,19 +31,19 @@ class Sample(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Bytes that it takes, its own parts included."""
+        """Memory of the message, with its overhead [bytes]."""
         return len(self.payload) + _SAMPLE_BYTES
 
 
 class Inbox:
-    """A queue between Zenoh's thread and a worker, bounded in age and bytes: full, it drops the oldest and counts it.
+    """A queue between Zenoh's thread and a worker, bounded in age and bytes; it drops and counts the oldest samples.
 
-    The bound that matters is age: a worker that fell behind for a moment catches up in a fraction of it, for a window
-    costs a tenth of its own duration; one that stays behind answers with data no older than this (decision 6).
+    The age bound matters most. A worker that falls behind for a moment catches up in a fraction of it, because a window
+    costs a tenth of its own duration. A worker that stays behind answers with data no older than this (decision 6).
 
     Args:
-        max_age_s: a sample that waited for so long is dropped when the next one comes.
-        max_bytes: of all samples.
+        max_age_s: a sample that is older than this is dropped when the next one arrives [s].
+        max_bytes: maximum memory of all samples [bytes].
     """
 
     def __init__(self, max_age_s: float, max_bytes: int) -> None:
@@ -53,7 +53,7 @@ class Inbox:
         self._changed = threading.Condition()
 
     def put(self, sample: Sample) -> None:
-        """Append; never blocks for longer than an append takes."""
+        """Append a sample; does not wait for the worker."""
         with self._changed:
             self._samples.append(sample)
             self._bytes += sample.size
@@ -66,12 +66,12 @@ class Inbox:
             self._changed.notify()
 
     def wake(self) -> None:
-        """Let a waiting take return."""
+        """Let a waiting `take` return."""
         with self._changed:
             self._changed.notify_all()
 
     def take(self, timeout_s: float) -> tuple[Sample | None, int]:
-        """The oldest sample, or None after the time out; and how many were dropped since the last call."""
+        """The oldest sample, or None after the timeout; and the number of samples dropped since the last call."""
         with self._changed:
             if not self._samples:
                 self._changed.wait(timeout_s)
@@ -82,7 +82,7 @@ class Inbox:
 
 
 class Outlet(NamedTuple):
-    """What a worker needs from the network: made and used on the worker's own thread."""
+    """What a worker needs from the network; opened and used on the worker's own thread."""
 
     ask_camera: Callable[[], CameraInfo | None]
     publish: Callable[[bytes], None]
@@ -93,11 +93,11 @@ class StreamWorker:
     """Runs one Stream on its own thread.
 
     Args:
-        stream: the state it alone touches.
+        stream: only this thread changes its state.
         open_outlet: called first on the thread.
-        inbox: its queue.
-        limits: caps on packets.
-        spare: so many workers of the node at once may run a model beside the one that answers; without one, any.
+        inbox: the queue.
+        limits: limits of packets.
+        standby_slots: limits how many workers of the node run a standby model at once; None: no limit.
     """
 
     def __init__(
@@ -106,13 +106,13 @@ class StreamWorker:
         open_outlet: Callable[[], Outlet],
         inbox: Inbox,
         limits: PacketLimits,
-        spare: threading.Semaphore | None = None,
+        standby_slots: threading.Semaphore | None = None,
     ) -> None:
         self.stream = stream
         self.beat_ns = time.monotonic_ns()
         self._inbox = inbox
         self._open_outlet, self._limits = open_outlet, limits
-        self._spare = spare or threading.Semaphore()
+        self._standby_slots = standby_slots or threading.Semaphore()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"stream {stream.name}", daemon=True)
         self._thread.start()
@@ -126,46 +126,46 @@ class StreamWorker:
         self._inbox.put(Sample(payload, received_ns, is_camera=True))
 
     def stop(self) -> None:
-        """Ask the thread to end; what is queued is not worked on any more."""
+        """Ask the thread to end; queued samples are not processed."""
         self._stopping.set()
         self._inbox.wake()
 
     def join(self, timeout_s: float) -> None:
-        """Wait for the thread's end."""
+        """Wait for the end of the thread."""
         self._thread.join(timeout_s)
 
     def _run(self) -> None:
         outlet = self._open_outlet()
         try:
-            self._see_through(outlet.ask_camera)
-            rests_until = 0.0  # a time, not a span: packets that come meanwhile must not begin the rest anew
+            self._set_camera(outlet.ask_camera)
+            pause_until = 0.0  # a time, not a duration: packets that arrive in a pause must not extend it
             while not self._stopping.is_set():
                 self.beat_ns = time.monotonic_ns()
-                rest_s = max(0.0, rests_until - time.monotonic())
-                sample, dropped = self._inbox.take(rest_s if self.stream.owes else _IDLE_BEAT_S)
+                pause_s = max(0.0, pause_until - time.monotonic())
+                sample, dropped = self._inbox.take(pause_s if self.stream.lanes.has_backlog else _IDLE_BEAT_S)
                 if dropped:
                     self.stream.overloaded(dropped)
                 if sample is not None:
                     self._work(sample, outlet)
-                elif self.stream.owes:
-                    rests_until = time.monotonic() + self._attend()
+                elif self.stream.lanes.has_backlog:
+                    pause_until = time.monotonic() + self._run_standby()
         finally:
             outlet.close()
 
-    def _attend(self) -> float:
-        """Give a model beside the one that answers what time is left; how long to leave it to others then [s]."""
-        if not self._spare.acquire(blocking=False):
-            return _NO_SPARE_S
+    def _run_standby(self) -> float:
+        """Run one step of the standby model; return the pause after it [s], which leaves the processor to others."""
+        if not self._standby_slots.acquire(blocking=False):
+            return _RETRY_STANDBY_S
         began = time.monotonic()
         try:
-            self.stream.attend()
+            self.stream.lanes.run_standby()
         finally:
-            self._spare.release()
-        return min(_MOST_PAUSE_S, time.monotonic() - began)  # half of the time is others'
+            self._standby_slots.release()
+        return min(_MAX_PAUSE_S, time.monotonic() - began)  # as long as the step: half of the time
 
     def _work(self, sample: Sample, outlet: Outlet) -> None:
         if sample.is_camera:
-            self._see_through(lambda: CameraInfo.decode(sample.payload))
+            self._set_camera(lambda: CameraInfo.decode(sample.payload))
             return
         try:
             arrival = Arrival(sample.received_ns, time.monotonic_ns())
@@ -174,9 +174,9 @@ class StreamWorker:
                 self._publish(estimate, outlet)
         except NeuroVEError as error:
             total = self.stream.refused(sample.received_ns)
-            if total & (total - 1) == 0:  # logged at 1, 2, 4, 8, ...: counted at packet rate
+            if total & (total - 1) == 0:  # log the 1st, 2nd, 4th, 8th, ...: packets are only counted
                 log.warning("packet refused", stream=self.stream.name, why=error.message, total=total)
-        except Exception:  # a fault on one packet must not end the stream
+        except Exception:  # an internal error on one packet must not end the stream
             self.stream.failed()
             log.exception("packet failed", stream=self.stream.name)
 
@@ -184,13 +184,13 @@ class StreamWorker:
         trace = estimate.trace.model_copy(update={"published_ns": time.monotonic_ns()})
         stamped = estimate.model_copy(update={"trace": trace})
         outlet.publish(stamped.encode())
-        self.stream.published(stamped)
+        self.stream.activity.published(stamped)
 
-    def _see_through(self, get: Callable[[], CameraInfo | None]) -> None:
+    def _set_camera(self, get: Callable[[], CameraInfo | None]) -> None:
         try:
             camera = get()
         except NeuroVEError as error:
             log.warning("camera info refused", stream=self.stream.name, why=error.message)
             return
         if camera is not None:
-            self.stream.see_through(camera)
+            self.stream.set_camera(camera)

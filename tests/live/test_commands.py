@@ -67,7 +67,7 @@ def test_activating_what_is_not_there_is_refused_by_the_node(node, run):
 def test_a_taken_port_is_one_clear_line(node):
     second = neurove("serve", "--listen", node)
     assert second.returncode == 2
-    assert second.stderr.startswith(f"neurove: can not open a Zenoh session: listen={node}: Address already in use")
+    assert second.stderr.startswith(f"neurove: cannot open a Zenoh session: listen={node}: Address already in use")
     assert second.stderr.count("\n") == 1
 
 

@@ -66,7 +66,7 @@ def test_an_operator_pushes_activates_and_rolls_back_while_events_flow_without_a
             (models,) = json.loads(run("models", *at, "--json").out)
             assert (models["active"]["digest"], models["previous"]["name"]) == (digest, "default")
             late = run("activate", "default", *at, "--expect", "00000000")
-            assert (late.code, "n1: conflict: 00000000 is expected to be active" in late.err) == (3, True)
+            assert (late.code, "n1: conflict: expected 00000000 to be active" in late.err) == (3, True)
             back = run("rollback", *at, "--expect", digest[:8])
             assert (back.code, "n1: rolled_back: to default" in back.out) == (0, True)
             nothing = run("rollback", *at)

@@ -25,7 +25,7 @@ from neurove_core.models import bundle
 from neurove_protocol import Events, Sensor
 from neurove_service.clients import ask
 from neurove_service.config import ServiceConfig
-from neurove_service.streams.ring import Ring, packed
+from neurove_service.streams.ring import Ring, pack
 from tests.live.conftest import Heard, client, free_endpoint, running, service, wait_until
 from tests.long.swaps import resident_kib
 
@@ -129,7 +129,7 @@ def state_bytes(sensor: Sensor, grid: CanonicalConfig) -> int:
         pushed = estimator.cut(events._replace(t=events.t + shift_us), state, shift_us)
         _, state = estimator.follow(pushed.windows, state._replace(windows=pushed.state))
         for window in pushed.windows:
-            ring.append(packed(window))
+            ring.append(pack(window))
     return sum(_arrays(state).values()) + ring.bytes
 
 

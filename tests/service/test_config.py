@@ -36,7 +36,7 @@ def test_a_wrong_value_is_named_with_its_field_bound_and_origin(flags, telling):
 def test_an_unknown_key_of_a_file_or_the_environment_is_an_error(tmp_path, monkeypatch):
     file = tmp_path / "neurove.toml"
     file.write_text("que_s = 2.0\n")
-    with pytest.raises(ConfigError, match=r"que_s=2.0 \(from file .*unknown setting; known are .*queue_s"):
+    with pytest.raises(ConfigError, match=r"que_s=2.0 \(from file .*unknown setting; known settings: .*queue_s"):
         load(ServiceConfig, {}, file)
     monkeypatch.setenv("NEUROVE_NOED", "x")
     with pytest.raises(ConfigError, match=r"noed='x' \(from environment\): unknown setting"):

@@ -37,7 +37,7 @@ def test_the_answers_are_those_that_the_running_service_publishes(recording, mod
     path = tmp_path / "small.safetensors"
     bundle.save(model, path)
     stream = Stream("cam0", ModelSlot(str(path)))
-    stream.see_through(recording.camera("cam0"))
+    stream.set_camera(recording.camera("cam0"))
     published = []
     for seq, piece in enumerate(slices(recording.chunks())):
         packet = EventPacket("cam0", seq, recording.sensor, piece.t0_us, piece.events)

@@ -50,6 +50,6 @@ def test_the_time_for_a_window_is_measured(slot):
 
 def test_a_model_that_is_plainly_too_slow_is_not_timed_to_the_end(slot):
     estimator = slot.active.estimator
-    assert len(admission.window_times_ms(estimator, 50, bound_ms=-1.0, most_above=4)) == 5
+    assert len(admission.window_times_ms(estimator, 50, bound_ms=-1.0, max_slow=4)) == 5
     with pytest.raises(TooSlow, match="p99_ms="):
         admission.check_speed(estimator, share=1e-9)

@@ -11,9 +11,10 @@ from neurove_core.config import ModelConfig
 from neurove_core.models import bundle
 from neurove_core.models.about import About
 from neurove_protocol.errors import Diverged
-from neurove_service.models.slot import ModelSlot, Rules
+from neurove_service.models.change import Rules
+from neurove_service.models.slot import ModelSlot
+from neurove_service.streams.history import RingSize
 from neurove_service.streams.lane import windows_to_prime
-from neurove_service.streams.lanes import RingSize
 from neurove_service.streams.stream import Arrival, Stream
 from tests.builders import make_packets
 from tests.service.conftest import SMALL
@@ -64,8 +65,8 @@ class Camera:
             now_ns = time.monotonic_ns()
             self.estimates += self.stream.accept(replace(packet, stream=self.stream.name), Arrival(now_ns, now_ns))
             until = time.monotonic() + 0.003
-            while self.stream.owes and time.monotonic() < until:
-                self.stream.attend()
+            while self.stream.lanes.has_backlog and time.monotonic() < until:
+                self.stream.lanes.run_standby()
             if self._stop.wait(max(0.0, until - time.monotonic())):
                 return
 
@@ -158,7 +159,7 @@ def test_a_model_that_fails_while_it_is_primed_is_refused_and_nothing_stays(slot
     assert told[-1] == "refused"
     assert (slot.plan.phase, slot.active.epoch) == ("steady", 0)
     assert {one.model for one in camera.estimates} == {"one"}
-    assert camera.stream.lanes.beside is None
+    assert camera.stream.lanes.standby is None
 
 
 def test_a_model_without_spikes_takes_over_from_one_with_them_and_gives_back(slots):

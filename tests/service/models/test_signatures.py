@@ -9,8 +9,9 @@ from neurove_core.models import manifest, signing_keys
 from neurove_protocol.control import ActivateRequest, ModelsReply, ModelsRequest, PushRequest
 from neurove_protocol.errors import Downgrade, InvalidField, Untrusted
 from neurove_service.models.active_file import Active, ActiveFile
+from neurove_service.models.change import Rules
 from neurove_service.models.signatures import verifier
-from neurove_service.models.slot import ModelSlot, Rules
+from neurove_service.models.slot import ModelSlot
 from neurove_service.models.store import ModelStore
 from neurove_service.node.handlers import Handlers
 
@@ -45,7 +46,7 @@ def handlers_of(folder, key_file, highest_release=0):
 def test_what_a_trusted_key_signed_may_serve_and_what_nobody_signed_may_not(folder, key_file):
     handlers = handlers_of(folder, key_file)
     handlers.activate(ActivateRequest(model="one").encode())
-    with pytest.raises(Untrusted, match="only models that are signed"):
+    with pytest.raises(Untrusted, match="only signed models"):
         handlers.activate(ActivateRequest(model="two").encode())
     models = ModelsReply.decode(handlers.models(ModelsRequest().encode()))
     assert models.active.name == "one"
@@ -92,7 +93,7 @@ def test_a_signature_is_read_once_until_it_or_its_bundle_changes(folder, key_fil
     }
     for _ in range(3):
         assert store.signed(digests["one"]).release == 3
-        with pytest.raises(Untrusted, match="only models that are signed"):
+        with pytest.raises(Untrusted, match="only signed models"):
             store.signed(digests["two"])
     assert len(read) == 2
     data = (folder / "one.safetensors").read_bytes()
@@ -100,7 +101,7 @@ def test_a_signature_is_read_once_until_it_or_its_bundle_changes(folder, key_fil
     with pytest.raises(Untrusted):
         store.signed(digests["one"])
     (folder / "one.safetensors.sig").unlink()
-    with pytest.raises(Untrusted, match="only models that are signed"):
+    with pytest.raises(Untrusted, match="only signed models"):
         store.signed(digests["one"])
     assert len(read) == 4
 

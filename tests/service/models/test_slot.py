@@ -4,7 +4,8 @@ import threading
 import pytest
 
 from neurove_protocol.errors import BadModel, Conflict, NothingBefore, UnknownModel
-from neurove_service.models.slot import ModelSlot, Rules
+from neurove_service.models.change import Rules
+from neurove_service.models.slot import ModelSlot
 from tests.service.models.test_swap import wait_until
 
 
@@ -71,7 +72,7 @@ def test_of_changes_at_once_those_that_come_late_are_told_of_a_conflict(slot):
     winner = threading.Thread(target=slot.activate, args=("two",), kwargs={"on_progress": first_step})
     winner.start()
     assert began.wait(30)
-    with pytest.raises(Conflict, match="another one is under way"):
+    with pytest.raises(Conflict, match="another model change is in progress"):
         slot.activate("untrained")
     with pytest.raises(Conflict):
         slot.rollback()
@@ -87,7 +88,7 @@ def test_a_change_that_expects_another_model_is_a_conflict_and_changes_nothing(s
     before = slot.active
     digest = before.estimator.bundle.digest
     for change in (lambda: slot.activate("two", expect="0" * 8), lambda: slot.rollback(expect="0" * 8)):
-        with pytest.raises(Conflict, match=f"00000000 is expected to be active, but .* {digest} is"):
+        with pytest.raises(Conflict, match=f"expected 00000000 to be active, but .* {digest} is active"):
             change()
     assert slot.active is before
     assert slot.activate("two", expect=digest[:8])[1].epoch == 1

@@ -22,7 +22,7 @@ from neurove_protocol.errors import (
 )
 from neurove_service.models import store as model_store
 from neurove_service.models.library import Library
-from neurove_service.models.pull import LEAST_BYTES, ChunkLength
+from neurove_service.models.pull import MIN_CHUNK_BYTES, ChunkLength
 from neurove_service.models.signatures import Signed
 from neurove_service.models.slot import ModelSlot
 from neurove_service.models.store import ModelStore
@@ -93,7 +93,7 @@ def test_a_pushed_bundle_is_whole_on_the_disk_and_can_be_activated(store, tmp_pa
 
 def test_a_cut_push_goes_on_where_it_stopped_in_another_process_too(store, tmp_path, data):
     with pytest.raises(
-        TransferInterrupted, match=r"interrupted at \d+ of \d+ bytes: whoever pushed it does not answer"
+        TransferInterrupted, match=r"interrupted at \d+ of \d+ bytes: the client that pushed it does not answer"
     ):
         fetch(store, wanted(data), source(data, until=len(data) - 1))
     have = store.partial()[wanted(data).digest]
@@ -125,7 +125,7 @@ def with_nan():
 @pytest.mark.parametrize(
     ("bad", "claimed", "telling"),
     [
-        (flipped, None, "the sha256 of what came is"),
+        (flipped, None, "the sha256 of the received bytes is"),
         (lambda data: data[: len(data) // 2], "itself", "not a whole safetensors file"),
         (lambda _: b"hello, I am no model at all", "itself", "not a safetensors file"),
         (lambda _: with_nan(), "itself", "not finite"),
@@ -156,7 +156,7 @@ def test_what_can_not_be_kept_is_refused_before_the_first_byte(tmp_path, data, m
 
 def test_a_folder_that_can_not_be_written_to_is_a_refusal(tmp_path, data):
     (tmp_path / "staging").write_text("a file where a folder should be")
-    with pytest.raises(NoStore, match="its folder can not be written to"):
+    with pytest.raises(NoStore, match="its folder is not writable"):
         fetch(ModelStore(tmp_path), wanted(data), source(data))
 
 
@@ -209,14 +209,14 @@ def test_two_pushes_of_one_bundle_at_once_move_it_once(tmp_path, data):
     first.join()
     second.join()
     assert results == [len(data), 0]
-    assert steps[1][0].text == "another push of the same model is under way"
+    assert steps[1][0].text == "another push of the same model is in progress"
 
 
 def test_a_source_that_answers_wrongly_is_asked_again_and_then_given_up(store, data):
     def pull(digest, request):
         return source(data)(digest, request) + b"\0"
 
-    with pytest.raises(TransferInterrupted, match="asked for were"):
+    with pytest.raises(TransferInterrupted, match="instead of"):
         fetch(store, wanted(data), pull)
 
     def refuses(_, __):
@@ -229,7 +229,7 @@ def test_a_source_that_answers_wrongly_is_asked_again_and_then_given_up(store, d
 def test_a_node_that_stops_does_not_wait_for_chunks(tmp_path, data):
     stopping = threading.Event()
     stopping.set()
-    with pytest.raises(TransferInterrupted, match="this node stops"):
+    with pytest.raises(TransferInterrupted, match="this node is stopping"):
         fetch(ModelStore(tmp_path, patience_s=600), wanted(data), source(data, until=0), stop=stopping)
 
 
@@ -244,8 +244,8 @@ def lengths_over(chunks, *, seconds_per_byte, seconds=0.0):
 
 def test_chunks_grow_as_far_as_they_hold_the_link_for_a_millisecond_or_two():
     slow = lengths_over(500, seconds_per_byte=8 / 20e6)  # 20 Mbit/s
-    assert (slow[0], max(slow)) == (LEAST_BYTES, 2 * LEAST_BYTES)
-    assert np.mean(slow) < 1.2 * LEAST_BYTES
+    assert (slow[0], max(slow)) == (MIN_CHUNK_BYTES, 2 * MIN_CHUNK_BYTES)
+    assert np.mean(slow) < 1.2 * MIN_CHUNK_BYTES
     assert max(lengths_over(500, seconds_per_byte=8 / 1e9)) == 1 << 17
     assert max(lengths_over(500, seconds_per_byte=0)) == 1 << 20
 

@@ -11,7 +11,8 @@ from neurove_core.config import WindowConfig
 from neurove_core.models import bundle
 from neurove_protocol import Flag
 from neurove_protocol.errors import Conflict, Diverged, InvalidField, NoMemory, NothingBefore, TooSlow
-from neurove_service.models.slot import ModelSlot, Rules
+from neurove_service.models.change import Rules
+from neurove_service.models.slot import ModelSlot
 from neurove_service.streams.comparison import TrialLimits
 from neurove_service.streams.stream import Arrival, Stream
 from tests.builders import make_packets
@@ -60,8 +61,8 @@ def feed(stream, packets):
     estimates = []
     for packet in packets:
         estimates += stream.accept(packet, Arrival(1, 2))
-        while packet.seq % 40 and stream.owes:  # now and then the model beside lags
-            stream.attend()
+        while packet.seq % 40 and stream.lanes.has_backlog:  # now and then the model beside lags
+            stream.lanes.run_standby()
     return estimates
 
 
@@ -145,7 +146,7 @@ def test_of_two_changes_at_once_one_wins_and_the_other_is_told_at_once(slots):
     winner.start()
     assert stuck.wait(20)
     told = []
-    with pytest.raises(Conflict, match="another one is under way"):
+    with pytest.raises(Conflict, match="another model change is in progress"):
         slot.activate("three", on_progress=told.append)
     with pytest.raises(Conflict):
         slot.rollback()
@@ -158,7 +159,7 @@ def test_of_two_changes_at_once_one_wins_and_the_other_is_told_at_once(slots):
 def test_a_change_that_expects_another_model_is_refused(slots):
     slot = slots()
     digest = slot.active.estimator.bundle.digest
-    with pytest.raises(Conflict, match="ffffffff is expected to be active, but one"):
+    with pytest.raises(Conflict, match="expected ffffffff to be active, but one"):
         slot.activate("two", expect="ffffffff")
     with pytest.raises(InvalidField, match="expect='abc': at least 8 digits"):
         slot.activate("two", expect="abc")
@@ -211,7 +212,7 @@ def test_a_canary_switches_the_named_streams_alone_until_it_is_promoted(slots):
     others = make_packets(300, stream="cam1")
     feed(a, packets[:50]), feed(b, others[:50])
     slot.activate("two", canary=frozenset({"cam0", "cam9"}), on_progress=told.append)
-    assert "not here yet: ['cam9']" in next(one.text for one in told if one.step == "active")
+    assert "these streams do not exist yet: ['cam9']" in next(one.text for one in told if one.step == "active")
     assert {one.model for one in feed(a, packets[50:100])} == {"two"}
     assert {one.model for one in feed(b, others[50:100])} == {"one"}
     assert slot.active.estimator.bundle.name == "one"
@@ -274,7 +275,7 @@ def test_a_shadow_that_breaks_a_limit_is_refused_with_the_figure_and_nothing_cha
         wait_until(lambda: len(live.estimates) > count + 3)
     assert steps(told)[-1] == "refused"
     assert {(one.model, one.epoch) for one in live.estimates} == {("one", 0)}
-    assert not stream.owes
+    assert not stream.lanes.has_backlog
     assert slot.previous is None
 
 
@@ -367,7 +368,7 @@ def test_a_rollback_after_probation_primes_the_old_model(slots):
     slot.activate("two")
     assert slot.await_probation(10)
     feed(stream, packets[50:100])
-    assert stream.lanes.beside is None
+    assert stream.lanes.standby is None
     wait_until(lambda: kept == ["two"])
     taken, serving = slot.rollback(on_progress=told.append)
     after = feed(stream, packets[100:])

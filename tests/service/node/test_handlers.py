@@ -27,8 +27,9 @@ from neurove_protocol.errors import (
     UnknownModel,
 )
 from neurove_service.models.active_file import Active, ActiveFile
+from neurove_service.models.change import Rules
 from neurove_service.models.signatures import Signed
-from neurove_service.models.slot import ModelSlot, Rules
+from neurove_service.models.slot import ModelSlot
 from neurove_service.models.store import ModelStore
 from neurove_service.node.handlers import Handlers
 from neurove_service.node.health import stream_status
@@ -57,7 +58,7 @@ def handlers(slot, stream, clock):
 def feed(stream, clock, packets):
     for packet in packets:
         for estimate in stream.accept(packet, Arrival(clock[0], clock[0])):
-            stream.published(estimate)
+            stream.activity.published(estimate)
 
 
 def ask_health(handlers):
@@ -110,7 +111,7 @@ def test_health_tells_how_the_newest_change_of_model_went_and_whether_the_node_i
     assert ask_health(handlers).change == "two is active"
     slot.fault(serving, "planted")
     told = ask_health(handlers)
-    assert (told.change, told.rollbacks) == ("two was rolled back by itself: planted", 1)
+    assert (told.change, told.rollbacks) == ("two was rolled back automatically: planted", 1)
     assert (told.model.name, told.epoch) == ("one", 2)
     with pytest.raises(UnknownModel):
         slot.activate("three")

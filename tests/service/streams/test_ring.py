@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from neurove_core.ingest.windows import Window
-from neurove_service.streams.ring import Ring, packed
+from neurove_service.streams.ring import Ring, pack
 
 SHAPE = (10, 16, 24)
 
@@ -17,7 +17,7 @@ def window(number, share=0.1):
 @pytest.mark.parametrize("shape", [SHAPE, (10, 130, 172)], ids=["small", "more than 16 bits of cells"])
 def test_a_window_comes_out_as_it_went_in_and_takes_no_more_room_than_its_counts(share, shape):
     counts = np.resize(window(3, share).counts, shape)
-    entry = packed(Window(7, counts, 5, 2))
+    entry = pack(Window(7, counts, 5, 2))
     back = entry.window()
     np.testing.assert_array_equal(back.counts, counts)
     assert (back.start_us, back.events, back.outside) == (7, 5, 2)
@@ -29,7 +29,7 @@ def test_a_window_comes_out_as_it_went_in_and_takes_no_more_room_than_its_counts
 def test_a_ring_keeps_the_newest_windows_in_order():
     ring = Ring(4, 1 << 30)
     for number in range(10):
-        ring.append(packed(window(number)))
+        ring.append(pack(window(number)))
     assert [entry.start_us // 50_000 for entry in ring.newest(100)] == [6, 7, 8, 9]
     assert [entry.start_us // 50_000 for entry in ring.newest(2)] == [8, 9]
     assert [entry.start_us // 50_000 for entry in ring.after(8 * 50_000)] == [8, 9]
@@ -37,9 +37,9 @@ def test_a_ring_keeps_the_newest_windows_in_order():
 
 
 def test_a_ring_never_takes_more_bytes_than_it_may():
-    entry = packed(window(0, 1.0))
+    entry = pack(window(0, 1.0))
     ring = Ring(1000, 3 * entry.size + 10)
     for number in range(50):
-        ring.append(packed(window(number, 1.0)))
+        ring.append(pack(window(number, 1.0)))
         assert ring.bytes <= 3 * entry.size + 10
     assert len(ring.newest(1000)) == 3

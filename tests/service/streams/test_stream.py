@@ -150,8 +150,8 @@ def test_another_sensor_size_resets_and_flags_the_next_estimate(stream):
 def test_camera_info_calibrates_from_the_next_packet_on(stream):
     camera = CameraInfo(stream="cam0", width=64, height=48, lens="pinhole", fx=40, fy=40, cx=32, cy=24, height_m=1.0)
     before = feed(stream, make_packets(30))
-    stream.see_through(camera)
-    stream.see_through(camera)
+    stream.set_camera(camera)
+    stream.set_camera(camera)
     after = feed(stream, make_packets(40, first_seq=30, start_us=120_000))
     assert all({Flag.UNCALIBRATED, Flag.UNSCALED} <= set(one.flags) for one in before)
     assert not any({Flag.UNCALIBRATED, Flag.UNSCALED} & set(one.flags) for one in after)
@@ -160,7 +160,7 @@ def test_camera_info_calibrates_from_the_next_packet_on(stream):
 
 
 def test_camera_info_of_another_sensor_is_not_used(stream):
-    stream.see_through(CameraInfo(stream="cam0", width=9, height=9, lens="pinhole", fx=40, fy=40, cx=4, cy=4))
+    stream.set_camera(CameraInfo(stream="cam0", width=9, height=9, lens="pinhole", fx=40, fy=40, cx=4, cy=4))
     assert all(Flag.UNCALIBRATED in one.flags for one in feed(stream, make_packets(30)))
 
 

@@ -5,6 +5,7 @@ import pytest
 from neurove_protocol import CameraInfo, TwistEstimate
 from neurove_protocol.errors import Malformed
 from neurove_protocol.events import PacketLimits, encode_packet
+from neurove_service.streams.lanes import Lanes
 from neurove_service.streams.stream import Stream
 from neurove_service.streams.worker import Inbox, Outlet, Sample, StreamWorker
 from tests.builders import make_packets
@@ -118,8 +119,8 @@ def test_a_fault_while_working_on_a_packet_does_not_end_the_stream(worker, publi
 
 def test_a_model_beside_gets_its_turns_however_often_packets_come(worker, monkeypatch):
     turns = []
-    monkeypatch.setattr(Stream, "owes", property(lambda _: True))
-    monkeypatch.setattr(worker.stream, "attend", lambda: turns.append(threading.Event().wait(0.03)))
+    monkeypatch.setattr(Lanes, "has_backlog", property(lambda _: True))
+    monkeypatch.setattr(worker.stream.lanes, "run_standby", lambda: turns.append(threading.Event().wait(0.03)))
     for packet in make_packets(400, n=5):
         worker.put_packet(encode_packet(packet), 1)
         threading.Event().wait(0.005)  # a packet comes in each of its rests
