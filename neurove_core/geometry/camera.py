@@ -1,4 +1,4 @@
-"""Poses become twists; camera models and the canonical camera's look-up table: any sensor, one network."""
+"""Camera: lens models, and the look-up table from the pixels of any sensor to the canonical camera."""
 
 import math
 
@@ -6,12 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.config import CanonicalConfig
-from neurove_core.geometry.motion import _ITERATIONS, _TOLERANCE
 from neurove_protocol import CameraInfo, Sensor
 from neurove_protocol.errors import InvalidField
 
 OUTSIDE = -1
 """Entry of a look-up table for a pixel that looks past the canonical camera's field of view."""
+
+_ITERATIONS = 20  # of undistortion, at most
+_TOLERANCE = 1e-7  # an iteration that moves less [focal lengths] is the last
 
 
 def focal_px(canonical: CanonicalConfig) -> float:

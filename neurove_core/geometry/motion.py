@@ -11,6 +11,8 @@ from neurove_protocol.errors import InvalidField
 MAX_GAP_US = 500_000
 """Between samples further apart than this nothing is interpolated; the slowest truth we know comes every 200 ms."""
 
+_BLOCK = 1 << 15  # poses whose motion is fitted at once: some 20 MB
+
 
 class Poses(NamedTuple):
     """Where a camera was, ordered by time: its optical frame (x right, y down, z forward) in a world."""
@@ -39,15 +41,6 @@ class Twists(NamedTuple):
             between = a + fraction[:, None] * (b - a)
         # a sample's own time needs only itself, whatever its neighbour is
         return np.where(fraction[:, None] == 0, a, np.where(fraction[:, None] == 1, b, between))
-
-
-_BLOCK = 1 << 15  # poses whose motion is fitted at once: some 20 MB
-
-
-_ITERATIONS = 20
-
-
-_TOLERANCE = 1e-7
 
 
 def filter_for(poses: Poses) -> float:
