@@ -20,8 +20,8 @@ from torch import Tensor, nn
 from neurove_core.config import Config, ModelConfig
 from neurove_core.files import write_atomically
 from neurove_core.models import golden
-from neurove_core.models.about import About, BundleLimits
 from neurove_core.models.golden import Golden
+from neurove_core.models.metadata import About, BundleLimits
 from neurove_core.models.uncertainty import Uncertainty, why_no_correlation
 from neurove_core.networks import kinds
 from neurove_core.networks.kinds import Network

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from neurove_core import self_test
 from neurove_core.estimator import Estimator
-from neurove_core.models.about import About, MadeBy
 from neurove_core.models.bundle import Bundle
+from neurove_core.models.metadata import About, MadeBy
 from neurove_core.networks import kinds
 from neurove_core.training.loop import commit
 from neurove_core.training.run import check_same_network

@@ -18,8 +18,8 @@ from neurove_core import self_test
 from neurove_core.estimator import Estimator
 from neurove_core.files import write_atomically
 from neurove_core.models import bundle, golden
-from neurove_core.models.about import About, MadeBy
 from neurove_core.models.bundle import Bundle
+from neurove_core.models.metadata import About, MadeBy
 from neurove_core.networks.encoding import to_spikes
 from neurove_core.networks.state import detached
 from neurove_core.training.batches import Segment, draw

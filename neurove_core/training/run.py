@@ -19,8 +19,8 @@ from torch import Tensor, nn
 
 from neurove_core.config import ModelConfig
 from neurove_core.files import write_atomically
-from neurove_core.models.about import About
 from neurove_core.models.bundle import PER_HEIGHT, Bundle
+from neurove_core.models.metadata import About
 from neurove_core.networks import kinds
 from neurove_core.networks.kinds import Network
 from neurove_core.training.config import RecipeConfig, TrainingConfig

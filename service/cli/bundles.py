@@ -235,7 +235,7 @@ def add(commands: Any) -> None:
 
 
 def _release(text: str) -> int:
-    from neurove_core.models.about import MAX_RELEASE
+    from neurove_core.models.metadata import MAX_RELEASE
 
     try:
         value = int(text)

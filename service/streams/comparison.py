@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.models import about
+from neurove_core.models import metadata
 from neurove_core.models.bundle import Bundle
 
 FLOOR_M_S, FLOOR_RAD_S = 0.1, 0.05
@@ -26,7 +26,7 @@ class TrialLimits(NamedTuple):
     divergence: float = 1.0  # RMS difference of the estimates, in RMS of the proven model's
     rate_ratio: float = 8.0  # share of cells that fire, in that of the proven model, either way
     latency_share: float = 0.5  # median time for a window, in the window's duration
-    own: about.BundleLimits = about.BundleLimits()  # what the model's bundle says of it besides, where it does
+    own: metadata.BundleLimits = metadata.BundleLimits()  # what the model's bundle says of it besides, where it does
 
     def and_of(self, bundle: Bundle) -> "TrialLimits":
         """These, and those that a bundle sets itself: it may be stricter than the node, never laxer."""

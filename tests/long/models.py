@@ -11,8 +11,8 @@ import torch
 
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
 from neurove_core.models import bundle, manifest, signing_keys
-from neurove_core.models.about import About
 from neurove_core.models.bundle import Bundle
+from neurove_core.models.metadata import About
 from neurove_core.networks.neurove import NeuroVE
 
 WINDOW_US = 20_000

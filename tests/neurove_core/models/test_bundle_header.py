@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 import neurove_core
 from neurove_core.models import bundle, golden, manifest
-from neurove_core.models.about import About, BundleLimits, MadeBy
 from neurove_core.models.bundle import Header
+from neurove_core.models.metadata import About, BundleLimits, MadeBy
 from neurove_protocol.errors import BadModel
 from tests.bundles import CONFIG, DATA, ORIGINAL, packed, refusal, unpacked, with_entries, with_fields
 

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neurove_core.models import bundle, manifest, signing_keys
-from neurove_core.models.about import About
+from neurove_core.models.metadata import About
 from neurove_protocol.errors import BadModel, Downgrade, InvalidField, Untrusted
 from tests.bundles import CONFIG, DATA, ORIGINAL, make_bundle
 

@@ -12,7 +12,7 @@ import torch
 from neurove_core import self_test
 from neurove_core.estimator import Estimator
 from neurove_core.models import bundle, golden
-from neurove_core.models.about import About, BundleLimits, MadeBy
+from neurove_core.models.metadata import About, BundleLimits, MadeBy
 from neurove_service.cli import main
 from tests.bundles import CONFIG, DATA, ORIGINAL, with_fields, with_tensors
 

@@ -9,7 +9,7 @@ import torch
 
 from neurove_core.config import ModelConfig
 from neurove_core.models import bundle
-from neurove_core.models.about import About
+from neurove_core.models.metadata import About
 from neurove_protocol.errors import Diverged
 from neurove_service.models.slot import ModelSlot, Rules
 from neurove_service.streams.lane import windows_to_prime
