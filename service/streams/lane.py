@@ -126,7 +126,7 @@ class Primed(NamedTuple):
 
 def windows_to_prime(estimator: Estimator) -> int:
     """Windows that a model should have seen before it answers a stream: as its bundle says, where it does."""
-    told = estimator.bundle.about.prime_windows
+    told = estimator.bundle.metadata.prime_windows
     return max(estimator.config.settle_windows, PRIME_WINDOWS) if told is None else told
 
 

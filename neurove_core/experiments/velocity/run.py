@@ -184,7 +184,7 @@ def shipped(plan: Plan, folder: Path) -> dict[str, Any] | None:
     if (model.config.window, model.config.canonical) != (plan.config.model.window, plan.config.model.canonical):
         return None
     figures, _ = _figures(model, items(plan.recordings, quick=plan.quick), Kept(folder, plan.config.model))
-    made_by = model.about.made_by
+    made_by = model.metadata.made_by
     return figures | {"updates": made_by and made_by.updates, "program": made_by and made_by.program}
 
 

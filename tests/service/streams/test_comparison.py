@@ -69,10 +69,10 @@ def test_a_slow_model_is_found_with_its_figure_and_bound():
 def test_a_bundle_may_be_stricter_about_itself_than_the_node(own, words, front_is_tried):
     measured = trial(DRIVING, (0.3, 0.4, 2, 0, 0.5, 0.2), front_is_tried=front_is_tried).measured()
     assert finding(measured, TrialLimits()) is None
-    strict = TrialLimits().and_of(replace(make_bundle(), about=metadata.About(limits=own)))
+    strict = TrialLimits().and_of(replace(make_bundle(), metadata=metadata.Metadata(limits=own)))
     assert str(finding(measured, strict)) == words
     lax = metadata.BundleLimits(mean_dv_m_s=0.6, mean_dw_rad_s=0.3, latency_ratio=1.1)
-    lax_too = TrialLimits(divergence=0.1).and_of(replace(make_bundle(), about=metadata.About(limits=lax)))
+    lax_too = TrialLimits(divergence=0.1).and_of(replace(make_bundle(), metadata=metadata.Metadata(limits=lax)))
     assert finding(measured, lax_too).field == "divergence"  # what the node says holds all the same
 
 
