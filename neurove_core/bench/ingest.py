@@ -30,7 +30,7 @@ def ingest(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool
     """Events of one window to counts [2n, H, W] of a DAVIS346; the limit is to add to cells that are already known."""
     found: list[Row] = []
     for n in (5_000,) if quick else (100_000, 1_000_000):
-        events = draw(n)
+        events = sweeping_edge(n)
         known = _cells(events)
         runs: dict[str, Callable[[], Any]] = {
             "ours": _counted(count_events, events),
@@ -73,7 +73,7 @@ def end_to_end(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: 
     """Events of one window to its estimate, 1e5 events of a DAVIS346, from rest."""
     found: list[Row] = []
     shapes = {"tiny": window.TINY} if quick else {"shipped": window.SHIPPED, "reference, T=1": window.REFERENCE}
-    events = draw(5_000 if quick else 100_000)
+    events = sweeping_edge(5_000 if quick else 100_000)
     tonic = peers.load("tonic.functional", missing) if with_peers else None
     for name, config in shapes.items():
         estimator = Estimator(bundle.untrained(0, config))
@@ -89,7 +89,7 @@ def end_to_end(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: 
         expected = runs["ours"]()
         equal: dict[str, bool | None] = {
             peer: None
-            if any(name in peer for name in peers.ELSEWISE)
+            if any(name in peer for name in peers.DIFFERENT_BY_DESIGN)
             else bool(np.allclose(run(), expected, rtol=1e-3, atol=1e-4))
             for peer, run in runs.items()
             if not peer.startswith("ours")
@@ -102,25 +102,25 @@ def end_to_end(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: 
 
 
 def _estimated(estimator: Estimator, events: Events) -> Callable[[], NDArray[Any]]:
-    rest = estimator.initial_state(
+    initial = estimator.initial_state(
         SENSOR
     )  # its network state and look-up table, as a stream has them; no window is open
 
     def run() -> NDArray[Any]:
-        return estimator.push(events, rest, DURATION_US).estimates[0].twists
+        return estimator.push(events, initial, DURATION_US).estimates[0].twists
 
     return run
 
 
 def _in_steps(counts: Callable[[], NDArray[np.uint8]], network: NeuroVE) -> Callable[[], NDArray[Any]]:
     """Counts to a network's input to its answer, in plain PyTorch or a peer's neurons, from rest."""
-    rest, encoding = network.initial_state(1), network.config.network.encoding
+    initial, encoding = network.initial_state(1), network.config.network.encoding
 
     @torch.inference_mode()
     def run() -> NDArray[Any]:
         spikes = to_spikes_reference(torch.from_numpy(counts()), encoding)
         with plain():
-            twists: NDArray[Any] = network(spikes[None, None], rest)[0][0, 0].numpy()
+            twists: NDArray[Any] = network(spikes[None, None], initial)[0][0, 0].numpy()
         return twists
 
     return run
@@ -153,7 +153,7 @@ def _tonic_counts(tonic: Any, config: ModelConfig, events: Events) -> Callable[[
 
 def decode(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool) -> list[Row]:
     """An EVT3 file of a Prophesee camera to events."""
-    events = draw(5_000 if quick else 1_000_000, Sensor(1280, 720))
+    events = sweeping_edge(5_000 if quick else 1_000_000, Sensor(1280, 720))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "recording.raw"
         header = b"% evt 3.0\n% format EVT3;height=720;width=1280\n% geometry 1280x720\n% end\n"
@@ -178,7 +178,7 @@ def decode(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool
         return rows(f"decode EVT3, {events.n:.0e} events", times, equal)
 
 
-def draw(n: int, sensor: Sensor = SENSOR) -> Events:
+def sweeping_edge(n: int, sensor: Sensor = SENSOR) -> Events:
     """An edge that sweeps over the sensor in one window, with noise: where events are, others are."""
     rng = np.random.default_rng(0)
     t = np.sort(rng.integers(0, DURATION_US, n))
@@ -251,11 +251,11 @@ def _evt3(events: Events) -> NDArray[np.uint16]:
     """Words of single events: TIME_HIGH, TIME_LOW and ADDR_Y only where they change, ADDR_X for each event."""
     t, y = events.t, events.y.astype(np.int64)
     words = np.stack([0x8000 | t >> 12, 0x6000 | t & 0xFFF, y, 0x2000 | events.p.astype(np.int64) << 11 | events.x])
-    said = np.ones(words.shape, np.bool_)
-    said[0, 1:] = np.diff(t >> 12) != 0
-    said[1, 1:] = np.diff(t) != 0
-    said[2, 1:] = np.diff(y) != 0
-    return words.T[said.T].astype("<u2")
+    written = np.ones(words.shape, np.bool_)
+    written[0, 1:] = np.diff(t >> 12) != 0
+    written[1, 1:] = np.diff(t) != 0
+    written[2, 1:] = np.diff(y) != 0
+    return words.T[written.T].astype("<u2")
 
 
 def _same_events(theirs: list[Any], ours: list[Events]) -> bool:

@@ -43,7 +43,7 @@ def networks(network: NeuroVE, missing: Missing) -> dict[str, NeuroVE]:
     return {name: peer for name, peer in made.items() if peer is not None}
 
 
-ELSEWISE: Final = ("snnTorch", "norse")
+DIFFERENT_BY_DESIGN: Final = ("snnTorch", "norse")
 """Peers that compute something else by design: snnTorch resets a step later, norse rounds its potential elsewhere."""
 
 Neurons = Callable[[SpikingBlock], tuple[Callable[[Tensor], Tensor], Callable[[], None]]]
@@ -62,12 +62,12 @@ class PeerBlock(nn.Module):
     def __init__(self, block: SpikingBlock, neurons: Neurons, *, stepwise: bool) -> None:
         super().__init__()
         self.conv, self.norm = block.conv, block.norm
-        self._fire, self._rest = neurons(block)
+        self._fire, self._reset = neurons(block)
         self._stepwise = stepwise
 
     def forward(self, spikes: Tensor, state: LIFState) -> tuple[Tensor, LIFState]:
         """As SpikingBlock.forward; the state goes through unseen."""
-        self._rest()
+        self._reset()
         if self._stepwise:
             return torch.stack([self._fire(self.norm(self.conv(x))) for x in spikes]), state
         current: Tensor = self.norm(self.conv(spikes.flatten(0, 1)))

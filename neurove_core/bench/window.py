@@ -55,23 +55,23 @@ def _windows(
     network = _network(config)
     quantised = config.network.precision == "int8"
     in_float32 = _network(with_precision(config, "float32")) if quantised else network
-    spikes, rest = draw(config, steps), network.initial_state(1)
+    spikes, initial = random_input(config, steps), network.initial_state(1)
     given = quantisation.codes(spikes).contiguous() if quantised else spikes  # as the encoding lays them
     engine = Engine(network)
     others = peers.networks(in_float32, missing) if with_peers else {}
-    runs: dict[str, Callable[[], object]] = {"ours": lambda: engine(given, rest)}
+    runs: dict[str, Callable[[], object]] = {"ours": lambda: engine(given, initial)}
     for peer, theirs in {"PyTorch, plain": network, **others}.items():
-        runs[peer] = _plainly(theirs, spikes, rest)
+        runs[peer] = _plainly(theirs, spikes, initial)
     with torch.inference_mode():
-        fired = engine.features(spikes, rest)[0]
-        equal: dict[str, bool | None] = {"PyTorch, plain": _agree(engine, network, spikes, rest)}
+        fired = engine.features(spikes, initial)[0]
+        equal: dict[str, bool | None] = {"PyTorch, plain": _agree(engine, network, spikes, initial)}
         with plain():
             for peer, theirs in others.items():
                 fires_alike = bool(torch.equal(peers.features(theirs, spikes), fired))
-                equal[peer] = None if quantised or peer in peers.ELSEWISE else fires_alike
+                equal[peer] = None if quantised or peer in peers.DIFFERENT_BY_DESIGN else fires_alike
         if quantised:
             wide = Engine(in_float32)
-            runs["ours, float32"], equal["ours, float32"] = lambda: wide(spikes, rest), None
+            runs["ours, float32"], equal["ours, float32"] = lambda: wide(spikes, initial), None
         times = interleaved({**runs, "peak": machine.peak()}, rounds)
     if not quantised:  # no limit: where few fire most products are left out
         times[AT_PEAK] = times["peak"] * steps * machine.flops(config) / machine.PEAK_FLOPS
@@ -85,7 +85,7 @@ def train(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool)
     found: list[Row] = []
     for name, (config, steps) in shapes.items():
         network = _network(config).requires_grad_().train()
-        spikes = draw(config, steps, batch=4)
+        spikes = random_input(config, steps, batch=4)
         others = peers.networks(network, missing) if with_peers else {}
         ours = _TrainingStep(network, spikes)
         runs: dict[str, Callable[[], object]] = {"ours": ours}
@@ -99,7 +99,7 @@ def train(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool)
             runs[peer] = _inside_plain(step)
         loss = ours.loss()
         equal: dict[str, bool | None] = {
-            peer: None if peer in peers.ELSEWISE else abs(value - loss) < 1e-4 * abs(loss)
+            peer: None if peer in peers.DIFFERENT_BY_DESIGN else abs(value - loss) < 1e-4 * abs(loss)
             for peer, value in losses.items()
         }
         found += rows(f"training step {name}, batch 4", interleaved(runs, rounds, warm_up=1), equal)
@@ -111,7 +111,7 @@ def streams(rounds: int, *, quick: bool) -> list[Row]:
     config = TINY if quick else SHIPPED
     network = _network(config)
     engine = Engine(network)
-    inputs = [draw(config, 1, seed=seed) for seed in range(8)]
+    inputs = [random_input(config, 1, seed=seed) for seed in range(8)]
     states = [network.initial_state(1) for _ in inputs]
 
     def in_turn() -> None:
@@ -123,8 +123,8 @@ def streams(rounds: int, *, quick: bool) -> list[Row]:
             states[0] = engine(inputs[0], states[0])[1]
 
     def at_once(count: int) -> Callable[[], object]:
-        joint, rest = torch.cat(inputs[:count], dim=1), [network.initial_state(1)] * count
-        return lambda: engine.together(joint, rest)
+        joint, initial = torch.cat(inputs[:count], dim=1), [network.initial_state(1)] * count
+        return lambda: engine.together(joint, initial)
 
     batches = {count: at_once(count) for count in (2, 4, 8)}
     runs = {f"{count} at once": run for count, run in batches.items()}
@@ -143,7 +143,7 @@ def streams(rounds: int, *, quick: bool) -> list[Row]:
     ]
 
 
-def draw(config: ModelConfig, steps: int, batch: int = 1, seed: int = 1) -> Tensor:
+def random_input(config: ModelConfig, steps: int, batch: int = 1, seed: int = 1) -> Tensor:
     """Input (T, B, 2n, H, W) as counts of a window are encoded, channels last as the encoding lays it."""
     shape = (steps, batch, 2 * config.window.bins, config.canonical.height, config.canonical.width)
     counts = torch.poisson(torch.full(shape, 0.3), generator=torch.Generator().manual_seed(seed))
@@ -170,13 +170,13 @@ def _inside_plain(run: Callable[[], object]) -> Callable[[], object]:
     return plainly
 
 
-def _agree(engine: Engine, network: NeuroVE, spikes: Tensor, rest: NetworkState) -> bool:
+def _agree(engine: Engine, network: NeuroVE, spikes: Tensor, initial: NetworkState) -> bool:
     """Whether the engine fires as its plain form, bit for bit, and the network answers alike in the first window."""
-    fired = engine.features(spikes, rest)[0]
+    fired = engine.features(spikes, initial)[0]
     with plain():
-        same = torch.equal(engine.features(spikes, rest)[0], fired)
-        expected = network(spikes[:1], rest)[0]
-    return bool(same and torch.allclose(engine(spikes[:1], rest)[0], expected, rtol=1e-3, atol=1e-4))
+        same = torch.equal(engine.features(spikes, initial)[0], fired)
+        expected = network(spikes[:1], initial)[0]
+    return bool(same and torch.allclose(engine(spikes[:1], initial)[0], expected, rtol=1e-3, atol=1e-4))
 
 
 class _TrainingStep:
@@ -184,7 +184,7 @@ class _TrainingStep:
 
     def __init__(self, network: NeuroVE, spikes: Tensor) -> None:
         self._network, self._spikes = copy.deepcopy(network), spikes
-        self._rest = self._network.initial_state(spikes.shape[1])
+        self._initial = self._network.initial_state(spikes.shape[1])
         self._optimizer = torch.optim.Adam(self._network.parameters(), lr=1e-4, fused=True)  # for peers too
 
     def loss(self) -> float:
@@ -198,4 +198,4 @@ class _TrainingStep:
         self._optimizer.step()
 
     def _error(self) -> Tensor:
-        return torch.mean((self._network(self._spikes, self._rest)[0] - 0.5).square())
+        return torch.mean((self._network(self._spikes, self._initial)[0] - 0.5).square())

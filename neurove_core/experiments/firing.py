@@ -66,14 +66,14 @@ class Rate(NamedTuple):
     sd: float
 
 
-class Report(NamedTuple):
+class Results(NamedTuple):
     """What one run measured."""
 
     seed: int  # of the first of SEEDS runs
     rates: dict[str, dict[str, Rate]]  # by neuron, then by current
 
 
-def run(seed: int = 0) -> Report:
+def run(seed: int = 0) -> Results:
     """Measure every neuron under every current, with the seeds seed to seed + 9.
 
     Raises:
@@ -88,7 +88,7 @@ def run(seed: int = 0) -> Report:
         rates[neuron] = {
             kind: Rate(row.mean().item(), row.std().item()) for kind, row in zip(CURRENTS, of_kind, strict=True)
         }
-    return Report(seed, rates)
+    return Results(seed, rates)
 
 
 def random_current(kind: str, seed: int, steps: int = STEPS) -> Tensor:
@@ -195,33 +195,34 @@ def stacked(steps: list[tuple[Tensor, Tensor]]) -> NeuronSteps:
     return NeuronSteps(torch.stack(spikes), torch.stack(potentials))
 
 
-def to_json(report: Report) -> str:
-    """The report for machines: set-up, rates, and the preparing study's rates."""
+def to_json(results: Results) -> str:
+    """The results for machines: set-up, rates, and the preparing study's rates."""
     about = {
-        "command": f"neurove reproduce firing --seed {report.seed}",
-        "seeds": [report.seed, report.seed + SEEDS - 1],
+        "command": f"neurove reproduce firing --seed {results.seed}",
+        "seeds": [results.seed, results.seed + SEEDS - 1],
         "steps": STEPS,
         "v_th": V_TH,
         "decay": DECAY,
         "currents": CURRENTS,
         "rates": {
-            neuron: {kind: rate._asdict() for kind, rate in by_kind.items()} for neuron, by_kind in report.rates.items()
+            neuron: {kind: rate._asdict() for kind, rate in by_kind.items()}
+            for neuron, by_kind in results.rates.items()
         },
         "study": STUDY,
     }
     return json.dumps(about, indent=2) + "\n"
 
 
-def to_markdown(report: Report) -> str:
+def to_markdown(results: Results) -> str:
     """The rates as a table: mean over the seeds, deviation between them, and the preparing study's in brackets."""
     lines = [
-        f"Spikes per step: mean ± standard deviation over {SEEDS} seeds ({report.seed} to {report.seed + SEEDS - 1}) "
+        f"Spikes per step: mean ± standard deviation over {SEEDS} seeds ({results.seed} to {results.seed + SEEDS - 1}) "
         f"of {STEPS} steps; in brackets the preparing study's. LIF and ALIF: v_th {V_TH:g}, leak {DECAY:g}.",
         "",
         f"| neuron | {' | '.join(CURRENTS)} |",
         f"| --- | {' | '.join('---' for _ in CURRENTS)} |",
     ]
-    for neuron, by_kind in report.rates.items():
+    for neuron, by_kind in results.rates.items():
         cells = (cell(rate, STUDY.get(neuron, {}).get(kind)) for kind, rate in by_kind.items())
         lines.append(f"| {neuron} | {' | '.join(cells)} |")
     lines += [
@@ -241,17 +242,17 @@ def cell(rate: Rate, study: float | None) -> str:
     return f"{rate.mean:.3f} ± {rate.sd:.3f}" + ("" if study is None else f" ({study:.3f})")
 
 
-def save(report: Report, out: Path) -> list[Path]:
+def save(results: Results, out: Path) -> list[Path]:
     """Write firing.json, firing.md, firing.png and firing.svg into a folder; returns their paths.
 
     Raises:
         MissingExtra: matplotlib is not installed; then nothing is written.
         InvalidField: a file cannot be written.
     """
-    figure = draw(report.seed)
+    figure = draw(results.seed)
     return [
-        save_text(to_json(report), out / "firing.json"),
-        save_text(to_markdown(report), out / "firing.md"),
+        save_text(to_json(results), out / "firing.json"),
+        save_text(to_markdown(results), out / "firing.md"),
         *save_figure(figure, out / "firing"),
     ]
 

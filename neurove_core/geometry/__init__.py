@@ -1,1 +1,1 @@
-"""Rotations, motion (poses and twists), and the camera (lens and look-up table)."""
+"""Geometry: rotations, motion (poses and twists), and the camera (lens models and look-up table)."""

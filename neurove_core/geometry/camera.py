@@ -1,4 +1,4 @@
-"""Poses become twists; camera models and the canonical camera's look-up table: any sensor, one network."""
+"""Camera: lens models, and the look-up table from the pixels of any sensor to the canonical camera."""
 
 import math
 
@@ -6,12 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.config import CanonicalConfig
-from neurove_core.geometry.motion import _ITERATIONS, _TOLERANCE
 from neurove_protocol import CameraInfo, Sensor
 from neurove_protocol.errors import InvalidField
 
 OUTSIDE = -1
-"""Entry of a look-up table for a pixel that looks past the canonical camera's field of view."""
+"""Entry of a look-up table for a pixel outside the canonical camera's field of view."""
+
+_ITERATIONS = 20  # most iterations of undistortion
+_TOLERANCE = 1e-7  # undistortion stops below this error or step (in focal lengths or radians)
 
 
 def focal_px(canonical: CanonicalConfig) -> float:
@@ -24,21 +26,21 @@ def focal_px(canonical: CanonicalConfig) -> float:
 
 
 def lookup_table(canonical: CanonicalConfig, sensor: Sensor, camera: CameraInfo | None) -> NDArray[np.int32]:
-    """Which cell of the canonical camera each pixel of a sensor looks into.
+    """The cell of the canonical camera for each pixel of a sensor.
 
-    Undistortion, scaling and cropping cost one table read per event. Without CameraInfo the sensor's rectangle is
-    scaled plainly onto the grid.
+    With this table, undistortion, scaling and cropping cost one table read per event. Without CameraInfo, the whole
+    sensor is scaled to the grid.
 
     Args:
         canonical: the grid that the network sees.
         sensor: the pixel array of the events.
-        camera: its lens, where known.
+        camera: the lens of the sensor, if known.
 
     Returns:
         (sensor.height, sensor.width) of row * width + column, or OUTSIDE.
 
     Raises:
-        InvalidField: the camera info is of another sensor.
+        InvalidField: the camera info describes a sensor of another size.
     """
     if camera is None:
         columns = np.arange(sensor.width) * canonical.width // sensor.width
@@ -49,7 +51,7 @@ def lookup_table(canonical: CanonicalConfig, sensor: Sensor, camera: CameraInfo 
     u, v = np.meshgrid(np.arange(sensor.width, dtype=np.float64), np.arange(sensor.height, dtype=np.float64))
     x, y = undistort((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, camera)
     focal = focal_px(canonical)
-    with np.errstate(invalid="ignore"):  # a ray that the lens can not make is nan, and nan is outside
+    with np.errstate(invalid="ignore"):  # a pixel without a ray is nan, and nan is outside
         column = np.floor(x * focal + canonical.width / 2)
         row = np.floor(y * focal + canonical.height / 2)
         inside = (column >= 0) & (column < canonical.width) & (row >= 0) & (row < canonical.height)
@@ -60,12 +62,14 @@ def lookup_table(canonical: CanonicalConfig, sensor: Sensor, camera: CameraInfo 
 def undistort(
     xd: NDArray[np.float64], yd: NDArray[np.float64], camera: CameraInfo
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rays of distorted image points, by Newton's method on the radius or fixed-point iteration.
+    """Remove the lens distortion from image points: the rays through them.
+
+    Equidistant lenses use Newton's method on the angle, pinhole lenses a fixed-point iteration.
 
     Args:
         xd: (u - cx) / fx of any shape.
         yd: (v - cy) / fy of the same shape.
-        camera: whose distortion is taken off.
+        camera: defines the lens model and its distortion.
 
     Returns:
         x/z and y/z of the rays; nan where the lens model has no ray in front of the camera for the point.
@@ -78,7 +82,7 @@ def undistort(
 def distort(
     x: NDArray[np.float64], y: NDArray[np.float64], camera: CameraInfo
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where the lens puts the rays (x, y, 1): the inverse of undistort, same units."""
+    """Apply the lens distortion to the rays (x, y, 1): the inverse of undistort, in the same units."""
     if camera.lens == "equidistant":
         r = np.hypot(x, y)
         theta = np.arctan(r)
@@ -104,14 +108,14 @@ def _undistort_pinhole(
     if not any(distortion):
         return x, y
     error = np.zeros_like(x)
-    with np.errstate(all="ignore"):  # far outside the model's range the iteration may leave the numbers; see below
+    with np.errstate(all="ignore"):  # far outside the model's range the iteration may overflow; see `lost`
         for _ in range(_ITERATIONS):
             radial, dx, dy = _radial_tangential(x, y, distortion)
             error = np.hypot(x * radial + dx - xd, y * radial + dy - yd)
             if not (error >= _TOLERANCE).any():
                 break
             x, y = (xd - dx) / radial, (yd - dy) / radial
-        lost = ~(error < 1e-3) | (radial <= 0)  # below 0 the ray is on the other side of the axis
+        lost = ~(error < 1e-3) | (radial <= 0)  # radial < 0: the ray is on the opposite side of the axis
     x[lost] = y[lost] = np.nan
     return x, y
 

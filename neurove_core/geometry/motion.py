@@ -1,4 +1,4 @@
-"""Motion: poses to twists, and interpolation between samples."""
+"""Motion: from poses to twists, smoothing, and interpolation between samples."""
 
 from typing import NamedTuple
 
@@ -9,27 +9,29 @@ from neurove_core.geometry import rotations
 from neurove_protocol.errors import InvalidField
 
 MAX_GAP_US = 500_000
-"""Between samples further apart than this nothing is interpolated; the slowest truth we know comes every 200 ms."""
+"""Longest gap between two samples that is interpolated [us]; the slowest ground truth we know has 200 ms."""
+
+_BLOCK = 1 << 15  # poses that are fitted at once: about 20 MB
 
 
 class Poses(NamedTuple):
-    """Where a camera was, ordered by time: its optical frame (x right, y down, z forward) in a world."""
+    """Poses of a camera, ordered by time: its optical frame (x right, y down, z forward) in a world frame."""
 
     t: NDArray[np.int64]  # (N,) sensor clock [us]
-    position_m: NDArray[np.float64]  # (N, 3) of the camera in the world
-    orientation: NDArray[np.float64]  # (N, 4) unit quaternion x y z w: turns camera axes into the world's
+    position_m: NDArray[np.float64]  # (N, 3) position of the camera in the world
+    orientation: NDArray[np.float64]  # (N, 4) unit quaternion x y z w: rotates from the camera frame to the world frame
 
 
 class Twists(NamedTuple):
-    """How a camera moved, ordered by time, in its own optical frame (x right, y down, z forward)."""
+    """Twists of a camera, ordered by time, in its own optical frame (x right, y down, z forward)."""
 
     t: NDArray[np.int64]  # (N,) sensor clock [us]
-    twist: NDArray[np.float64]  # (N, 6) vx vy vz [m/s] wx wy wz [rad/s]; nan where it is not known
+    twist: NDArray[np.float64]  # (N, 6) vx vy vz [m/s] wx wy wz [rad/s]; nan where unknown
 
     def at(self, t_us: NDArray[np.int64], max_gap_us: int = MAX_GAP_US) -> NDArray[np.float64]:
-        """The twist (M, 6) at any times (M,), linear between the two samples around each.
+        """The twists (M, 6) at any times (M,) [us], interpolated linearly between the two neighbouring samples.
 
-        nan before the first sample, after the last, and between two that are further apart than `max_gap_us`.
+        They are nan before the first sample, after the last, and in gaps longer than `max_gap_us`.
         """
         first, fraction = _between(self.t, np.asarray(t_us, np.int64), max_gap_us)
         if not self.t.size:
@@ -37,68 +39,65 @@ class Twists(NamedTuple):
         a, b = self.twist[first], self.twist[np.minimum(first + 1, self.t.size - 1)]
         with np.errstate(invalid="ignore"):
             between = a + fraction[:, None] * (b - a)
-        # a sample's own time needs only itself, whatever its neighbour is
+        # at the time of a sample only that sample counts, even if its neighbour is nan
         return np.where(fraction[:, None] == 0, a, np.where(fraction[:, None] == 1, b, between))
 
 
-_BLOCK = 1 << 15  # poses whose motion is fitted at once: some 20 MB
-
-
-_ITERATIONS = 20
-
-
-_TOLERANCE = 1e-7
-
-
 def filter_for(poses: Poses) -> float:
-    """Length of the filter [s] that `twists` uses unless told: ten sampling intervals (median), at least 0.1 s.
+    """Default filter length of `twists` [s]: ten sampling intervals (median), at least 0.1 s.
 
-    Noise of poses is per sample, so the count of samples sets what is left of it: 0.5 s for odometry at 20 Hz, 0.1 s
-    for motion capture at 100 Hz and more.
+    Pose noise is independent per sample, so the number of samples sets the remaining noise. The length is 0.5 s for
+    odometry at 20 Hz and 0.1 s for motion capture at 100 Hz or more.
     """
     return max(0.1, 10 * float(np.median(np.diff(poses.t))) / 1e6) if poses.t.size > 1 else 0.1
 
 
 def twists(poses: Poses, *, filter_s: float | None = None) -> Twists:
-    """The camera's twist at each pose, in its own frame at that time.
+    """The camera's twist at each pose, in the camera frame at that time.
 
-    Around each pose the others within half a filter are seen from it: the logarithms (screws) of the relative motions.
-    A parabola in time is fitted to them by least squares, all samples alike, and its slope at the pose is the twist; so
-    a motion of constant twist is found exactly, whatever the sampling, and the choice of the world's frame does not
-    matter. Within half a filter of an end or of a gap the window is one-sided: the noise is up to four times as large
-    there. A sine of 0.3 / filter_s comes out at 0.91 of its size, one of 0.8 / filter_s at 0.49.
+    The filter window of a pose holds the poses within half a filter length. Their motions relative to the pose are
+    expressed as screws (logarithms in SE(3)). An unweighted least-squares fit of a parabola in time to the screws gives
+    the twist: its slope at the pose. A motion of constant twist is therefore recovered exactly with any sampling, and
+    the result does not depend on the world frame. Within half a filter length of an end or a gap the window is
+    one-sided, and the noise there is up to four times as large. The filter passes a sine of frequency 0.3 / filter_s
+    with gain 0.91, and one of 0.8 / filter_s with gain 0.49.
 
     Args:
-        poses: ordered by time, without doubles.
-        filter_s: length of the centred window [s]; by default filter_for(poses).
+        poses: ordered by time, without duplicate times.
+        filter_s: length of the centred window [s]; the default is filter_for(poses).
 
     Returns:
         one twist per pose; nan where the window holds fewer than three poses, or they span less than a quarter of it.
 
     Raises:
-        InvalidField: times do not increase, a quaternion is no unit, a number is not finite, or filter_s <= 0.
+        InvalidField: times do not increase, a quaternion does not have unit length, a number is not finite, or
+            filter_s <= 0.
     """
     screw, rate = _fits(poses, filter_s)
     return Twists(poses.t, rotations.body_twist(screw, rate))
 
 
 def smoothed(poses: Poses, *, filter_s: float | None = None) -> Poses:
-    """The poses as the filter of `twists` sees them: the same window, the value of the parabola instead of its slope.
+    """The poses smoothed by the filter of `twists`: the value of the fitted parabola instead of its slope.
+
+    Args:
+        poses: as for `twists`.
+        filter_s: as for `twists`.
 
     Raises:
         InvalidField: as `twists`.
     """
     screw, _ = _fits(poses, filter_s)
-    screw = np.nan_to_num(screw)  # where the window holds too little, the pose stays
+    screw = np.nan_to_num(screw)  # a pose stays as it is if its window holds too few others
     q, offset = rotations.pose_of(screw)
     position = poses.position_m + rotations.turn(poses.orientation, offset)
     return Poses(poses.t, position, rotations.product(poses.orientation, q))
 
 
 def interpolate_poses(poses: Poses, t_us: NDArray[np.int64], max_gap_us: int = MAX_GAP_US) -> Poses:
-    """The poses at any times (M,): position linear, orientation at a constant rate between the two around each.
+    """The poses at any times (M,) [us]: positions interpolated linearly, orientations by slerp.
 
-    nan before the first, after the last, and between two that are further apart than `max_gap_us`.
+    They are nan before the first pose, after the last, and in gaps longer than `max_gap_us`.
     """
     t_us = np.asarray(t_us, np.int64)
     first, fraction = _between(poses.t, t_us, max_gap_us)
@@ -111,11 +110,11 @@ def interpolate_poses(poses: Poses, t_us: NDArray[np.int64], max_gap_us: int = M
 
 
 def check_poses(poses: Poses) -> None:
-    """Refuse what is no path of a camera.
+    """Check that poses form a valid trajectory.
 
     Raises:
-        InvalidField: times do not increase, a quaternion is no unit (to 1 %), or a number is not finite; the first
-            pose that is wrong is named.
+        InvalidField: times do not increase, the length of a quaternion differs from 1 by 1 % or more, or a number is
+            not finite; the error names the first wrong pose.
     """
     norm = np.linalg.norm(poses.orientation, axis=1)
     for field, bad, values, bound in (
@@ -131,7 +130,10 @@ def check_poses(poses: Poses) -> None:
 def _between(
     t: NDArray[np.int64], t_us: NDArray[np.int64], max_gap_us: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """For each time the sample before it and how far it is on to the next one, 0 to 1; nan where there are not both."""
+    """For each time the index of the sample before it, and the fraction (0 to 1) of the way to the next sample.
+
+    The fraction is nan where one of the two samples is missing or the gap is too long.
+    """
     if not t.size:
         return np.zeros(t_us.size, np.int64), np.full(t_us.size, np.nan)
     first = np.clip(np.searchsorted(t, t_us, side="right") - 1, 0, max(t.size - 2, 0))
@@ -143,7 +145,7 @@ def _between(
 
 
 def _fits(poses: Poses, filter_s: float | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Around each pose the fitted screw (N, 6) at its time, as seen from it, and the screw's rate (N, 6) [1/s]."""
+    """The fitted screw (N, 6) at each pose, relative to the pose itself, and the rate of the screw (N, 6) [1/s]."""
     check_poses(poses)
     filter_s = filter_for(poses) if filter_s is None else filter_s
     if not 0 < filter_s < 1e6:
@@ -156,7 +158,7 @@ def _fits(poses: Poses, filter_s: float | None) -> tuple[NDArray[np.float64], ND
 
 
 def _fit(poses: Poses, i: NDArray[np.int64], half_us: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """As _fits, around some poses (N,)."""
+    """As _fits, for the poses of indices i (N,)."""
     first = np.searchsorted(poses.t, poses.t[i] - half_us, side="left")
     last = np.searchsorted(poses.t, poses.t[i] + half_us, side="right") - 1
     moments, sums = np.zeros((i.size, 5)), np.zeros((i.size, 3, 6))
@@ -174,7 +176,7 @@ def _fit(poses: Poses, i: NDArray[np.int64], half_us: float) -> tuple[NDArray[np
 
 
 def _relative(poses: Poses, i: NDArray[np.int64], j: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Screws (M, 6) that lead from poses i to poses j, in the frames of i."""
+    """Screws (M, 6) from poses i to poses j, in the frames of i."""
     back = rotations.inverse(poses.orientation[i])
     q = rotations.product(back, poses.orientation[j])
     return rotations.screw_of(q, rotations.turn(back, poses.position_m[j] - poses.position_m[i]))

@@ -1,9 +1,9 @@
-"""Rotations and rigid motions: unit quaternions x y z w, rotation vectors, and the exp and log maps of both groups.
+"""Rotations and rigid motions: unit quaternions x y z w, rotation vectors, and the exp and log maps of SO(3) and SE(3).
 
-All functions take arrays of any leading shape (...). A rotation vector [rad] points along the axis and is as long as
-the angle. A screw is (v, w), six numbers in the order of a twist: the motion that a constant twist makes in one second.
+All functions take arrays of any leading shape (...). A rotation vector [rad] points along the axis, and its length is
+the angle. A screw (v, w) has six numbers in the order of a twist: the motion of a constant twist during one second.
 
-Source: the formulas are those of any textbook on SO(3) and SE(3), as in Barfoot 2017, chapter 7.
+Source: standard formulas of SO(3) and SE(3), as in Barfoot 2017, chapter 7.
 """
 
 import numpy as np
@@ -11,23 +11,23 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-_SMALL_RAD = 1e-3  # below it the quotients are their series, which is then exact to the last digits
+_SMALL_RAD = 1e-3  # below this angle the series replace the quotients; they are exact to the last digits there
 
 
 def product(a: Array, b: Array) -> Array:
-    """Quaternion (..., 4) of the rotation that turns by b first, then by a."""
+    """Quaternion (..., 4) of the rotation by b followed by the rotation by a."""
     av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
     vector = aw * bv + bw * av + _cross(av, bv)
     return np.concatenate([vector, aw * bw - (av * bv).sum(-1, keepdims=True)], axis=-1)
 
 
 def inverse(q: Array) -> Array:
-    """Quaternion (..., 4) of the rotation back."""
+    """Quaternion (..., 4) of the inverse rotation."""
     return np.asarray(q * np.array([-1.0, -1.0, -1.0, 1.0]))
 
 
 def turn(q: Array, v: Array) -> Array:
-    """The vectors v (..., 3), turned by q (..., 4).
+    """The vectors v (..., 3), rotated by q (..., 4).
 
     >>> turn(np.array([0.0, 0.0, 0.6, 0.8]), np.array([1.0, 0.0, 0.0])).round(9).tolist()
     [0.28, 0.96, 0.0]
@@ -50,7 +50,7 @@ def matrix_of(q: Array) -> Array:
 def quaternion_of(matrix: Array) -> Array:
     """Quaternions (..., 4), w >= 0, of rotation matrices (..., 3, 3).
 
-    By the largest of the four components, so that no half turn is lost to rounding.
+    It divides by the largest of the four components, which is exact for rotations by 180 degrees too.
     """
     m = matrix
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
@@ -58,7 +58,7 @@ def quaternion_of(matrix: Array) -> Array:
     y = np.stack([x[..., 1], 1 - xx + yy - zz, m[..., 1, 2] + m[..., 2, 1]], -1)
     z = np.stack([x[..., 2], y[..., 2], 1 - xx - yy + zz], -1)
     w = np.stack([m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]], -1)
-    # row k is the quaternion times four times its component k; the longest row is divided by least
+    # row k is the quaternion times four times its component k; the longest row has the smallest rounding error
     rows = np.stack([np.concatenate([r, w[..., k : k + 1]], -1) for k, r in enumerate((x, y, z))], -2)
     last = np.concatenate([w, (1 + xx + yy + zz)[..., None]], -1)
     rows = np.concatenate([rows, last[..., None, :]], -2)
@@ -75,20 +75,20 @@ def exp(phi: Array) -> Array:
 
 
 def log(q: Array) -> Array:
-    """Rotation vectors (..., 3) [rad], none longer than pi, of quaternions (..., 4)."""
-    q = np.where(q[..., 3:] < 0, -q, q)  # q and -q are one rotation; this one is the short way round
+    """Rotation vectors (..., 3) [rad] of quaternions (..., 4), at most pi long."""
+    q = np.where(q[..., 3:] < 0, -q, q)  # q and -q are the same rotation; w >= 0 gives the shorter angle
     sine = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
     angle = 2 * np.arctan2(sine, q[..., 3:])
     return np.asarray(q[..., :3] * np.divide(angle, sine, out=np.full_like(sine, 2.0), where=sine > 1e-150))
 
 
 def slerp(a: Array, b: Array, fraction: Array) -> Array:
-    """Quaternions (..., 4) that part of the way from a to b, at a constant rate the short way round."""
+    """Spherical linear interpolation (..., 4) from a to b (..., 4), by a fraction (...), along the shorter arc."""
     return product(a, exp(fraction[..., None] * log(product(inverse(a), b))))
 
 
 def screw_of(q: Array, position: Array) -> Array:
-    """Log map of SE(3): screws (..., 6) that end in these poses (..., 4) and (..., 3)."""
+    """Log map of SE(3): screws (..., 6) of the poses with quaternions (..., 4) and positions (..., 3)."""
     phi = log(q)
     angle = np.linalg.norm(phi, axis=-1, keepdims=True)
     safe = np.where(angle < _SMALL_RAD, 1.0, angle)
@@ -100,7 +100,7 @@ def screw_of(q: Array, position: Array) -> Array:
 
 
 def pose_of(screw: Array) -> tuple[Array, Array]:
-    """Exp map of SE(3): the poses, quaternions (..., 4) and positions (..., 3), in which screws (..., 6) end."""
+    """Exp map of SE(3): quaternions (..., 4) and positions (..., 3) of the poses of screws (..., 6)."""
     v, phi = screw[..., :3], screw[..., 3:]
     angle = np.linalg.norm(phi, axis=-1, keepdims=True)
     safe = np.where(angle < _SMALL_RAD, 1.0, angle)
@@ -111,9 +111,9 @@ def pose_of(screw: Array) -> tuple[Array, Array]:
 
 
 def body_twist(screw: Array, rate: Array, terms: int = 8) -> Array:
-    """The twist (..., 6) in the moving body's frame while its screw (..., 6) changes at this rate (..., 6) [1/s].
+    """The twist (..., 6) in the body frame while its screw (..., 6) changes at this rate (..., 6) [1/s].
 
-    The right Jacobian of SE(3) times the rate, as its series; eight terms are exact to 1e-7 below 0.5 rad.
+    It is the series of the right Jacobian of SE(3) times the rate; eight terms are exact to 1e-7 below 0.5 rad.
     """
     total = term = rate
     for k in range(1, terms):
@@ -129,6 +129,6 @@ def _bracket(a: Array, b: Array) -> Array:
 
 
 def _cross(a: Array, b: Array) -> Array:
-    """Vector products (..., 3); numpy's own takes five times as long over small arrays."""
+    """Cross products (..., 3); numpy.cross takes five times as long on small arrays."""
     a0, a1, a2, b0, b1, b2 = (v[..., k] for v in (a, b) for k in range(3))
     return np.stack([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0], -1)

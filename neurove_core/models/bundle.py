@@ -20,8 +20,8 @@ from torch import Tensor, nn
 from neurove_core.config import Config, ModelConfig
 from neurove_core.files import write_atomically
 from neurove_core.models import golden
-from neurove_core.models.about import About, BundleLimits
 from neurove_core.models.golden import Golden
+from neurove_core.models.metadata import BundleLimits, Metadata
 from neurove_core.models.uncertainty import Uncertainty, why_no_correlation
 from neurove_core.networks import kinds
 from neurove_core.networks.kinds import Network
@@ -51,7 +51,7 @@ class UncertaintyHeader(Config):
     provenance: str = Field(max_length=1000, description="One line: how it was calibrated.")
 
 
-class Header(About):
+class Header(Metadata):
     """What a bundle says about itself, as JSON in the file's safetensors header."""
 
     bundle_version: int = BUNDLE_VERSION
@@ -86,7 +86,7 @@ class Bundle:
     offset: Tensor  # (6): twist = network output * scale + offset, in linear_unit and rad/s
     scale: Tensor  # (6)
     linear_unit: LinearUnit = METRIC
-    about: About = field(default_factory=About)
+    metadata: Metadata = field(default_factory=Metadata)
     golden: Golden | None = None  # none: the model can not be tested on another machine, and passes unseen
     uncertainty: Uncertainty | None = None  # where there is one, the network has a spread
     digest: str = ""  # sha256 of the bundle's bytes, hex
@@ -102,24 +102,24 @@ class Bundle:
             provenance=self.provenance,
             parameters=parameters,
             release=self.release,
-            figures=self.about.figures,
+            figures=self.metadata.figures,
         )
 
     @property
     def release(self) -> int:
         """Counter of this model's releases."""
-        return self.about.release
+        return self.metadata.release
 
     @property
     def prime_windows(self) -> int:
         """How many recent windows a stream replays so that this model's estimates are settled."""
-        windows = self.about.prime_windows
+        windows = self.metadata.prime_windows
         return self.config.settle_windows if windows is None else windows
 
     @property
     def limits(self) -> BundleLimits:
         """By how much it may differ from the model that it takes over from."""
-        return self.about.limits or BundleLimits()
+        return self.metadata.limits or BundleLimits()
 
     def to_bytes(self) -> bytes:
         """The bundle as the bytes of its file."""
@@ -134,15 +134,15 @@ class Bundle:
             and UncertaintyHeader(
                 uncertain_above=self.uncertainty.uncertain_above, provenance=self.uncertainty.provenance
             ),
-            **dict(self.about),
+            **dict(self.metadata),
         )
         without = {"golden_tolerance": self.golden is None, "uncertainty": self.uncertainty is None}
-        untold = About.model_fields.keys() - self.about.told() | {
+        untold = Metadata.model_fields.keys() - self.metadata.non_default_fields() | {
             name for name, left_out in without.items() if left_out
         }
         tensors = {**_stored(self.network), _OFFSET: self.offset, _SCALE: self.scale}
         if self.golden:
-            tensors |= golden.packed(self.golden)
+            tensors |= golden.to_tensors(self.golden)
         if self.uncertainty is not None:
             tensors[_CORRELATION] = self.uncertainty.correlation
         return safetensors.torch.save(tensors, {_KEY: header.model_dump_json(exclude=untold)})
@@ -185,7 +185,7 @@ def from_bytes(data: bytes, name: str) -> Bundle:
     except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:
         # the last two: a tensor without elements may claim sides that torch has no integer for
         raise BadModel(name, f"not a whole safetensors file: {error}") from None
-    test = golden.unpacked(tensors, header.config, header.golden_tolerance, name)
+    test = golden.from_tensors(tensors, header.config, header.golden_tolerance, name)
     with torch.device("meta"):  # shapes alone: a header of a few bytes may declare terabytes of weights
         wanted = {**_stored(_network(header)), _OFFSET: torch.zeros(6), _SCALE: torch.ones(6)}
         if header.uncertainty is not None:
@@ -204,7 +204,7 @@ def from_bytes(data: bytes, name: str) -> Bundle:
         offset=offset,
         scale=scale,
         linear_unit=header.linear_unit,
-        about=About(**{told: getattr(header, told) for told in About.model_fields}),
+        metadata=Metadata(**{told: getattr(header, told) for told in Metadata.model_fields}),
         golden=test,
         uncertainty=uncertainty,
         digest=hashlib.sha256(data).hexdigest(),

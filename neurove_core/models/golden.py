@@ -4,17 +4,15 @@ The digest of a bundle shows that the bytes are those that were sent. Whether th
 of the program compute with them what their maker's did is another question, and this is its answer.
 """
 
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from neurove_core.config import ModelConfig
 from neurove_protocol.errors import BadModel
-
-if TYPE_CHECKING:  # an estimator has a bundle, and a bundle a golden test
-    from neurove_core.config import ModelConfig
 
 WINDOWS: Final = 12
 """T of a golden test where nothing else is asked for."""
@@ -36,7 +34,7 @@ class Golden(NamedTuple):
     tolerance: float = TOLERANCE  # an axis may be off by this times the bundle's scale of that axis
 
 
-def packed(golden: Golden) -> dict[str, Tensor]:
+def to_tensors(golden: Golden) -> dict[str, Tensor]:
     """A golden test as the tensors of a bundle: most cells see nothing, and cost a bit each.
 
     `golden.seen` has a bit for each cell of (T, 2n, H, W), the first one highest, 1 where there were events;
@@ -55,7 +53,7 @@ def stored_bytes(counts: NDArray[np.uint8]) -> int:
     return (counts.size + 7) // 8 + int(np.count_nonzero(counts))
 
 
-def unpacked(tensors: dict[str, Tensor], config: "ModelConfig", tolerance: float | None, name: str) -> Golden | None:
+def from_tensors(tensors: dict[str, Tensor], config: ModelConfig, tolerance: float | None, name: str) -> Golden | None:
     """Take the golden test out of a bundle's tensors; none where it has none.
 
     Args:

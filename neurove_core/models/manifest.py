@@ -18,8 +18,8 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 from pydantic import ConfigDict, Field, ValidationError
 
 from neurove_core.config import Config
-from neurove_core.models.about import MAX_RELEASE
 from neurove_core.models.bundle import MAX_BYTES, Header, object_without_duplicates, read_header
+from neurove_core.models.metadata import MAX_RELEASE
 from neurove_core.models.signing_keys import key_id
 from neurove_protocol.errors import Downgrade, InvalidField, Untrusted, shown
 from neurove_protocol.fields import WrongField

@@ -19,7 +19,7 @@ LEVEL: Final = 0.9
 LEVELS: Final = (0.5, 0.68, 0.8, LEVEL, 0.95, 0.99)
 """Nominal coverages that are compared with the measured ones."""
 
-REST_M_S: Final = 0.5
+MIN_SPEED_M_S: Final = 0.5
 """A slower motion counts as so fast where its uncertainty is held against it: at rest any share would be endless."""
 
 _MAX_LOG: Final = 20.0  # of a log sigma, either way: far beyond any sense, and exp stays finite
@@ -51,9 +51,9 @@ class Uncertainty:
     def is_uncertain(self, twists: Array, covariance: Array) -> bool:
         """Whether the linear part of a window's twists (n, 6) [m/s] is too unsure.
 
-        Its sigma is the root of the three variances' sum; its speed that of the mean twist, at least REST_M_S.
+        Its sigma is the root of the three variances' sum; its speed that of the mean twist, at least MIN_SPEED_M_S.
         """
-        speed = max(float(np.linalg.norm(twists[:, :3].mean(0))), REST_M_S)
+        speed = max(float(np.linalg.norm(twists[:, :3].mean(0))), MIN_SPEED_M_S)
         return float(np.sqrt(np.trace(covariance[:3, :3]))) > self.uncertain_above * speed
 
 

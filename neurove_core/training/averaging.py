@@ -9,8 +9,8 @@ from torch import Tensor
 
 from neurove_core import self_test
 from neurove_core.estimator import Estimator
-from neurove_core.models.about import About, MadeBy
 from neurove_core.models.bundle import Bundle
+from neurove_core.models.metadata import MadeBy, Metadata
 from neurove_core.networks import kinds
 from neurove_core.training.loop import commit
 from neurove_core.training.run import check_same_network
@@ -49,7 +49,7 @@ def average(bundles: Sequence[Bundle]) -> Bundle:
         last,
         provenance=f"neurove bundle average of {of}; the last: {last.provenance}"[:_PROVENANCE_CHARS],
         network=network.eval(),
-        about=About(made_by=_made_by(last, of)),
+        metadata=Metadata(made_by=_made_by(last, of)),
         uncertainty=None,
     )
     if made.golden:
@@ -67,6 +67,6 @@ def _mean(bundles: Sequence[Bundle], name: str) -> Tensor:
 def _made_by(last: Bundle, of: str) -> MadeBy:
     """As the last one was made, by another program."""
     program = f"neurove bundle average of {of}"
-    if last.about.made_by is None:
+    if last.metadata.made_by is None:
         return MadeBy(program=program, seed=0, commit=commit(), torch=torch.__version__)
-    return last.about.made_by.model_copy(update={"program": program, "commit": commit(), "torch": torch.__version__})
+    return last.metadata.made_by.model_copy(update={"program": program, "commit": commit(), "torch": torch.__version__})

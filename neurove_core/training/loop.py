@@ -18,8 +18,8 @@ from neurove_core import self_test
 from neurove_core.estimator import Estimator
 from neurove_core.files import write_atomically
 from neurove_core.models import bundle, golden
-from neurove_core.models.about import About, MadeBy
 from neurove_core.models.bundle import Bundle
+from neurove_core.models.metadata import MadeBy, Metadata
 from neurove_core.networks.encoding import to_spikes
 from neurove_core.networks.state import detached
 from neurove_core.training.batches import Segment, draw
@@ -221,7 +221,7 @@ def provenance(run: Run, more: int = 0) -> str:
     return text[:_PROVENANCE_CHARS]
 
 
-def about(run: Run) -> About:
+def about(run: Run) -> Metadata:
     """How this model was made, as fields, and how far off it was at its last updates."""
     config = run.config
     made_by = MadeBy(
@@ -236,7 +236,7 @@ def about(run: Run) -> About:
     )
     last = run.curve[-1] if run.curve else {}
     errors = ("linear_error_m_s", "angular_error_rad_s")
-    return About(made_by=made_by, figures={f"training_{name}": last[name] for name in errors if name in last})
+    return Metadata(made_by=made_by, figures={f"training_{name}": last[name] for name in errors if name in last})
 
 
 def _program(run: Run) -> str:

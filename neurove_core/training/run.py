@@ -19,8 +19,8 @@ from torch import Tensor, nn
 
 from neurove_core.config import ModelConfig
 from neurove_core.files import write_atomically
-from neurove_core.models.about import About
 from neurove_core.models.bundle import PER_HEIGHT, Bundle
+from neurove_core.models.metadata import Metadata
 from neurove_core.networks import kinds
 from neurove_core.networks.kinds import Network
 from neurove_core.training.config import RecipeConfig, TrainingConfig
@@ -84,7 +84,7 @@ class Run:
         batch = self.config.recipe.batch // self.ranks.count
         return self.config.recipe.model_copy(update={"batch": batch})
 
-    def bundle(self, provenance: str, about: About | None = None) -> Bundle:
+    def bundle(self, provenance: str, about: Metadata | None = None) -> Bundle:
         """The model as it is now."""
         network = kinds.make(self.config.model)
         network.load_state_dict(self.network.state_dict())
@@ -97,7 +97,7 @@ class Run:
             offset=self.offset.cpu(),
             scale=self.scale.cpu(),
             linear_unit=PER_HEIGHT,
-            about=about or About(),
+            metadata=about or Metadata(),
         ).with_digest()
 
     def save(self, path: Path, orders: list[Any]) -> None:

@@ -20,7 +20,7 @@ def fields(found: "Bundle", data: bytes) -> dict[str, Any]:
     return {
         **found.info.model_dump(),
         "size": len(data),
-        **found.about.model_dump(mode="json"),
+        **found.metadata.model_dump(mode="json"),
         "prime_windows": found.prime_windows,
         "linear_unit": found.linear_unit,
         "config": found.config.model_dump(mode="json"),

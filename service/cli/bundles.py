@@ -239,7 +239,7 @@ def _add_trust(parser: argparse.ArgumentParser, **options: Any) -> None:
 
 
 def _release(text: str) -> int:
-    from neurove_core.models.about import MAX_RELEASE
+    from neurove_core.models.metadata import MAX_RELEASE
 
     try:
         value = int(text)

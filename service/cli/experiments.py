@@ -48,7 +48,7 @@ def reproduce_sine(args: argparse.Namespace) -> int:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    from neurove_core.experiments.sine import report as sine_report
+    from neurove_core.experiments.sine import report
 
     models, seeds = args.models.split(","), range(args.seed, args.seed + args.seeds)
     command_line, made_by = shlex.join(["neurove", *sys.argv[1:]]), commit()
@@ -62,17 +62,17 @@ def reproduce_sine(args: argparse.Namespace) -> int:
             rmse = f"{model} seed {seed}: update {update}, RMSE {mse**0.5:.2e}"
             bar.update(tasks[model, seed], completed=update, description=rmse)
 
-        runs: list[sine_report.Run] = []
+        runs: list[report.SineRun] = []
         files: dict[Path, None] = {}
-        for run in sine_report.reproduce(models, seeds, changes=dict(args.set), quick=args.quick, progress=progress):
+        for run in report.reproduce(models, seeds, changes=dict(args.set), quick=args.quick, progress=progress):
             runs.append(run)
             if args.out:
-                files |= dict.fromkeys(sine_report.save_run(runs, args.out, command=command_line, commit=made_by))
+                files |= dict.fromkeys(report.save_run(runs, args.out, command=command_line, commit=made_by))
     if args.out:
-        files |= dict.fromkeys(sine_report.save(runs, args.out))
+        files |= dict.fromkeys(report.save(runs, args.out))
     figures = [run.figures for run in runs]
-    tables = sine_report.tables(figures)
-    print(json.dumps(figures) if args.json else "\n".join(sine_report.markdown(tables[n], n) for n in tables))
+    tables = report.tables(figures)
+    print(json.dumps(figures) if args.json else "\n".join(report.markdown(tables[n], n) for n in tables))
     for file in files:
         print(f"wrote {file}", file=sys.stderr)
     return 0
@@ -115,25 +115,28 @@ def reproduce_velocity(args: argparse.Namespace) -> int:
     """Repeat Tables III and IV: velocity by NeuroVE, NeuroVE w/o, ANN, SNN-ANG and baselines that do not learn."""
     import torch
 
-    from neurove_core.experiments.velocity import figures as velocity_figures
-    from neurove_core.experiments.velocity import report as velocity_report
-    from neurove_core.experiments.velocity import run as velocity
+    from neurove_core.experiments.velocity import figures, report, run
 
     torch.set_num_threads(args.threads)
-    config = velocity.base_config(args.config, args.steps, quick=args.quick)
+    config = run.base_config(args.config, args.steps, quick=args.quick)
     seeds = range(args.seed, args.seed + args.seeds)
-    plan = velocity.Plan(config, tuple(args.methods.split(",")), seeds, args.recordings, args.quick)
+    experiment = run.Experiment(config, tuple(args.methods.split(",")), seeds, args.recordings, args.quick)
     out: Path = args.out or Path("runs") / config.name
     folder: Path = args.data or out / "data"
     found = []
     with progress() as show:
-        for one in velocity.reproduce(plan, folder, out, show, args.workers):
+        for one in run.reproduce(experiment, folder, out, show, args.workers):
             found.append(one)
-            show("evaluated", len(found), len(plan.methods) * len(seeds), f"{one.row['method']} seed {one.row['seed']}")
-    report = _made_by() | velocity.results(plan, folder, found)
-    print(json.dumps(report) if args.json else velocity_report.markdown(report), end="")
+            show(
+                "evaluated",
+                len(found),
+                len(experiment.methods) * len(seeds),
+                f"{one.row['method']} seed {one.row['seed']}",
+            )
+    told = _made_by() | run.results(experiment, folder, found)
+    print(json.dumps(told) if args.json else report.markdown(told), end="")
     tracks = {one.row["method"]: one.tracks for one in reversed(found)}
-    for file in [*velocity_report.save(report, out), *velocity_figures.save(report, tracks, out)]:
+    for file in [*report.save(told, out), *figures.save(told, tracks, out)]:
         print(f"wrote {file}", file=sys.stderr)
     if args.recordings:
         _real_rows("default", args.recordings, out)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from neurove_core.bench import Row
-from neurove_core.bench.ingest import DURATION_US, SENSOR, draw
+from neurove_core.bench.ingest import DURATION_US, SENSOR, sweeping_edge
 from neurove_core.config import ModelConfig
 from neurove_core.geometry.camera import lookup_table
 from neurove_core.ingest import windows
@@ -58,7 +58,7 @@ def wire(rounds: int, *, quick: bool) -> list[Row]:
         rounds: measured repetitions.
         quick: small input without warm-up; the times mean nothing.
     """
-    events = draw(5_000 if quick else 500_000)
+    events = sweeping_edge(5_000 if quick else 500_000)
     packets = _packets(events)
     config = ModelConfig()
     lut = lookup_table(config.canonical, SENSOR, None)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.models import about
+from neurove_core.models import metadata
 from neurove_core.models.bundle import Bundle
 
 FLOOR_M_S, FLOOR_RAD_S = 0.1, 0.05
@@ -29,7 +29,7 @@ class TrialLimits(NamedTuple):
     divergence: float = 1.0  # RMS difference of the estimates, divided by the RMS of the proven model's
     rate_ratio: float = 8.0  # ratio of the firing rates of both models, in either direction
     latency_share: float = 0.5  # median time for a window, as a share of the window's duration
-    own: about.BundleLimits = about.BundleLimits()  # further limits that the model's bundle sets
+    own: metadata.BundleLimits = metadata.BundleLimits()  # further limits that the model's bundle sets
 
     def and_of(self, bundle: Bundle) -> "TrialLimits":
         """These limits together with those of a bundle, which may be stricter than the node but not laxer."""

@@ -107,7 +107,7 @@ def _rate(state: StreamState) -> float:
 
 def windows_to_prime(estimator: Estimator) -> int:
     """Number of windows that a model should see before it answers a stream: the bundle's value if it has one."""
-    wanted = estimator.bundle.about.prime_windows
+    wanted = estimator.bundle.metadata.prime_windows
     return max(estimator.config.settle_windows, PRIME_WINDOWS) if wanted is None else wanted
 
 

@@ -11,8 +11,8 @@ import torch
 
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
 from neurove_core.models import bundle, manifest, signing_keys
-from neurove_core.models.about import About
 from neurove_core.models.bundle import Bundle
+from neurove_core.models.metadata import Metadata
 from neurove_core.networks.neurove import NeuroVE
 
 WINDOW_US = 20_000
@@ -60,7 +60,7 @@ class Made:
 
 
 def _released(model: Bundle, release: int) -> Bundle:
-    return replace(model, about=About(release=release))
+    return replace(model, metadata=Metadata(release=release))
 
 
 def _tensors(change: Callable[[dict[str, torch.Tensor], str], None]) -> Callable[[bytes], bytes]:
@@ -107,8 +107,8 @@ def _slow() -> Bundle:
         }
     )
     zeros, ones = torch.zeros(6), torch.ones(6)
-    about = About(release=_RELEASE)
-    return Bundle("too-slow", False, "a test", config, NeuroVE(config).eval(), zeros, ones, about=about)  # trained
+    about = Metadata(release=_RELEASE)
+    return Bundle("too-slow", False, "a test", config, NeuroVE(config).eval(), zeros, ones, metadata=about)  # trained
 
 
 _SPOILT: dict[str, Callable[[bytes], bytes]] = {

@@ -65,7 +65,7 @@ class Recipe(Config):
     clip: float = Field(0.5, gt=0, description="Norm of the gradient.")
 
 
-class Result(NamedTuple):
+class Evaluation(NamedTuple):
     """What a trained network reached; one number per validation wave."""
 
     regression_rmse_x1000: list[float]  # all steps
@@ -103,7 +103,7 @@ class Network:
     def _initialise(self, recipe: Recipe, rng: np.random.Generator) -> None:
         bound = recipe.hidden**-0.5
         self.theta[:] = rng.uniform(-bound, bound, self.theta.size)
-        mask = _cut(self.learned, _shapes(self.kind, recipe.hidden))
+        mask = _views(self.learned, _shapes(self.kind, recipe.hidden))
         pairs = ((self.weights.first, mask.first), (self.weights.second, mask.second))
         for layer, learned in pairs:
             diffuses = recipe.model == "aslstm"
@@ -169,10 +169,10 @@ def _shapes(kind: int, hidden: int) -> list[tuple[int, ...]]:
 def _allocated(kind: int, hidden: int, dtype: Any) -> tuple[Array, Weights]:
     shapes = _shapes(kind, hidden)
     theta = np.zeros(sum(math.prod(shape) for shape in shapes), dtype)
-    return theta, _cut(theta, shapes)
+    return theta, _views(theta, shapes)
 
 
-def _cut(vector: Array, shapes: list[tuple[int, ...]]) -> Weights:
+def _views(vector: Array, shapes: list[tuple[int, ...]]) -> Weights:
     """Weights that are views of a vector."""
     arrays: list[Array] = []
     start = 0
@@ -183,7 +183,7 @@ def _cut(vector: Array, shapes: list[tuple[int, ...]]) -> Weights:
     return Weights(LayerWeights(*arrays[:fields]), LayerWeights(*arrays[fields : 2 * fields]), *arrays[2 * fields :])
 
 
-def evaluate(network: Network, data: NDArray[np.float32] | None = None) -> tuple[Result, Array]:
+def evaluate(network: Network, data: NDArray[np.float32] | None = None) -> tuple[Evaluation, Array]:
     """Regression over 999 teacher-forced steps, then 1000 steps of closed-loop forecast.
 
     Args:
@@ -203,13 +203,13 @@ def evaluate(network: Network, data: NDArray[np.float32] | None = None) -> tuple
     error = np.nan_to_num(answers - truth[1:], nan=_NO_ANSWER, posinf=_NO_ANSWER, neginf=-_NO_ANSWER)
     error = np.clip(error, -_NO_ANSWER, _NO_ANSWER).astype(np.float64)
     regression, forecast = error[: LENGTH - 1], error[LENGTH - 1 :]
-    result = Result(
+    evaluation = Evaluation(
         regression_rmse_x1000=_rms(1000 * regression),
         regression_rmse_x1000_from_100=_rms(1000 * regression[SKIP:]),
         forecast_rmse=_rms(forecast),
         spike_rate=[float(layer.s[1:].mean()) for layer in tape[:2]],
     )
-    return result, answers
+    return evaluation, answers
 
 
 def continued(rows: NDArray[np.float32]) -> NDArray[np.float64]:

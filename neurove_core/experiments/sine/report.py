@@ -61,7 +61,7 @@ Progress = Callable[[str, int, int, int, float], None]
 """model, seed, update, updates, mean square error."""
 
 
-class Run(NamedTuple):
+class SineRun(NamedTuple):
     """One model trained from one seed."""
 
     model: str
@@ -79,7 +79,7 @@ def reproduce(
     changes: Mapping[str, str] | None = None,
     quick: bool = False,
     progress: Progress | None = None,
-) -> Iterator[Run]:
+) -> Iterator[SineRun]:
     """Train and evaluate every model from every seed, one after the other.
 
     Args:
@@ -120,7 +120,7 @@ def changed(recipe: Recipe, changes: Mapping[str, str]) -> Recipe:
         raise InvalidField("recipe", wrong.name or "set", wrong.value, why) from None
 
 
-def _run(model: str, seed: int, recipe: Recipe, progress: Progress | None) -> Run:
+def _run(model: str, seed: int, recipe: Recipe, progress: Progress | None) -> SineRun:
     updates = recipe.updates + recipe.fine_updates
 
     def report(update: int, mse: float) -> None:
@@ -128,25 +128,25 @@ def _run(model: str, seed: int, recipe: Recipe, progress: Progress | None) -> Ru
             progress(model, seed, update + 1, updates, mse)
 
     trained = train(recipe, seed, report)
-    result, answers = evaluate(trained.network)
+    evaluation, answers = evaluate(trained.network)
     thresholds = np.concatenate([layer.v_th for layer in trained.network.weights[:2]])
     figures = {
         "model": model,
         "seed": seed,
-        "regression_rmse_x1000": result.regression_rmse_x1000,
-        "regression_rmse_x1000_from_100": result.regression_rmse_x1000_from_100,
-        "forecast_rmse": result.forecast_rmse,
-        "spike_rate": result.spike_rate,
+        "regression_rmse_x1000": evaluation.regression_rmse_x1000,
+        "regression_rmse_x1000_from_100": evaluation.regression_rmse_x1000_from_100,
+        "forecast_rmse": evaluation.forecast_rmse,
+        "spike_rate": evaluation.spike_rate,
         "v_th": sorted({round(float(value), 4) for value in thresholds}),
         "updates": trained.updates,
         "skipped_updates": trained.skipped_updates,
         "cpu_s": round(trained.cpu_s, 1),
         "parameters": int(trained.network.learned.sum()),
     }
-    return Run(model, seed, recipe, trained, answers, figures)
+    return SineRun(model, seed, recipe, trained, answers, figures)
 
 
-def save_run(runs: list[Run], out: Path, *, command: str, commit: str) -> list[Path]:
+def save_run(runs: list[SineRun], out: Path, *, command: str, commit: str) -> list[Path]:
     """Write the newest run's network and the figures of all so far, so that a stopped command loses nothing.
 
     Args:
@@ -158,8 +158,8 @@ def save_run(runs: list[Run], out: Path, *, command: str, commit: str) -> list[P
     Raises:
         InvalidField: a file can not be written.
     """
-    told = [run.figures | {"command": command, "commit": commit} for run in runs]
-    figures = save_text(json.dumps(told, indent=1) + "\n", out / "sine.json")
+    rows = [run.figures | {"command": command, "commit": commit} for run in runs]
+    figures = save_text(json.dumps(rows, indent=1) + "\n", out / "sine.json")
     run = runs[-1]
     file = out / f"{run.model}-{run.seed}.safetensors"
     header = {"recipe": run.recipe.model_dump_json(), "seed": str(run.seed), "command": command, "commit": commit}
@@ -167,7 +167,7 @@ def save_run(runs: list[Run], out: Path, *, command: str, commit: str) -> list[P
     return [figures, file]
 
 
-def save(runs: list[Run], out: Path) -> list[Path]:
+def save(runs: list[SineRun], out: Path) -> list[Path]:
     """Write the two tables and the pictures.
 
     Args:
@@ -243,7 +243,7 @@ def _joined(values: Sequence[float]) -> str:
     return " / ".join(f"{value:.2g}" if math.isfinite(value) else "-" for value in values)
 
 
-def draw_regression(runs: list[Run]) -> "Figure":
+def draw_regression(runs: list[SineRun]) -> "Figure":
     """Truth and answers of the first validation wave over 2000 steps, and their error, one row per model."""
     firsts = list({run.model: run for run in reversed(runs)}.values())[::-1]
     figure = blank_figure(10, 1.9 * len(firsts) + 0.4)
@@ -271,7 +271,7 @@ def _truth() -> Array:
     return truth
 
 
-def draw_spikes(runs: list[Run]) -> "Figure":
+def draw_spikes(runs: list[SineRun]) -> "Figure":
     """Spikes of both layers over the first validation wave, one column per model."""
     firsts = list({run.model: run for run in reversed(runs)}.values())[::-1]
     figure = blank_figure(2.6 * len(firsts) + 1, 4.6)

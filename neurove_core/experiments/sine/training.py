@@ -75,11 +75,11 @@ def train(recipe: Recipe, seed: int, progress: Callable[[int, float], None] = la
     network = Network(recipe, rng)
     began = time.process_time()
     adam = Adam(network, recipe.clip)
-    walk = _Walk(data, recipe, network, rng)
+    batches = _BatchStream(data, recipe, network, rng)
     for update in range(recipe.updates):
-        x, target, state = walk.chunk()
+        x, target, state = batches.chunk()
         mse, grad, tape = _loss(network, recipe, x, target, state, len(x), log=False)
-        walk.advance(tape)
+        batches.advance(tape)
         adam.step(grad, _rate(update, recipe.updates, recipe.lr, recipe.lr_end, warm_up=50))
         progress(update, mse)
     skipped = adam.skipped
@@ -89,16 +89,16 @@ def train(recipe: Recipe, seed: int, progress: Callable[[int, float], None] = la
         lr = _rate(update, recipe.fine_updates, recipe.fine_lr, recipe.fine_lr_end, warm_up=20)
         closed = rng.random() < recipe.closed_share
         if closed:
-            x, target, state = walk.window(_closed_steps(update, recipe, rng))
+            x, target, state = batches.window(_closed_steps(update, recipe, rng))
         else:
-            x, target, state = walk.chunk()
+            x, target, state = batches.chunk()
         mse, grad, tape = _loss(network, recipe, x, target, state, 1 if closed else len(x), log=True)
         if not closed:
-            walk.advance(tape)
+            batches.advance(tape)
         adam.step(grad, lr)
         left = recipe.fine_updates - 1 - update
         if left % _CHECK_EVERY == 0 and left < recipe.chosen_share * recipe.fine_updates:
-            best.look()
+            best.update()
         progress(recipe.updates + update, mse)
     best.restore()
     return Trained(network, recipe.updates + recipe.fine_updates, time.process_time() - began, skipped + adam.skipped)
@@ -116,7 +116,7 @@ class _Best:
         self._network, self._data = network, np.ascontiguousarray(data[:, :_CHECK_WAVES])
         self._score, self._theta = math.inf, network.theta.copy()
 
-    def look(self) -> None:
+    def update(self) -> None:
         """Compare the weights of now: the product of both errors, over _CHECK_FROM steps and from there on alone."""
         x, target = self._data[:-1], self._data[1:]
         tape = self._network.run(x, self._network.initial_state(x.shape[1]), _CHECK_FROM)
@@ -166,7 +166,7 @@ def _loss(
     return mse, grad, tape._replace(first=last.first, second=last.second)  # type: ignore[arg-type]  # only the end is used
 
 
-class _Walk:
+class _BatchStream:
     """A batch of waves that is walked through in chunks, its state carried; at the end others are drawn."""
 
     def __init__(self, data: Array, recipe: Recipe, network: Network, rng: np.random.Generator) -> None:
@@ -177,20 +177,20 @@ class _Walk:
         rows = self._rng.integers(0, self._data.shape[1], self._recipe.batch)
         self._batch = np.ascontiguousarray(self._data[:, rows])
         self._position, self._state = 0, self._network.initial_state(self._recipe.batch)
-        self._passed = [(self._position, self._state)]
+        self._visited = [(self._position, self._state)]
 
     def chunk(self) -> tuple[Array, Array, State]:
         """The next inputs, targets, and the state before them."""
         if self._position >= LENGTH - 1:
             self._begin()
-        return self._cut(self._position, self._recipe.chunk, self._state)
+        return self._slice(self._position, self._recipe.chunk, self._state)
 
     def window(self, steps: int) -> tuple[Array, Array, State]:
         """So many steps from the newest place passed that leaves room for them, without going on."""
-        position, state = next(place for place in reversed(self._passed) if place[0] + steps < LENGTH)
-        return self._cut(position, steps, state)
+        position, state = next(place for place in reversed(self._visited) if place[0] + steps < LENGTH)
+        return self._slice(position, steps, state)
 
-    def _cut(self, position: int, steps: int, state: State) -> tuple[Array, Array, State]:
+    def _slice(self, position: int, steps: int, state: State) -> tuple[Array, Array, State]:
         end = min(position + steps, LENGTH - 1)
         return self._batch[position:end], self._batch[position + 1 : end + 1], state
 
@@ -199,4 +199,4 @@ class _Walk:
         first, second = tape.first, tape.second
         self._position += len(tape.y) - 1
         self._state = State(first, second, tape.y[-1].copy())  # type: ignore[arg-type]  # layers are states by now
-        self._passed.append((self._position, self._state))
+        self._visited.append((self._position, self._state))

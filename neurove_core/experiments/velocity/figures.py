@@ -12,14 +12,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SHOWN: Final = ((2, "vz [m/s]"), (4, "wy [rad/s]"))
-_OF_GROUPS: Final = ("mvsec", "driving", "hand-held")
+_GROUPS: Final = ("mvsec", "driving", "hand-held")
 
 
-def save(told: dict[str, Any], tracks: dict[str, list[Track]], out: Path) -> list[Path]:
+def save(results: dict[str, Any], tracks: dict[str, list[Track]], out: Path) -> list[Path]:
     """Write all pictures as PNG and SVG.
 
     Args:
-        told: the results.
+        results: the results.
         tracks: of the first seed, by method.
         out: folder.
 
@@ -27,15 +27,15 @@ def save(told: dict[str, Any], tracks: dict[str, list[Track]], out: Path) -> lis
         MissingExtra: matplotlib is not installed. InvalidField: a file can not be written.
     """
     out.mkdir(parents=True, exist_ok=True)
-    stem = "velocity-quick" if told["quick"] else "velocity"
-    drawn = {"tracks": draw_tracks(tracks), "errors": draw_errors(told), "curves": draw_curves(told)}
+    stem = "velocity-quick" if results["quick"] else "velocity"
+    drawn = {"tracks": draw_tracks(tracks), "errors": draw_errors(results), "curves": draw_curves(results)}
     return [file for name, figure in drawn.items() for file in save_figure(figure, out / f"{stem}-{name}")]
 
 
 def draw_tracks(tracks: dict[str, list[Track]]) -> "Figure":
     """Truth and estimate of each method over the first item of some groups."""
     some = next(iter(tracks.values()))
-    firsts = [next((n for n, one in enumerate(some) if one.group == group), None) for group in _OF_GROUPS]
+    firsts = [next((n for n, one in enumerate(some) if one.group == group), None) for group in _GROUPS]
     chosen = [number for number in firsts if number is not None]
     figure = blank_figure(12, 2.6 * len(chosen) * len(_SHOWN) / 2 + 1)
     panels = figure.subplots(len(chosen), len(_SHOWN), squeeze=False)
@@ -43,7 +43,7 @@ def draw_tracks(tracks: dict[str, list[Track]]) -> "Figure":
         for panel, (axis, label) in zip(row, _SHOWN, strict=True):
             panel.plot(some[number].t_s, some[number].truth[:, axis], color="black", linewidth=1.4, label="truth")
             for method, own in tracks.items():
-                panel.plot(own[number].t_s, own[number].answer[:, axis], linewidth=0.8, label=method)
+                panel.plot(own[number].t_s, own[number].estimate[:, axis], linewidth=0.8, label=method)
             panel.set_ylabel(label)
             panel.set_title(f"{some[number].group}: {some[number].name}", fontsize=9)
             panel.grid(visible=True, alpha=0.3)
@@ -53,9 +53,9 @@ def draw_tracks(tracks: dict[str, list[Track]]) -> "Figure":
     return figure
 
 
-def draw_errors(told: dict[str, Any]) -> "Figure":
+def draw_errors(results: dict[str, Any]) -> "Figure":
     """RMSE of each method on each group, with the spread between seeds."""
-    methods, groups = methods_of(told), list(told["groups"])
+    methods, groups = methods_of(results), list(results["groups"])
     figure = blank_figure(12, 6)
     panels = figure.subplots(2, 1, sharex=True)
     wide = 0.8 / len(methods)
@@ -63,7 +63,7 @@ def draw_errors(told: dict[str, Any]) -> "Figure":
         panels, (("rmse_v_l_m_s", "v_l RMSE [m/s]"), ("rmse_v_a_deg_s", "v_a RMSE [deg/s]")), strict=True
     ):
         for number, method in enumerate(methods):
-            found = [over_seeds(told, method, group, name) for group in groups]
+            found = [over_seeds(results, method, group, name) for group in groups]
             at = [place + number * wide for place, values in enumerate(found) if values]
             means = [statistics.mean(values) for values in found if values]
             spreads = [statistics.stdev(values) if len(values) > 1 else 0.0 for values in found if values]
@@ -76,18 +76,18 @@ def draw_errors(told: dict[str, Any]) -> "Figure":
     return figure
 
 
-def draw_curves(told: dict[str, Any]) -> "Figure":
+def draw_curves(results: dict[str, Any]) -> "Figure":
     """Mean error of the training batches over the updates, a line for each seed."""
     figure = blank_figure(12, 4)
     panels = figure.subplots(1, 2)
-    methods = list(dict.fromkeys(run["method"] for run in told["runs"]))
+    methods = list(dict.fromkeys(run["method"] for run in results["runs"]))
     for panel, (name, label) in zip(
         panels,
         (("linear_error_m_s", "linear error [m/s]"), ("angular_error_rad_s", "angular error [rad/s]")),
         strict=True,
     ):
         for number, method in enumerate(methods):
-            runs = [run for run in told["runs"] if run["method"] == method]
+            runs = [run for run in results["runs"] if run["method"] == method]
             for first, run in enumerate(runs):
                 steps, values = ([point[key] for point in run["curve"]] for key in ("step", name))
                 panel.plot(steps, values, color=f"C{number}", linewidth=1, label=None if first else method)

@@ -41,11 +41,11 @@ _DRIVE_SLOWED: Final = (1.0, 2.0)
 _QUICK_CAMERA: Final = "pinhole:24x18:75"
 _QUICK_S: Final = 1.0
 _WINDOW_US: Final = 50_000  # of contrast maximisation
-_CM_INSTANTS: Final = 5  # per recording
-_KEY_POINTS: Final = 16  # of a way, by which its file is known again
+_CONTRAST_INSTANTS: Final = 5  # per recording
+_KEY_POINTS: Final = 16  # of a trajectory, by which its file is known again
 
 
-class Item(NamedTuple):
+class Scenario(NamedTuple):
     """One recording to judge on, or to learn from."""
 
     group: str
@@ -66,7 +66,7 @@ GROUPS: Final = {
 }
 """What is judged on, by name."""
 
-CM_GROUPS: Final = ("driving", "hand-held", "town 1", "town 2", "mvsec")
+CONTRAST_GROUPS: Final = ("driving", "hand-held", "town 1", "town 2", "mvsec")
 """Where contrast maximisation is asked too."""
 
 _CAMERAS: Final = ("pinhole:86x65:75", "pinhole:128x96:90", "pinhole:172x130:55", "davis240c", "pinhole:320x240:62")
@@ -77,7 +77,7 @@ _PIXELS: Final = {
 }
 
 
-def items(recordings: Path | None = None, *, quick: bool = False) -> list[Item]:
+def held_out_scenarios(recordings: Path | None = None, *, quick: bool = False) -> list[Scenario]:
     """All that is judged on, group by group.
 
     Args:
@@ -85,32 +85,37 @@ def items(recordings: Path | None = None, *, quick: bool = False) -> list[Item]:
         quick: the first of each group alone, a second long, through a tiny camera.
     """
     found = [
-        *(_street("driving", f"seed {seed}", seed, 8.0) for seed in range(6000, 6006)),
+        *(_street_scenario("driving", f"seed {seed}", seed, 8.0) for seed in range(6000, 6006)),
         *(
-            _street("heights", f"{h} m", 6010 + i, 6.0, height_m=h)
+            _street_scenario("heights", f"{h} m", 6010 + i, 6.0, height_m=h)
             for i, h in enumerate((0.3, 0.5, 0.8, 1.1, 2.0, 2.5))
         ),
-        *(_street("cameras", name, 6000 + i, 6.0, camera=name) for i, name in enumerate(_CAMERAS)),
-        *(_street("pixels", name, 6000 + i, 6.0, pixels=made) for i, (name, made) in enumerate(_PIXELS.items())),
-        *(_item("hand-held", f"seed {seed}", "room", _waved(seed, 6.0), seed) for seed in range(6020, 6024)),
-        *(_item("bare street", f"seed {seed}", "bare-street", driving(seed, 6.0), seed) for seed in (6030, 6031)),
-        *(_item(f"town {n}", f"seed {7000 + n}", "street", driving(7000 + n, 24.0), 7000 + n) for n in (1, 2)),
+        *(_street_scenario("cameras", name, 6000 + i, 6.0, camera=name) for i, name in enumerate(_CAMERAS)),
+        *(
+            _street_scenario("pixels", name, 6000 + i, 6.0, pixels=made)
+            for i, (name, made) in enumerate(_PIXELS.items())
+        ),
+        *(_scenario("hand-held", f"seed {seed}", "room", _slowed_hand(seed, 6.0), seed) for seed in range(6020, 6024)),
+        *(_scenario("bare street", f"seed {seed}", "bare-street", driving(seed, 6.0), seed) for seed in (6030, 6031)),
+        *(_scenario(f"town {n}", f"seed {7000 + n}", "street", driving(7000 + n, 24.0), 7000 + n) for n in (1, 2)),
     ]
     if recordings is not None and (recordings / DAY1).exists():
         for start_s in _DAY1_TESTED_S:
-            way = _part(recordings / DAY1, start_s, 10.0)
-            found.append(_item("mvsec", f"from {start_s} s", "street", way, 8000 + start_s))
+            trajectory = _recorded_path(recordings / DAY1, start_s, 10.0)
+            found.append(_scenario("mvsec", f"from {start_s} s", "street", trajectory, 8000 + start_s))
     if not quick:
         return found
-    firsts = {item.group: item for item in reversed(found)}
+    firsts = {scenario.group: scenario for scenario in reversed(found)}
     camera = named_camera(_QUICK_CAMERA, HEIGHT_M)
     return [
-        item._replace(simulation=replace(item.simulation, lens=camera, duration_s=_QUICK_S))
-        for item in reversed(firsts.values())
+        scenario._replace(simulation=replace(scenario.simulation, lens=camera, duration_s=_QUICK_S))
+        for scenario in reversed(firsts.values())
     ]
 
 
-def drives(recordings: Path | None, seconds: float, motion_px: float, *, quick: bool = False) -> list[Item]:
+def training_drives(
+    recordings: Path | None, seconds: float, motion_px: float, *, quick: bool = False
+) -> list[Scenario]:
     """What is learned from beside a configuration's sequences: MVSEC's day 2, and the first part of day 1.
 
     Source: NeuroVE, section IV-A: trained on outdoor_day2 and a subset of outdoor_day1, judged on the rest of it.
@@ -125,18 +130,20 @@ def drives(recordings: Path | None, seconds: float, motion_px: float, *, quick: 
         return []
     count = 2 if quick else _TRAIN_DRIVES
     on_day1 = max(1, round(count * DAY1_TRAINED_S / (DAY1_TRAINED_S + _DAY2_S)))
-    found: list[Item] = []
+    found: list[Scenario] = []
     for day, number, until_s in ((DAY1, on_day1, DAY1_TRAINED_S), (DAY2, count - on_day1, _DAY2_S)):
         for start in np.linspace(0, until_s - seconds - 1, number).round(2).tolist():
-            way = _part(recordings / day, start, seconds)
+            trajectory = _recorded_path(recordings / day, start, seconds)
             name = f"{Path(day).stem} from {start:g} s"
-            item = _item("drives", name, "street", way, 9000 + len(found), _QUICK_CAMERA if quick else CAMERA)
-            found.append(item._replace(simulation=replace(item.simulation, motion_px=motion_px)))
+            scenario = _scenario(
+                "drives", name, "street", trajectory, 9000 + len(found), _QUICK_CAMERA if quick else CAMERA
+            )
+            found.append(scenario._replace(simulation=replace(scenario.simulation, motion_px=motion_px)))
     return found
 
 
-def _waved(seed: int, seconds: float) -> Trajectory:
-    """A wild hand's way at a quarter of its speed: some 87 deg/s in the root mean square."""
+def _slowed_hand(seed: int, seconds: float) -> Trajectory:
+    """A wild hand's trajectory at a quarter of its speed: some 87 deg/s in the root mean square."""
     return Part(hand_held(seed, seconds), 0.0, _HAND_SLOWED, seconds)
 
 
@@ -147,11 +154,11 @@ def _turning_drive(seed: int, seconds: float) -> Trajectory:
     return turning_part(rng, driving(seed, DRIVE_S + seconds), slowed, seconds)
 
 
-def _part(poses: Path, start_s: float, seconds: float) -> Trajectory:
+def _recorded_path(poses: Path, start_s: float, seconds: float) -> Trajectory:
     return parse_trajectory(f"{poses}?start={start_s:g}&flat=1", seconds)
 
 
-def _street(
+def _street_scenario(
     group: str,
     name: str,
     seed: int,
@@ -160,24 +167,24 @@ def _street(
     camera: str = CAMERA,
     height_m: float = HEIGHT_M,
     pixels: PixelConfig = USUAL,
-) -> Item:
-    return _item(group, name, "street", _turning_drive(seed, seconds), seed, camera, height_m, pixels)
+) -> Scenario:
+    return _scenario(group, name, "street", _turning_drive(seed, seconds), seed, camera, height_m, pixels)
 
 
-def _item(
+def _scenario(
     group: str,
     name: str,
     scene: str,
-    way: Trajectory,
+    trajectory: Trajectory,
     seed: int,
     camera: str = CAMERA,
     height_m: float = HEIGHT_M,
     pixels: PixelConfig = USUAL,
-) -> Item:
-    return Item(group, name, simulate(scene, way, named_camera(camera, height_m), pixels, seed=seed))
+) -> Scenario:
+    return Scenario(group, name, simulate(scene, trajectory, named_camera(camera, height_m), pixels, seed=seed))
 
 
-class Kept:
+class HeldOutCache:
     """Simulated items in a folder; what is missing is made.
 
     Args:
@@ -188,39 +195,47 @@ class Kept:
     def __init__(self, folder: Path, config: ModelConfig) -> None:
         self._folder, self._config = folder / "held-out", config
 
-    def path(self, item: Item) -> Path:
-        """The file of an item, as `training.data.save` writes it."""
-        return self._folder / f"{self._key(item)}.safetensors"
+    def path(self, scenario: Scenario) -> Path:
+        """The file of an scenario, as `training.data.save` writes it."""
+        return self._folder / f"{self._key(scenario)}.safetensors"
 
-    def turning_path(self, item: Item) -> Path:
-        """The file of what contrast maximisation says of an item."""
-        return self._folder / f"{self._key(item)}.turning.json"
+    def contrast_path(self, scenario: Scenario) -> Path:
+        """The file of what contrast maximisation says of an scenario."""
+        return self._folder / f"{self._key(scenario)}.turning.json"
 
-    def fill(self, wanted: list[Item]) -> Iterator[Item]:
-        """Make all that is missing; yields each item once it is there."""
+    def fill(self, wanted: list[Scenario]) -> Iterator[Scenario]:
+        """Make all that is missing; yields each scenario once it is there."""
         self._folder.mkdir(parents=True, exist_ok=True)
-        for item in wanted:
-            if not self.path(item).exists():
-                save(sequence_of(item.simulation, self._config), self.path(item))
-            if item.group in CM_GROUPS and not self.turning_path(item).exists():
-                told = list(_turning(item.simulation))
-                write_atomically(self.turning_path(item), json.dumps(told).encode())
-            yield item
+        for scenario in wanted:
+            if not self.path(scenario).exists():
+                save(sequence_of(scenario.simulation, self._config), self.path(scenario))
+            if scenario.group in CONTRAST_GROUPS and not self.contrast_path(scenario).exists():
+                told = list(_contrast_rates(scenario.simulation))
+                write_atomically(self.contrast_path(scenario), json.dumps(told).encode())
+            yield scenario
 
-    def _key(self, item: Item) -> str:
-        made = item.simulation
-        kind: list[Any] = [FORMAT, *item[:2], made.name, made.seed, made.duration_s, made.motion_px, made.lens.name]
-        kind += [made.lens.info.model_dump(), made.lens.pitch_deg, made.pixels.model_dump()]
+    def _key(self, scenario: Scenario) -> str:
+        simulation = scenario.simulation
+        kind: list[Any] = [
+            FORMAT,
+            *scenario[:2],
+            simulation.name,
+            simulation.seed,
+            simulation.duration_s,
+            simulation.motion_px,
+            simulation.lens.name,
+        ]
+        kind += [simulation.lens.info.model_dump(), simulation.lens.pitch_deg, simulation.pixels.model_dump()]
         kind += [self._config.window.model_dump(), self._config.canonical.model_dump()]
-        position_m, _ = made.trajectory.pose(np.linspace(0, made.duration_s, _KEY_POINTS))
-        kind += position_m.round(6).tolist()  # names do not tell how a way was made
+        position_m, _ = simulation.trajectory.pose(np.linspace(0, simulation.duration_s, _KEY_POINTS))
+        kind += position_m.round(6).tolist()  # names do not tell how a trajectory was made
         return hashlib.sha256(json.dumps(kind, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _turning(simulation: Simulation) -> Iterator[dict[str, Any]]:
+def _contrast_rates(simulation: Simulation) -> Iterator[dict[str, Any]]:
     """What contrast maximisation says at some instants: `truth` and `answer` [rad/s], mean over a window."""
     last_s = simulation.duration_s - _WINDOW_US / 1e6
-    count = _CM_INSTANTS if simulation.duration_s > _QUICK_S else 1
+    count = _CONTRAST_INSTANTS if simulation.duration_s > _QUICK_S else 1
     for start_s in np.linspace(0.5, last_s - 0.02, count).round(2).tolist():
         start_us = round(start_s * 1e6)
         events = Events.empty()

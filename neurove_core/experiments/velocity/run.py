@@ -1,6 +1,7 @@
-"""The paper's velocity experiment (sections IV-C and IV-D): methods trained by one recipe, judged alike.
+"""The paper's velocity experiment (sections IV-C and IV-D): train all methods with one recipe, evaluate all alike.
 
-A trained method is a folder with its bundle, so that an interrupted experiment goes on where it was.
+Each trained method is a folder that holds its bundle. An interrupted experiment continues with the first method that
+is not finished.
 """
 
 import json
@@ -11,8 +12,14 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from neurove_core import models
-from neurove_core.experiments.velocity.held_out import CM_GROUPS, Item, Kept, drives, items
-from neurove_core.experiments.velocity.tracks import Track, blind, follow, summaries, summary
+from neurove_core.experiments.velocity.held_out import (
+    CONTRAST_GROUPS,
+    HeldOutCache,
+    Scenario,
+    held_out_scenarios,
+    training_drives,
+)
+from neurove_core.experiments.velocity.tracks import Track, blind_predictors, follow, summaries, summary
 from neurove_core.models import bundle
 from neurove_core.models.bundle import Bundle
 from neurove_core.networks.snn_ang import CHANNELS
@@ -28,56 +35,70 @@ METHODS: Final[dict[str, dict[str, Any]]] = {
     "ann": {"kind": "ann", "network": {"precision": "float32"}},
     "snn-ang": {"kind": "snn-ang", "network": {"channels": CHANNELS, "precision": "float32"}},
 }
-"""What of the model's configuration each method changes; nothing else differs between them."""
+"""The fields of the model configuration that each method changes. Nothing else differs between the methods."""
 
 Show = Callable[[str, int, int, str], None]
-"""What is being done, how far, of how much, and a word on it."""
+"""Reports progress: the task, the steps done, the steps in total, and a detail."""
 
 
-class Plan(NamedTuple):
-    """What an experiment trains and judges."""
+class Experiment(NamedTuple):
+    """What to train and evaluate."""
 
     config: TrainingConfig
     methods: tuple[str, ...]
     seeds: range
-    recordings: Path | None  # where MVSEC's poses lie
-    quick: bool = False
+    recordings: Path | None  # folder of the recordings, with MVSEC's poses
+    quick: bool = False  # few short scenarios through a tiny camera
+
+    def drives(self) -> list[Scenario]:
+        """The drives along MVSEC's poses to train on, besides the sequences of the configuration."""
+        data = self.config.data
+        return training_drives(self.recordings, data.seconds, data.motion_px, quick=self.quick)
+
+    def scenarios(self) -> list[Scenario]:
+        """The held-out scenarios to evaluate on."""
+        return held_out_scenarios(self.recordings, quick=self.quick)
 
 
-class Trained(NamedTuple):
-    """One method from one seed, judged."""
+class VelocityRun(NamedTuple):
+    """One method, trained from one seed and evaluated."""
 
-    row: dict[str, Any]  # as it goes into the results
+    row: dict[str, Any]  # its entry in the results
     tracks: list[Track]
-    cpu_s_per_update: float  # of this machine, so it is only told as a ratio
+    cpu_s_per_update: float  # depends on this machine, so the results give ratios only
 
 
-def config_of(base: TrainingConfig, method: str, seed: int) -> TrainingConfig:
-    """The configuration of a method: the base's in everything but what METHODS says, and the seed.
+def method_config(base: TrainingConfig, method: str, seed: int) -> TrainingConfig:
+    """The configuration of a method: the base with the changes of METHODS and another seed.
+
+    Args:
+        base: the recipe of all methods.
+        method: a key of METHODS.
+        seed: is added to the seed of the base.
 
     Raises:
-        InvalidField: there is no such method.
+        InvalidField: the method is unknown.
     """
     if method not in METHODS:
         raise InvalidField("reproduce velocity", "methods", method, f"known are {', '.join(METHODS)}")
-    told = base.model_dump()
+    fields = base.model_dump()
     changes = METHODS[method]
-    told["model"] |= {name: value for name, value in changes.items() if name != "network"}
-    told["model"]["network"] |= changes.get("network", {})
-    told["recipe"]["seed"] = base.recipe.seed + seed
-    return TrainingConfig.model_validate(told | {"name": f"{method}-{seed}"})
+    fields["model"] |= {name: value for name, value in changes.items() if name != "network"}
+    fields["model"]["network"] |= changes.get("network", {})
+    fields["recipe"]["seed"] = base.recipe.seed + seed
+    return TrainingConfig.model_validate(fields | {"name": f"{method}-{seed}"})
 
 
 def base_config(source: str | None = None, steps: int | None = None, *, quick: bool = False) -> TrainingConfig:
     """The recipe of all methods.
 
     Args:
-        source: a configuration's file or name; by default `driving`, or `velocity-quick`.
-        steps: so many updates, not those of the configuration.
-        quick: see Plan.
+        source: file or name of a configuration; the default is `driving`, or `velocity-quick` for a quick run.
+        steps: number of updates, in place of the configuration's own.
+        quick: see Experiment.
 
     Raises:
-        InvalidField: there is no such configuration, or it or `steps` is wrong.
+        InvalidField: the configuration does not exist, or it or `steps` is wrong.
     """
     found = configs.load(source or ("velocity-quick" if quick else "driving"))
     if steps is None:
@@ -87,47 +108,60 @@ def base_config(source: str | None = None, steps: int | None = None, *, quick: b
     return found.model_copy(update={"recipe": found.recipe.model_copy(update={"steps": steps, "cycles": 1})})
 
 
-def reproduce(plan: Plan, folder: Path, out: Path, show: Show, workers: int = 1) -> Iterator[Trained]:
-    """Make the sequences, then train and judge each method from each seed; what is there already is not made again.
+def reproduce(experiment: Experiment, folder: Path, out: Path, show: Show, workers: int = 1) -> Iterator[VelocityRun]:
+    """Simulate the sequences, then train and evaluate each method from each seed; reuse finished sequences and methods.
 
     Args:
-        plan: what to do.
-        folder: of the simulated sequences.
-        out: folder of the trained methods, each in its own.
-        show: told how far it is.
-        workers: processes that simulate the configuration's sequences.
+        experiment: what to train and evaluate.
+        folder: holds the simulated sequences.
+        out: holds one folder per trained method.
+        show: receives the progress.
+        workers: number of processes that simulate the sequences of the configuration.
+
+    Yields:
+        the runs, all methods of the first seed first.
 
     Raises:
-        InvalidField: a method is unknown, or a folder holds another run. BrokenRecording: a sequence is broken.
+        InvalidField: a method is unknown, or a folder holds another run. BrokenRecording: a sequence is damaged.
     """
-    if not plan.methods or not len(plan.seeds):
-        raise InvalidField("reproduce velocity", "seeds", len(plan.seeds), "must be at least 1")
-    wanted = [(method, config_of(plan.config, method, seed)) for seed in plan.seeds for method in plan.methods]
-    cache = data.Cache(folder, plan.config)
-    total = plan.config.data.sequences
-    for done, name in enumerate(cache.fill(workers), total - len(cache.missing()) + 1):
+    if not experiment.methods or not len(experiment.seeds):
+        raise InvalidField("reproduce velocity", "seeds", len(experiment.seeds), "must be at least 1")
+    wanted = [
+        (method, method_config(experiment.config, method, seed))
+        for seed in experiment.seeds
+        for method in experiment.methods
+    ]
+    sequences = data.Cache(folder, experiment.config)
+    total = experiment.config.data.sequences
+    for done, name in enumerate(sequences.fill(workers), total - len(sequences.missing()) + 1):
         show("simulated", done, total, name)
-    ways = drives(plan.recordings, plan.config.data.seconds, plan.config.data.motion_px, quick=plan.quick)
-    judged_on = items(plan.recordings, quick=plan.quick)
-    kept = Kept(folder, plan.config.model)
-    for done, item in enumerate(kept.fill([*ways, *judged_on]), 1):
-        show("held out", done, len(ways) + len(judged_on), f"{item.group} {item.name}")
-    more = [kept.path(item) for item in ways]
+    drives, scenarios = experiment.drives(), experiment.scenarios()
+    cache = HeldOutCache(folder, experiment.config.model)
+    for done, scenario in enumerate(cache.fill([*drives, *scenarios]), 1):
+        show("held out", done, len(drives) + len(scenarios), f"{scenario.group} {scenario.name}")
+    more = [cache.path(drive) for drive in drives]
     for method, config in wanted:
-        run = trained(config, out, folder, more, show)
-        yield _judged(method, config, run, judged_on, kept)
+        run = ensure_trained(config, out, folder, more, show)
+        yield _evaluate(method, config, run, scenarios, cache)
 
 
-def trained(config: TrainingConfig, out: Path, folder: Path, more: Sequence[Path], show: Show) -> Path:
-    """The folder of a trained method; it is trained where it is not yet, or not to the end.
+def ensure_trained(config: TrainingConfig, out: Path, folder: Path, more: Sequence[Path], show: Show) -> Path:
+    """Return the folder of a trained method; train it first if it is missing or unfinished.
+
+    Args:
+        config: of the method.
+        out: holds one folder per trained method.
+        folder: holds the simulated sequences of the configuration.
+        more: sequence files to train on besides them.
+        show: receives the progress.
 
     Raises:
         InvalidField: the folder holds a run of another configuration. BadModel: so does its checkpoint.
     """
     run = out / (f"{config.name}-mvsec" if more else config.name)
-    path, about = run / f"{config.name}{bundle.SUFFIX}", run / RUN_JSON
-    if path.exists() and about.exists():
-        if TrainingConfig.model_validate(json.loads(about.read_text())["config"]) != config:
+    path, record = run / f"{config.name}{bundle.SUFFIX}", run / RUN_JSON
+    if path.exists() and record.exists():
+        if TrainingConfig.model_validate(json.loads(record.read_text())["config"]) != config:
             why = "it holds a run of another configuration: choose another --out, or delete it"
             raise InvalidField("reproduce velocity", "out", run.name, why)
         return run
@@ -144,71 +178,87 @@ def trained(config: TrainingConfig, out: Path, folder: Path, more: Sequence[Path
     return run
 
 
-def _judged(method: str, config: TrainingConfig, run: Path, judged_on: list[Item], kept: Kept) -> Trained:
+def _evaluate(
+    method: str, config: TrainingConfig, run: Path, scenarios: list[Scenario], cache: HeldOutCache
+) -> VelocityRun:
     model = bundle.load(run / f"{config.name}{bundle.SUFFIX}")
-    about = json.loads((run / RUN_JSON).read_text())
-    figures, tracks = _figures(model, judged_on, kept)
+    record = json.loads((run / RUN_JSON).read_text())
+    figures, tracks = _held_out_figures(model, scenarios, cache)
     row = {
         "method": method,
         "seed": config.recipe.seed,
-        "updates": about["step"],
-        "commit": about["commit"],
-        "torch": about["torch"],
-        "curve": [{name: value for name, value in point.items() if name != "cpu_s"} for point in about["curve"]],
+        "updates": record["step"],
+        "commit": record["commit"],
+        "torch": record["torch"],
+        "curve": [{name: value for name, value in point.items() if name != "cpu_s"} for point in record["curve"]],
     }
-    return Trained(row | figures, tracks, about["cpu_s"] / about["step"])
+    return VelocityRun(row | figures, tracks, record["cpu_s"] / record["step"])
 
 
-def _figures(model: Bundle, judged_on: list[Item], kept: Kept) -> tuple[dict[str, Any], list[Track]]:
+def _held_out_figures(
+    model: Bundle, scenarios: list[Scenario], cache: HeldOutCache
+) -> tuple[dict[str, Any], list[Track]]:
     spikes, neurons, tracks = 0, 0, []
-    for item in judged_on:
-        track, fires = follow(model, kept.path(item), item)
+    for scenario in scenarios:
+        track, (scenario_spikes, scenario_neurons) = follow(model, cache.path(scenario), scenario)
         tracks.append(track)
-        spikes, neurons = spikes + fires[0], neurons + fires[1]
-    told = {
+        spikes, neurons = spikes + scenario_spikes, neurons + scenario_neurons
+    figures = {
         "parameters": model.info.parameters,
         "digest": model.digest,
         "firing_rate": spikes / neurons if neurons else None,
         "groups": summaries(tracks),
         "recordings": {f"{track.group}: {track.name}": summary([track]) for track in tracks},
     }
-    return told, tracks
+    return figures, tracks
 
 
-def shipped(plan: Plan, folder: Path) -> dict[str, Any] | None:
-    """What the default model reaches on the same items, which `reproduce` has made; None where it sees another grid.
+def default_model_figures(experiment: Experiment, folder: Path) -> dict[str, Any] | None:
+    """The figures of the default model on the same scenarios; None if it uses another window or canonical grid.
 
-    It learned longer than the methods, and from none of MVSEC's ways.
+    The default model was trained longer than the methods, and on none of MVSEC's trajectories.
+
+    Args:
+        experiment: whose scenarios `reproduce` has simulated.
+        folder: holds the simulated sequences.
     """
     model = models.find(models.DEFAULT)
-    if (model.config.window, model.config.canonical) != (plan.config.model.window, plan.config.model.canonical):
+    own, wanted = model.config, experiment.config.model
+    if (own.window, own.canonical) != (wanted.window, wanted.canonical):
         return None
-    figures, _ = _figures(model, items(plan.recordings, quick=plan.quick), Kept(folder, plan.config.model))
-    made_by = model.about.made_by
+    figures, _ = _held_out_figures(model, experiment.scenarios(), HeldOutCache(folder, wanted))
+    made_by = model.metadata.made_by
     return figures | {"updates": made_by and made_by.updates, "program": made_by and made_by.program}
 
 
-def turning(plan: Plan, folder: Path) -> dict[str, dict[str, Any]]:
-    """The angular figures of contrast maximisation, group by group, at a few instants of each item."""
-    kept = Kept(folder, plan.config.model)
+def contrast_figures(experiment: Experiment, folder: Path) -> dict[str, dict[str, Any]]:
+    """The angular figures of contrast maximisation by group, from a few instants of each scenario.
+
+    Args:
+        experiment: whose scenarios `reproduce` has simulated.
+        folder: holds the simulated sequences.
+    """
+    cache = HeldOutCache(folder, experiment.config.model)
     found: dict[str, list[Track]] = {}
-    for item in items(plan.recordings, quick=plan.quick):
-        if item.group in CM_GROUPS:
-            told = json.loads(kept.turning_path(item).read_text())
-            t_s = np.array([one["t_s"] for one in told])
-            truth, said = (np.array([[0.0, 0.0, 0.0, *one[name]] for one in told]) for name in ("truth", "answer"))
-            found.setdefault(item.group, []).append(Track(item.group, item.name, t_s, truth, said, 1))
+    for scenario in experiment.scenarios():
+        if scenario.group in CONTRAST_GROUPS:
+            instants = json.loads(cache.contrast_path(scenario).read_text())
+            t_s = np.array([one["t_s"] for one in instants])
+            truth, estimate = (
+                np.array([[0.0, 0.0, 0.0, *one[name]] for one in instants]) for name in ("truth", "answer")
+            )
+            found.setdefault(scenario.group, []).append(Track(scenario.group, scenario.name, t_s, truth, estimate, 1))
     linear = ("re_v_l", "re_v_l_unfloored", "rmse_v_l_m_s", "r2_v_l", "median_direction_error_v_l_deg")
     return {group: summary(tracks) | dict.fromkeys(linear) for group, tracks in found.items()}
 
 
-def results(plan: Plan, folder: Path, found: list[Trained]) -> dict[str, Any]:
-    """All that is told of an experiment; nothing in it depends on how fast the machine is but ratios.
+def results(experiment: Experiment, folder: Path, found: list[VelocityRun]) -> dict[str, Any]:
+    """The results of an experiment as JSON values; only the cost ratios depend on the speed of the machine.
 
     Args:
-        plan: of the experiment.
-        folder: of the simulated sequences.
-        found: what `reproduce` gave, all of it.
+        experiment: what was trained and evaluated.
+        folder: holds the simulated sequences.
+        found: all runs that `reproduce` yielded.
     """
     ours = {one.row["seed"]: one.cpu_s_per_update for one in found if one.row["method"] == "nve"}
     runs = []
@@ -217,12 +267,12 @@ def results(plan: Plan, folder: Path, found: list[Trained]) -> dict[str, Any]:
         runs.append(one.row | {"cost": one.cpu_s_per_update / reference if reference else None})
     tracks = found[0].tracks
     groups = dict.fromkeys(track.group for track in tracks)
-    config = plan.config.model_dump(mode="json")
+    config = experiment.config.model_dump(mode="json")
     return {
-        "quick": plan.quick,
-        "config": config | {"methods": {method: METHODS[method] for method in plan.methods}},
-        "drives": len(drives(plan.recordings, plan.config.data.seconds, plan.config.data.motion_px, quick=plan.quick)),
-        "no_mvsec": None if "mvsec" in groups else "MVSEC's poses are not there: --recordings DIR",
+        "quick": experiment.quick,
+        "config": config | {"methods": {method: METHODS[method] for method in experiment.methods}},
+        "drives": len(experiment.drives()),
+        "no_mvsec": None if "mvsec" in groups else "MVSEC's poses are missing: --recordings DIR",
         "groups": {
             group: {
                 "items": sum(track.group == group for track in tracks),
@@ -231,6 +281,6 @@ def results(plan: Plan, folder: Path, found: list[Trained]) -> dict[str, Any]:
             for group in groups
         },
         "runs": runs,
-        "shipped": shipped(plan, folder),
-        "blind": {"contrast maximisation": turning(plan, folder), **blind(tracks)},
+        "shipped": default_model_figures(experiment, folder),
+        "blind": {"contrast maximisation": contrast_figures(experiment, folder), **blind_predictors(tracks)},
     }

@@ -1,4 +1,4 @@
-"""What a model says of an item, beside the truth, and the figures of it."""
+"""What a model says of an scenario, beside the truth, and the figures of it."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from neurove_core.engine.engine import Engine
 from neurove_core.evaluation.metrics import SKIP_S, figures
-from neurove_core.experiments.velocity.held_out import Item
+from neurove_core.experiments.velocity.held_out import Scenario
 from neurove_core.models.bundle import PER_HEIGHT, Bundle
 from neurove_core.networks.encoding import to_spikes
 from neurove_core.networks.kinds import fired
@@ -19,12 +19,12 @@ from neurove_core.training.data import Sequences
 
 Array = NDArray[np.float64]
 
-LEAST_RATE_DEG_S: Final = 1.0
+MIN_RATE_DEG_S: Final = 1.0
 """Gehrig 2020 counts relative errors of truths above this."""
 
 _CHUNK: Final = 16  # windows that are followed at once
 
-_KEPT: Final = (
+_FIGURES: Final = (
     "windows",
     "r2_v_l",
     "r2_v_a",
@@ -40,24 +40,24 @@ _KEPT: Final = (
 
 
 class Track(NamedTuple):
-    """Answers to one item beside the truth, bin by bin; the first SKIP_S are left out."""
+    """Answers to one scenario beside the truth, bin by bin; the first SKIP_S are left out."""
 
     group: str
     name: str
     t_s: Array  # (N,) middle of each bin
     truth: Array  # (N, 6) [m/s, rad/s]
-    answer: Array  # (N, 6)
+    estimate: Array  # (N, 6)
     bins: int
 
 
 @torch.inference_mode()
-def follow(model: Bundle, path: Path, item: Item) -> tuple[Track, tuple[int, int]]:
-    """Run a model over an item's windows from rest, as the service would.
+def follow(model: Bundle, path: Path, scenario: Scenario) -> tuple[Track, tuple[int, int]]:
+    """Run a model over an scenario's windows from rest, as the service would.
 
     Args:
         model: any kind.
-        path: of the item's sequence.
-        item: whose it is.
+        path: of the scenario's sequence.
+        scenario: whose it is.
 
     Returns:
         its track, and how many neurons fired and how many there were, as its state at the end of every 16 windows
@@ -80,8 +80,11 @@ def follow(model: Bundle, path: Path, item: Item) -> tuple[Track, tuple[int, int
     kept = slice(round(SKIP_S / window_s), None)
     t_s = (np.arange(twists.shape[0] * bins).reshape(-1, bins) + 0.5) * window_s / bins
     truth = (twists * metres)[kept].reshape(-1, 6)
-    said = (answer * (metres if model.linear_unit == PER_HEIGHT else 1.0))[kept].reshape(-1, 6)
-    return Track(item.group, item.name, t_s[kept].ravel(), truth, said, bins), (int(counted[0]), int(counted[1]))
+    estimate = (answer * (metres if model.linear_unit == PER_HEIGHT else 1.0))[kept].reshape(-1, 6)
+    return Track(scenario.group, scenario.name, t_s[kept].ravel(), truth, estimate, bins), (
+        int(counted[0]),
+        int(counted[1]),
+    )
 
 
 def summaries(tracks: list[Track]) -> dict[str, dict[str, Any]]:
@@ -94,30 +97,32 @@ def summary(tracks: list[Track]) -> dict[str, Any]:
     """The figures that the tables need, over some tracks together; `gehrig_*` are the two of Gehrig 2020.
 
     Those are the mean length of the angular error, which that paper calls RMSE, and the median of its ratio to a truth
-    of more than LEAST_RATE_DEG_S.
+    of more than MIN_RATE_DEG_S.
     """
-    truth, said = (np.concatenate(parts) for parts in zip(*((one.truth, one.answer) for one in tracks), strict=True))
-    told = figures(truth, said, tracks[0].bins)
-    error, rate = (np.degrees(np.linalg.norm(part[:, 3:], axis=1)) for part in (said - truth, truth))
-    counted = rate > LEAST_RATE_DEG_S
-    return {name: told[name] for name in _KEPT} | {
-        "rmse_yaw_deg_s": told["per_axis"]["wy"]["rmse_deg_s"],
-        "spread_v_l_m_s": told["spread_v_l_m_s"],
-        "spread_v_a_deg_s": told["spread_v_a_deg_s"],
+    truth, estimate = (
+        np.concatenate(parts) for parts in zip(*((one.truth, one.estimate) for one in tracks), strict=True)
+    )
+    all_figures = figures(truth, estimate, tracks[0].bins)
+    error, rate = (np.degrees(np.linalg.norm(part[:, 3:], axis=1)) for part in (estimate - truth, truth))
+    counted = rate > MIN_RATE_DEG_S
+    return {name: all_figures[name] for name in _FIGURES} | {
+        "rmse_yaw_deg_s": all_figures["per_axis"]["wy"]["rmse_deg_s"],
+        "spread_v_l_m_s": all_figures["spread_v_l_m_s"],
+        "spread_v_a_deg_s": all_figures["spread_v_a_deg_s"],
         "gehrig_mean_error_deg_s": float(error.mean()),
         "gehrig_median_re": float(np.median(error[counted] / rate[counted])) if counted.any() else None,
     }
 
 
-def blind(tracks: list[Track]) -> dict[str, dict[str, dict[str, Any]]]:
+def blind_predictors(tracks: list[Track]) -> dict[str, dict[str, dict[str, Any]]]:
     """The figures, group by group, of two predictors that see nothing: `zero`, and `mean` of the group's own truth."""
     groups = {group: [one for one in tracks if one.group == group] for group in dict.fromkeys(t.group for t in tracks)}
     means = {group: np.concatenate([one.truth for one in own]).mean(axis=0) for group, own in groups.items()}
-    said: dict[str, dict[str, Array]] = {"zero": {group: np.zeros(6) for group in groups}, "mean": means}
+    estimate: dict[str, dict[str, Array]] = {"zero": {group: np.zeros(6) for group in groups}, "mean": means}
     return {
         name: {
-            group: summary([one._replace(answer=np.broadcast_to(values[group], one.truth.shape)) for one in own])
+            group: summary([one._replace(estimate=np.broadcast_to(values[group], one.truth.shape)) for one in own])
             for group, own in groups.items()
         }
-        for name, values in said.items()
+        for name, values in estimate.items()
     }

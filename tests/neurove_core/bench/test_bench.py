@@ -35,7 +35,11 @@ def test_what_is_timed_gives_equal_answers_and_peers_that_are_not_installed_are_
     assert any("PyTorch, plain" in row.peer for row in found)
     assert all(row.equal is not False for row in found)
     as_wide = [row for row in found if "int8" not in row.name or row.peer == "PyTorch, plain"]
-    assert all(row.equal for row in as_wide if not any(name in row.peer for name in (*peers.ELSEWISE, window.AT_PEAK)))
+    assert all(
+        row.equal
+        for row in as_wide
+        if not any(name in row.peer for name in (*peers.DIFFERENT_BY_DESIGN, window.AT_PEAK))
+    )
     for module, name in PEERS.items():
         assert (name in INSTALLED) == any(name in row.peer for row in found)
         assert (name in INSTALLED) != any(line.startswith(module) for line in missing)

@@ -107,7 +107,7 @@ def test_all_of_them_are_judged_where_they_are_there(tmp_path):
     evbench = rows["evbench", "rotation about x over its truth"]["made_of"]
     assert evbench["truth [rad/s]"] == pytest.approx(-0.142, abs=0.001)
     rest = rows["ecd", "turning at rest [rad/s]"]
-    assert rest["met"] == (rest["value"] <= real.REST_RAD_S)
+    assert rest["met"] == (rest["value"] <= real.STATIONARY_RAD_S)
     slider = rows["slider_depth", "direction of motion"]["made_of"]["truth [m/s]"]
     assert slider == pytest.approx([0.3, 0, 0], abs=0.05)
 

@@ -6,27 +6,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neurove_core.experiments.sine import data as sine
-from neurove_core.experiments.sine import report as sine_report
+from neurove_core.experiments.sine import data, report
 from neurove_core.experiments.sine.data import LENGTH, Network, Recipe, evaluate, waves
 from neurove_core.experiments.sine.training import train
 from neurove_protocol.errors import InvalidField
 
 pytest.importorskip("scipy", reason="scipy is not installed: pip install 'neurove[experiments]'")
 
-QUICK = Path(sine.__file__).parent / "results" / "sine-quick.json"
+QUICK = Path(data.__file__).parents[1] / "results" / "sine-quick.json"
 TINY = Recipe(model="aslstm", hidden=8, updates=12, fine_updates=6)
 
 
 def test_waves_go_on_as_the_same_sine():
     rows = waves()
     assert rows.shape == (100, LENGTH)
-    truth = sine.continued(rows)
+    truth = data.continued(rows)
     np.testing.assert_allclose(truth[:LENGTH].T, rows, atol=1e-6)
     np.testing.assert_allclose(truth[2:] + truth[:-2], 2 * np.cos(0.05) * truth[1:-1], atol=1e-6)  # to its end
 
 
-@pytest.mark.parametrize("model", list(sine.KINDS))
+@pytest.mark.parametrize("model", list(data.KINDS))
 def test_training_lowers_the_error_and_keeps_what_is_not_learned(model):
     recipe = Recipe(model=model, hidden=16, v_th=0.2, updates=80, fine_updates=0)
     before = Network(recipe, np.random.default_rng(0))
@@ -77,39 +76,39 @@ def test_a_rate_in_the_loss_makes_layers_fire_more():
 )
 def test_a_wrong_trial_is_named(changes, message):
     with pytest.raises(InvalidField, match=message):
-        next(sine_report.reproduce(["aslstm"], [0], changes=changes))
+        next(report.reproduce(["aslstm"], [0], changes=changes))
 
 
 def test_an_unknown_model_is_named():
     with pytest.raises(InvalidField, match="models='gru': known are aslstm"):
-        next(sine_report.reproduce(["gru"], [0]))
+        next(report.reproduce(["gru"], [0]))
 
 
 def test_quick_reproduces_the_committed_figures(tmp_path):
     committed = json.loads(QUICK.read_text())
     runs = []
-    for run in sine_report.reproduce([run["model"] for run in committed], [0], quick=True):
+    for run in report.reproduce([run["model"] for run in committed], [0], quick=True):
         runs.append(run)
-        sine_report.save_run(runs, tmp_path, command="a test", commit="none")
+        report.save_run(runs, tmp_path, command="a test", commit="none")
     for run, wanted in zip(runs, committed, strict=True):
         figures = run.figures
         rtol = 0.1 if run.model == "aslstm" else 0.5  # spikes amplify the last bits in which machines differ
         for key in ("regression_rmse_x1000_from_100", "regression_rmse_x1000"):
             np.testing.assert_allclose(figures[key], wanted[key], rtol=rtol, err_msg=run.model)
         assert (figures["updates"], figures["parameters"]) == (wanted["updates"], wanted["parameters"])
-    sine_report.save(runs, tmp_path)
+    report.save(runs, tmp_path)
     written = {file.name for file in tmp_path.iterdir()}
     assert written >= {"table1.md", "table2.json", "regression.png", "spikes.svg", "aslstm-0.safetensors"}
     table = (tmp_path / "table1.md").read_text()
     assert "| ltc |" in table
     assert "3.16 / 3.67 / 3.92" in table  # the paper's, beside ours
     again = json.loads((tmp_path / "sine.json").read_text())
-    assert [run["model"] for run in again] == list(sine_report.RECIPES)
+    assert [run["model"] for run in again] == list(report.RECIPES)
     assert all({"v_th", "spike_rate", "cpu_s", "command", "commit"} <= run.keys() for run in again)
 
 
 def test_the_pages_tables_are_those_of_the_committed_results():
     figures = json.loads((QUICK.parent / "sine.json").read_text())
     page = (QUICK.parents[1] / "README.md").read_text()
-    for number, rows in sine_report.tables(figures).items():
-        assert sine_report.markdown(rows, number) in page
+    for number, rows in report.tables(figures).items():
+        assert report.markdown(rows, number) in page

@@ -9,10 +9,16 @@ import pytest
 from neurove_core.estimator import Estimator
 from neurove_core.evaluation.judge import answer, judge
 from neurove_core.experiments import real
-from neurove_core.experiments.velocity import report as velocity_report
-from neurove_core.experiments.velocity import run as velocity
-from neurove_core.experiments.velocity.held_out import CM_GROUPS, DAY1_TRAINED_S, GROUPS, Kept, drives, items
-from neurove_core.experiments.velocity.tracks import Track, blind, follow, summary
+from neurove_core.experiments.velocity import report, run
+from neurove_core.experiments.velocity.held_out import (
+    CONTRAST_GROUPS,
+    DAY1_TRAINED_S,
+    GROUPS,
+    HeldOutCache,
+    held_out_scenarios,
+    training_drives,
+)
+from neurove_core.experiments.velocity.tracks import Track, blind_predictors, follow, summary
 from neurove_core.models import bundle
 from neurove_core.training import config as configs
 from neurove_protocol.errors import InvalidField
@@ -20,7 +26,7 @@ from neurove_service.cli import main
 from tests.recordings import SHARED, shared
 
 RESULTS = Path(real.__file__).parent / "results"
-QUICK = velocity.base_config(quick=True)
+QUICK = run.base_config(quick=True)
 
 
 def quiet(what: str, done: int, of: int, about: str) -> None:
@@ -28,18 +34,18 @@ def quiet(what: str, done: int, of: int, about: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def finished(tmp_path_factory):
     """Everything, once: sequences, two methods, results."""
     folder = tmp_path_factory.mktemp("velocity")
-    plan = velocity.Plan(QUICK, ("nve", "ann"), range(1), None, quick=True)
-    found = list(velocity.reproduce(plan, folder / "data", folder, quiet))
-    return folder, plan, found, velocity.results(plan, folder / "data", found)
+    experiment = run.Experiment(QUICK, ("nve", "ann"), range(1), None, quick=True)
+    found = list(run.reproduce(experiment, folder / "data", folder, quiet))
+    return folder, experiment, found, run.results(experiment, folder / "data", found)
 
 
 def test_methods_differ_from_one_another_in_what_they_are_and_in_nothing_else():
-    base = velocity.base_config()
+    base = run.base_config()
     assert base == configs.load("driving")
-    made = {method: velocity.config_of(base, method, 0) for method in velocity.METHODS}
+    made = {method: run.method_config(base, method, 0) for method in run.METHODS}
     assert {method: one.model.kind for method, one in made.items()} == {
         "nve": "neurove",
         "nve-wo": "neurove",
@@ -54,79 +60,79 @@ def test_methods_differ_from_one_another_in_what_they_are_and_in_nothing_else():
             base.model.window,
             base.model.canonical,
         )
-    assert velocity.config_of(base, "nve", 3).recipe.seed == base.recipe.seed + 3
+    assert run.method_config(base, "nve", 3).recipe.seed == base.recipe.seed + 3
 
 
 def test_what_is_judged_on_is_no_scene_and_no_way_that_is_learned_from():
-    wanted = items()
-    assert {item.group for item in wanted} == set(GROUPS) - {"mvsec"}
+    wanted = held_out_scenarios()
+    assert {scenario.group for scenario in wanted} == set(GROUPS) - {"mvsec"}
     learned_from = min(configs.load(name).data.seed for name in ("default", "driving"))
-    assert max(item.simulation.seed for item in wanted) < 1_000_000 <= learned_from
-    heights = [item.simulation.lens.height_m for item in wanted if item.group == "heights"]
+    assert max(scenario.simulation.seed for scenario in wanted) < 1_000_000 <= learned_from
+    heights = [scenario.simulation.lens.height_m for scenario in wanted if scenario.group == "heights"]
     assert (min(heights), max(heights)) == (0.3, 2.5)
-    assert len({item.simulation.lens.name for item in wanted if item.group == "cameras"}) == 5
+    assert len({scenario.simulation.lens.name for scenario in wanted if scenario.group == "cameras"}) == 5
 
 
 def test_of_day_1_nothing_is_judged_on_that_is_learned_from():
     for day in ("1", "2"):
         shared(f"mvsec/outdoor_day{day}_odom.h5")
-    learned = drives(SHARED, 6.0, 1.5)
-    tested = [item for item in items(SHARED) if item.group == "mvsec"]
-    on_day1 = [float(item.name.split()[2]) for item in learned if item.name.startswith("outdoor_day1")]
+    learned = training_drives(SHARED, 6.0, 1.5)
+    tested = [scenario for scenario in held_out_scenarios(SHARED) if scenario.group == "mvsec"]
+    on_day1 = [float(scenario.name.split()[2]) for scenario in learned if scenario.name.startswith("outdoor_day1")]
     assert len(learned) == 48
     assert 5 < len(on_day1) < 15
-    assert max(on_day1) + 6.0 <= DAY1_TRAINED_S < min(float(item.name.split()[1]) for item in tested)
-    assert {item.simulation.lens.info.lens for item in (*learned, *tested)} == {"equidistant"}
-    ways = [item.simulation.trajectory.twist(np.linspace(0, 5, 20)) for item in tested]
+    assert max(on_day1) + 6.0 <= DAY1_TRAINED_S < min(float(scenario.name.split()[1]) for scenario in tested)
+    assert {scenario.simulation.lens.info.lens for scenario in (*learned, *tested)} == {"equidistant"}
+    ways = [scenario.simulation.trajectory.twist(np.linspace(0, 5, 20)) for scenario in tested]
     assert np.abs(ways).max() < 20
     assert np.mean([way[:, 2].mean() for way in ways]) > 2  # it drives forward
 
 
-def test_without_the_poses_there_are_no_drives_and_the_table_says_so(run):
-    assert drives(None, 6.0, 1.5) == []
-    assert drives(Path("nowhere"), 6.0, 1.5) == []
-    _, _, _, told = run
+def test_without_the_poses_there_are_no_drives_and_the_table_says_so(finished):
+    assert training_drives(None, 6.0, 1.5) == []
+    assert training_drives(Path("nowhere"), 6.0, 1.5) == []
+    _, _, _, told = finished
     assert "mvsec" not in told["groups"]
-    assert "Left out: MVSEC's poses are not there" in velocity_report.markdown(told)
+    assert "Left out: MVSEC's poses are missing" in report.markdown(told)
 
 
-def test_a_track_is_what_the_estimator_says_of_the_same_recording(run):
-    folder, plan, found, _ = run
+def test_a_track_is_what_the_estimator_says_of_the_same_recording(finished):
+    folder, experiment, found, _ = finished
     model = bundle.load(folder / "nve-0" / "nve-0.safetensors")
-    item = next(item for item in items(quick=True) if item.group == "driving")
-    track, _ = follow(model, Kept(folder / "data", plan.config.model).path(item), item)
-    judged = judge(answer(Estimator(model), item.simulation), item.simulation.twists())
+    scenario = next(scenario for scenario in held_out_scenarios(quick=True) if scenario.group == "driving")
+    track, _ = follow(model, HeldOutCache(folder / "data", experiment.config.model).path(scenario), scenario)
+    judged = judge(answer(Estimator(model), scenario.simulation), scenario.simulation.twists())
     bins = len(judged.truth)
     assert len(track.truth) - bins in (0, 5)  # a recording's last window is closed by an event after it
-    np.testing.assert_allclose(track.answer[:bins], judged.answer, atol=1e-4)
+    np.testing.assert_allclose(track.estimate[:bins], judged.answer, atol=1e-4)
     np.testing.assert_allclose(track.truth[:bins], judged.truth, atol=2e-3)
     np.testing.assert_allclose(track.t_s[:bins] * 1e6, judged.end_us - 5_000)
-    told = found[0].row["recordings"][f"driving: {item.name}"]
+    told = found[0].row["recordings"][f"driving: {scenario.name}"]
     assert told["rmse_v_l_m_s"] == pytest.approx(summary([track])["rmse_v_l_m_s"])
 
 
-def test_a_finished_method_is_not_trained_again_and_what_is_simulated_stays(run):
-    folder, plan, found, told = run
+def test_a_finished_method_is_not_trained_again_and_what_is_simulated_stays(finished):
+    folder, experiment, found, told = finished
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
-    again = list(velocity.reproduce(plan, folder / "data", folder, quiet))
+    again = list(run.reproduce(experiment, folder / "data", folder, quiet))
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()} == before
     assert [one.row for one in again] == [one.row for one in found]
-    assert velocity.results(plan, folder / "data", again) == told
+    assert run.results(experiment, folder / "data", again) == told
 
 
-def test_a_folder_of_another_recipe_is_refused(run):
-    folder, plan, _, _ = run
-    other = plan._replace(config=velocity.base_config(None, 8, quick=True), methods=("ann",))
+def test_a_folder_of_another_recipe_is_refused(finished):
+    folder, experiment, _, _ = finished
+    other = experiment._replace(config=run.base_config(None, 8, quick=True), methods=("ann",))
     with pytest.raises(InvalidField, match="out='ann-0': it holds a run of another configuration"):
-        list(velocity.reproduce(other, folder / "data", folder, quiet))
+        list(run.reproduce(other, folder / "data", folder, quiet))
 
 
-def test_real_drives_are_learned_from_beside_the_sequences_in_a_folder_of_their_own(run, tmp_path):
-    folder, plan, _, _ = run
-    kept = Kept(folder / "data", plan.config.model)
-    more = [kept.path(item) for item in items(quick=True)[:2]]
-    config = velocity.config_of(velocity.base_config(None, 4, quick=True), "nve", 0)
-    made = velocity.trained(config, tmp_path, folder / "data", more, quiet)
+def test_real_drives_are_learned_from_beside_the_sequences_in_a_folder_of_their_own(finished, tmp_path):
+    folder, experiment, _, _ = finished
+    held_out = HeldOutCache(folder / "data", experiment.config.model)
+    more = [held_out.path(scenario) for scenario in held_out_scenarios(quick=True)[:2]]
+    config = run.method_config(run.base_config(None, 4, quick=True), "nve", 0)
+    made = run.ensure_trained(config, tmp_path, folder / "data", more, quiet)
     assert made.name == "nve-0-mvsec"
     assert (
         "4 simulated sequences of 0.8 s from seed 1000000 and 2 more"
@@ -138,7 +144,7 @@ def test_predictors_that_see_nothing_are_zero_and_the_best_constant():
     rng = np.random.default_rng(0)
     truth = rng.normal(1.0, 1.0, (200, 6))
     track = Track("driving", "one", np.arange(200) / 100, truth, truth, 5)
-    told = blind([track, track._replace(name="two", truth=truth + 1)])
+    told = blind_predictors([track, track._replace(name="two", truth=truth + 1)])
     assert told["zero"]["driving"]["re_v_l"] == pytest.approx(1)
     assert told["mean"]["driving"]["r2_v_l"] == pytest.approx(0, abs=1e-9)
     assert summary([track])["rmse_v_l_m_s"] == 0
@@ -147,16 +153,16 @@ def test_predictors_that_see_nothing_are_zero_and_the_best_constant():
 def test_the_figures_of_gehrig_2020_are_a_mean_length_and_a_median_ratio():
     truth = np.zeros((4, 6))
     truth[:, 5] = np.radians([0.5, 10, 20, 40])
-    said = truth.copy()
-    said[:, 3] = np.radians([5, 1, 4, 4])
-    told = summary([Track("driving", "one", np.zeros(4), truth, said, 1)])
+    estimate = truth.copy()
+    estimate[:, 3] = np.radians([5, 1, 4, 4])
+    told = summary([Track("driving", "one", np.zeros(4), truth, estimate, 1)])
     assert told["gehrig_mean_error_deg_s"] == pytest.approx(3.5)
     assert told["gehrig_median_re"] == pytest.approx(0.1)
 
 
-def test_contrast_maximisation_is_asked_where_it_makes_sense(run):
-    _, _, _, told = run
-    assert set(told["blind"]["contrast maximisation"]) == set(CM_GROUPS) - {"mvsec"}
+def test_contrast_maximisation_is_asked_where_it_makes_sense(finished):
+    _, _, _, told = finished
+    assert set(told["blind"]["contrast maximisation"]) == set(CONTRAST_GROUPS) - {"mvsec"}
     hand_held = told["blind"]["contrast maximisation"]["hand-held"]
     assert hand_held["re_v_l"] is None
     assert hand_held["rmse_v_a_deg_s"] > 0
@@ -164,22 +170,22 @@ def test_contrast_maximisation_is_asked_where_it_makes_sense(run):
 
 def test_wrong_wishes_are_refused():
     with pytest.raises(InvalidField, match="methods=.*known are nve, nve-wo, ann, snn-ang"):
-        velocity.config_of(QUICK, "gru", 0)
+        run.method_config(QUICK, "gru", 0)
     with pytest.raises(InvalidField, match="steps"):
-        velocity.base_config(None, 0)
-    plan = velocity.Plan(QUICK, ("nve",), range(0), None, quick=True)
+        run.base_config(None, 0)
+    experiment = run.Experiment(QUICK, ("nve",), range(0), None, quick=True)
     with pytest.raises(InvalidField, match="seeds=0"):
-        list(velocity.reproduce(plan, Path("nowhere"), Path("nowhere"), quiet))
+        list(run.reproduce(experiment, Path("nowhere"), Path("nowhere"), quiet))
 
 
-def test_the_quick_command_trains_all_methods_and_leaves_tables_and_pictures(run, tmp_path, capsys):
-    folder, *_ = run
+def test_the_quick_command_trains_all_methods_and_leaves_tables_and_pictures(finished, tmp_path, capsys):
+    folder, *_ = finished
     arguments = ["reproduce", "velocity", "--quick", "--data", str(folder / "data"), "--out", str(tmp_path)]
     assert main.main(arguments) == 0
     table = capsys.readouterr().out
     told = json.loads((tmp_path / "velocity-quick.json").read_text())
-    assert table == velocity_report.markdown(told) == (tmp_path / "velocity-quick.md").read_text()
-    assert [row["method"] for row in told["runs"]] == list(velocity.METHODS)
+    assert table == report.markdown(told) == (tmp_path / "velocity-quick.md").read_text()
+    assert [row["method"] for row in told["runs"]] == list(run.METHODS)
     for name in ("NeuroVE", "NeuroVE w/o", "equal-size ANN", "SNN-ANG", "the mean of this truth", "zero"):
         assert f"| {name} |" in table
     pictures = {path.name for path in tmp_path.glob("*.png")}
@@ -190,23 +196,23 @@ def test_the_quick_command_trains_all_methods_and_leaves_tables_and_pictures(run
     assert runs["nve"]["cost"] == 1.0
 
 
-def test_seeds_give_a_mean_and_a_spread(run):
-    *_, told = run
+def test_seeds_give_a_mean_and_a_spread(finished):
+    *_, told = finished
     other = json.loads(json.dumps(told))
     for row in other["runs"]:
         row["seed"] = 1
         row["groups"]["driving"]["re_v_l"] += 0.1
     both = told | {"runs": told["runs"] + other["runs"]}
-    text = velocity_report.markdown(both)
+    text = report.markdown(both)
     assert "2 seeds, mean ± spread between seeds" in text
     first = told["runs"][0]["groups"]["driving"]["re_v_l"]
     assert f"{first + 0.05:.2f} ± 0.07 /" in text
 
 
-def test_with_recordings_the_real_drives_and_the_real_events_are_there_too(run, tmp_path, capsys):
+def test_with_recordings_the_real_drives_and_the_real_events_are_there_too(finished, tmp_path, capsys):
     for check in real.CHECKS:
         shared(check.recording)
-    folder, *_ = run
+    folder, *_ = finished
     arguments = ["--quick", "--methods", "ann", "--data", str(folder / "data"), "--out", str(tmp_path), "--json"]
     assert main.main(["reproduce", "velocity", *arguments, "--recordings", str(SHARED)]) == 0
     told = json.loads(capsys.readouterr().out)
@@ -219,11 +225,11 @@ def test_with_recordings_the_real_drives_and_the_real_events_are_there_too(run, 
 @pytest.mark.parametrize("file", sorted(RESULTS.glob("velocity*.json")), ids=lambda file: file.name)
 def test_committed_tables_are_those_of_the_committed_figures(file):
     told = json.loads(file.read_text())
-    assert file.with_suffix(".md").read_text() == velocity_report.markdown(told)
+    assert file.with_suffix(".md").read_text() == report.markdown(told)
 
 
 def test_a_street_without_texture_shows_next_to_nothing_below():
-    made = {item.group: item.simulation for item in items(quick=True)}
+    made = {scenario.group: scenario.simulation for scenario in held_out_scenarios(quick=True)}
     lower = {}
     for scene in ("driving", "bare street"):
         events = [step.events for step in made[scene].steps()]

@@ -1,4 +1,4 @@
-"""Camera models: a ray has one cell in the canonical camera, whatever lens and sensor saw it."""
+"""Camera models: a ray falls in one cell of the canonical camera, independent of lens and sensor."""
 
 import math
 
@@ -48,7 +48,7 @@ def image_points(camera: CameraInfo) -> tuple[np.ndarray, np.ndarray]:
 
 
 def cell_of_ray(x: float, y: float, camera: CameraInfo) -> tuple[int, int] | None:
-    """Row and column that the camera's pixel nearest to a ray looks into."""
+    """Row and column of the cell for the camera pixel nearest to a ray."""
     xd, yd = distort(np.array([x]), np.array([y]), camera)
     u, v = round(float(xd[0]) * camera.fx + camera.cx), round(float(yd[0]) * camera.fy + camera.cy)
     if not (0 <= u < camera.width and 0 <= v < camera.height):
@@ -58,16 +58,16 @@ def cell_of_ray(x: float, y: float, camera: CameraInfo) -> tuple[int, int] | Non
 
 
 @each_camera
-def test_the_lens_puts_every_undistorted_ray_back_where_the_pixel_is(camera):
+def test_distorting_every_undistorted_ray_gives_its_pixel_again(camera):
     xd, yd = image_points(camera)
     x, y = undistort(xd, yd, camera)
     in_front = np.isfinite(x)
-    assert in_front.mean() > 0.5  # the fisheye sees behind itself in its corners
+    assert in_front.mean() > 0.5  # the corners of the fisheye see behind the camera
     back_x, back_y = distort(x[in_front], y[in_front], camera)
     assert np.hypot(back_x - xd[in_front], back_y - yd[in_front]).max() * camera.fx < 1e-4  # [px]
 
 
-def test_a_pinhole_lens_bends_a_ray_by_the_radial_tangential_formula_with_k3_last():
+def test_a_pinhole_lens_distorts_by_the_radial_tangential_formula_with_k3_last():
     k1, k2, p1, p2, k3 = distortion = (-0.3, 0.1, 0.02, -0.01, 0.05)
     x, y = 0.4, -0.3
     r2 = 0.16 + 0.09
@@ -77,7 +77,7 @@ def test_a_pinhole_lens_bends_a_ray_by_the_radial_tangential_formula_with_k3_las
     assert got[1][0] == pytest.approx(y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y)
 
 
-def test_an_equidistant_lens_puts_a_ray_at_the_polynomial_of_its_angle_from_the_axis():
+def test_an_equidistant_lens_maps_a_ray_to_the_polynomial_of_its_angle_from_the_axis():
     k1, k2, k3, k4 = MVSEC.distortion
     theta = math.radians(40)
     r = theta + k1 * theta**3 + k2 * theta**5 + k3 * theta**7 + k4 * theta**9
@@ -98,7 +98,7 @@ def test_every_pixel_of_a_usual_lens_has_a_ray(camera):
     angle=st.floats(0, 2 * math.pi),
     radius=st.floats(0, 2.5),
 )
-def test_a_ray_that_undistort_gives_explains_its_point_and_lies_on_the_points_side_of_the_axis(lens, k, angle, radius):
+def test_an_undistorted_ray_maps_back_to_its_point_and_lies_on_the_same_side_of_the_axis(lens, k, angle, radius):
     k = k if lens == "equidistant" else (k[0], k[1], 0.0, 0.0, k[2])
     camera = PERFECT.model_copy(update={"lens": lens, "distortion": k})
     xd, yd = np.array([radius * math.cos(angle)]), np.array([radius * math.sin(angle)])
@@ -111,13 +111,13 @@ def test_a_ray_that_undistort_gives_explains_its_point_and_lies_on_the_points_si
         assert y[0] * yd[0] >= 0
 
 
-def test_a_mirrored_solution_of_the_pinhole_polynomial_is_no_ray():
+def test_a_mirrored_solution_of_the_pinhole_polynomial_gives_no_ray():
     camera = PERFECT.model_copy(update={"distortion": (-0.5, 0.0, 0.0, 0.0)})
     x, _ = undistort(np.array([0.3, 2.0]), np.array([0.0, 0.0]), camera)  # x = -2 solves x (1 - x^2 / 2) = 2
     assert np.isfinite(x).tolist() == [True, False]
 
 
-def test_the_middle_of_the_image_is_undistorted_by_any_lens():
+def test_no_lens_distorts_the_centre_of_the_image():
     for camera in CAMERAS.values():
         x, y = undistort(np.zeros(1), np.zeros(1), camera)
         assert (float(x[0]), float(y[0])) == (0.0, 0.0)
@@ -125,11 +125,13 @@ def test_the_middle_of_the_image_is_undistorted_by_any_lens():
 
 @each_camera
 @pytest.mark.parametrize(("width", "height"), [(86, 65), (85, 64), (43, 33), (8, 8)])
-def test_the_pixel_at_the_optical_centre_looks_into_the_centre_cell(camera, width, height):
+def test_the_pixel_at_the_optical_centre_maps_to_the_centre_cell(camera, width, height):
     canonical = CanonicalConfig(width=width, height=height)
     cell = lookup_table(canonical, camera.sensor, camera)[round(camera.cy), round(camera.cx)]
     row, column = divmod(int(cell), width)
-    assert abs(column + 0.5 - width / 2) <= 1  # an even side has no centre cell: one of the two beside it
+    assert (
+        abs(column + 0.5 - width / 2) <= 1
+    )  # an even side has no centre cell, so either of its two neighbours is right
     assert abs(row + 0.5 - height / 2) <= 1
 
 
@@ -153,7 +155,7 @@ def test_a_perfect_pinhole_camera_equal_to_the_canonical_one_maps_each_pixel_to_
 
 
 @pytest.mark.parametrize("factor", [1, 2, 5])
-def test_without_a_camera_a_sensor_is_scaled_plainly_each_cell_gets_an_equal_block_of_pixels(factor):
+def test_without_a_camera_the_sensor_is_scaled_and_each_cell_gets_an_equal_block_of_pixels(factor):
     sensor = Sensor(factor * CANONICAL.width, factor * CANONICAL.height)
     table = lookup_table(CANONICAL, sensor, None)
     cells = np.arange(CANONICAL.width * CANONICAL.height, dtype=np.int32).reshape(CANONICAL.height, CANONICAL.width)
@@ -161,7 +163,7 @@ def test_without_a_camera_a_sensor_is_scaled_plainly_each_cell_gets_an_equal_blo
 
 
 @pytest.mark.parametrize("sensor", [Sensor(346, 260), Sensor(240, 180), Sensor(1280, 720), Sensor(3, 2)], ids=str)
-def test_plain_scaling_keeps_the_order_of_pixels_and_reaches_the_whole_grid_without_going_past_it(sensor):
+def test_scaling_keeps_the_order_of_pixels_and_covers_exactly_the_whole_grid(sensor):
     table = lookup_table(CANONICAL, sensor, None)
     rows, columns = np.divmod(table, CANONICAL.width)
     assert (rows == rows[:, :1]).all()
@@ -172,25 +174,25 @@ def test_plain_scaling_keeps_the_order_of_pixels_and_reaches_the_whole_grid_with
 
 
 @given(x=st.floats(-0.7, 0.7), y=st.floats(-0.5, 0.5))
-def test_the_same_ray_falls_in_the_same_or_a_neighbouring_cell_whatever_camera_sees_it(x, y):
+def test_all_cameras_map_the_same_ray_to_the_same_or_a_neighbouring_cell(x, y):
     cells = [cell for camera in CAMERAS.values() if (cell := cell_of_ray(x, y, camera)) is not None]
-    assert len(cells) >= 2  # PERFECT and FISHEYE see all of these
+    assert len(cells) >= 2  # PERFECT and FISHEYE see all of these rays
     rows, columns = zip(*cells, strict=True)
     assert max(rows) - min(rows) <= 1
     assert max(columns) - min(columns) <= 1
 
 
-def test_right_in_the_image_is_right_on_the_grid_and_down_is_down():
+def test_right_and_down_in_the_image_are_right_and_down_on_the_grid():
     row, column = cell_of_ray(0.3, 0.2, MVSEC) or (0, 0)
     assert column > CANONICAL.width // 2
     assert row > CANONICAL.height // 2
 
 
-def test_wide_pixels_of_a_fisheye_are_outside_and_the_field_of_view_is_the_canonical_one():
+def test_the_table_of_a_fisheye_covers_the_canonical_field_of_view_and_is_outside_beyond_it():
     table = lookup_table(CANONICAL, FISHEYE.sensor, FISHEYE)
     u, v = np.meshgrid(np.arange(400) - FISHEYE.cx, np.arange(400) - FISHEYE.cy)
     theta = np.hypot(u, v) / FISHEYE.fx
-    assert (theta.max(), theta[200, 399]) > (math.pi / 2, math.radians(90))  # it sees behind itself
+    assert (theta.max(), theta[200, 399]) > (math.pi / 2, math.radians(90))  # it sees behind the camera
     corner = math.hypot(CANONICAL.width, CANONICAL.height) / 2 / focal_px(CANONICAL)
     assert (table[theta > math.atan(corner)] == OUTSIDE).all()
     assert (table[theta < math.atan(CANONICAL.height / 2 / focal_px(CANONICAL)) - 0.01] != OUTSIDE).all()
@@ -202,7 +204,7 @@ def test_wide_pixels_of_a_fisheye_are_outside_and_the_field_of_view_is_the_canon
 
 @pytest.mark.parametrize("lens", ["pinhole", "equidistant"])
 @pytest.mark.parametrize("coefficient", [1e300, -1e300, 50.0, -50.0])
-def test_an_absurd_lens_gives_a_table_of_cells_and_outside_and_no_warning(lens, coefficient):
+def test_extreme_lens_coefficients_give_a_valid_table_and_no_warning(lens, coefficient):
     camera = PERFECT.model_copy(
         update={"width": 24, "height": 18, "fx": 1.0, "lens": lens, "distortion": (coefficient,) * 4}
     )
@@ -212,7 +214,7 @@ def test_an_absurd_lens_gives_a_table_of_cells_and_outside_and_no_warning(lens, 
 
 
 @pytest.mark.parametrize("sensor", [Sensor(240, 181), Sensor(241, 180), Sensor(180, 240)], ids=str)
-def test_camera_info_of_another_sensor_is_refused_and_both_are_named(sensor):
+def test_camera_info_of_another_sensor_is_refused_with_both_sizes(sensor):
     with pytest.raises(InvalidField) as refused:
         lookup_table(CANONICAL, sensor, ECD)
     assert "240x180" in refused.value.message

@@ -1,4 +1,4 @@
-"""Poses become twists: exact where it can be, the same in any world, and what real odometry says."""
+"""From poses to twists: exact for constant twists, independent of the world frame, checked on real odometry."""
 
 import numpy as np
 import pytest
@@ -17,7 +17,7 @@ def unit(rng: np.random.Generator, *shape: int) -> np.ndarray:
 
 
 def screw_motion(twist: np.ndarray, t_us: np.ndarray, seed: int = 0) -> Poses:
-    """Where a camera of constant twist is at these times, from some place in some world on."""
+    """Poses of a camera with a constant twist at these times, from a random start pose."""
     rng = np.random.default_rng(seed)
     q0, p0 = unit(rng), rng.normal(size=3)
     q, p = rotations.pose_of(np.asarray(twist) * (t_us / 1e6)[:, None])
@@ -25,14 +25,14 @@ def screw_motion(twist: np.ndarray, t_us: np.ndarray, seed: int = 0) -> Poses:
 
 
 def wobble(t_us: np.ndarray) -> Poses:
-    """A smooth motion that is no screw."""
+    """A smooth motion whose twist is not constant."""
     t = t_us[:, None] / 1e6
     position = np.sin(t * [1.0, 1.7, 2.3] + [0.0, 1.0, 2.0])
     return Poses(t_us, position, rotations.exp(0.8 * np.sin(t * [2.1, 0.9, 1.3])))
 
 
 def mvsec(day: int) -> tuple[Poses, np.ndarray, np.ndarray]:
-    """Odometry of outdoor_day, the velocity stored beside it (N, 3) [m/s], and unrounded times (N,) [s]."""
+    """Odometry of outdoor_day, the velocity stored with it (N, 3) [m/s], and unrounded times (N,) [s]."""
     with h5py.File(shared(f"mvsec/outdoor_day{day}_odom.h5")) as file:
         t_s = file["ts"][:]
         return Poses(np.rint(t_s * 1e6).astype(np.int64), file["poss"][:], file["rots"][:]), file["vs"][:], t_s
@@ -46,13 +46,13 @@ def rms(difference: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 0.5, 3.0, np.pi - 1e-6])
-def test_log_undoes_exp_at_any_angle_below_a_half_turn(angle):
+def test_log_is_the_inverse_of_exp_below_180_degrees(angle):
     axes = np.random.default_rng(1).normal(size=(50, 3))
     screw = np.concatenate([axes[::-1], axes / np.linalg.norm(axes, axis=1, keepdims=True) * angle], axis=1)
     np.testing.assert_allclose(rotations.screw_of(*rotations.pose_of(screw)), screw, atol=1e-8)
 
 
-def test_matrices_and_quaternions_are_the_same_rotations_half_turns_too():
+def test_matrices_and_quaternions_describe_the_same_rotations_at_180_degrees_too():
     q = np.concatenate([unit(np.random.default_rng(2), 200), np.eye(4)])
     m = rotations.matrix_of(q)
     back = rotations.quaternion_of(m)
@@ -69,7 +69,7 @@ def test_matrices_and_quaternions_are_the_same_rotations_half_turns_too():
 
 @pytest.mark.parametrize("sampling", ["even", "uneven"])
 @pytest.mark.parametrize("twist", [(0, 0, 0, 0, 0, 0), (1.5, -0.2, 8, 0, 0, 0), (0.3, 0.1, -2, 1.5, -3, 2)], ids=str)
-def test_a_motion_of_constant_twist_is_found_exactly_at_the_ends_too(twist, sampling):
+def test_a_constant_twist_is_recovered_exactly_and_at_the_ends_too(twist, sampling):
     t_us = np.arange(0, 2_000_000, 10_000)
     if sampling == "uneven":
         t_us = t_us + np.random.default_rng(3).integers(0, 9_999, t_us.size)
@@ -78,7 +78,7 @@ def test_a_motion_of_constant_twist_is_found_exactly_at_the_ends_too(twist, samp
     np.testing.assert_allclose(got.twist, np.broadcast_to(twist, (t_us.size, 6)), atol=2e-5)
 
 
-def test_a_smooth_motion_is_found_to_the_error_that_the_filter_is_said_to_have():
+def test_the_filter_has_the_documented_gain():
     t_us = np.arange(0, 1_500_000, 1_000)
     position = np.zeros((t_us.size, 3))
     for frequency_hz, response in ((3.0, 0.91), (8.0, 0.49)):
@@ -89,7 +89,7 @@ def test_a_smooth_motion_is_found_to_the_error_that_the_filter_is_said_to_have()
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_twist_does_not_depend_on_the_worlds_frame(seed):
+def test_the_twist_does_not_depend_on_the_world_frame(seed):
     rng = np.random.default_rng(seed)
     poses = wobble(np.arange(0, 1_000_000, 5_000))
     q, p = unit(rng), rng.normal(size=3) * 100
@@ -99,7 +99,7 @@ def test_the_twist_does_not_depend_on_the_worlds_frame(seed):
     np.testing.assert_allclose(twists(moved).twist, twists(poses).twist, atol=1e-9)
 
 
-def test_a_camera_mounted_elsewhere_on_the_body_has_the_bodys_twist_as_seen_from_there():
+def test_a_camera_mounted_elsewhere_on_the_body_has_the_twist_of_the_body_at_that_place():
     rng = np.random.default_rng(5)
     poses = wobble(np.arange(0, 1_000_000, 5_000))
     q, p = unit(rng), rng.normal(size=3)
@@ -114,7 +114,7 @@ def test_a_camera_mounted_elsewhere_on_the_body_has_the_bodys_twist_as_seen_from
     np.testing.assert_allclose(twists(mounted).twist, want, atol=2e-3)
 
 
-def test_noise_of_poses_is_filtered_and_smoothed_poses_lie_closer_to_the_path():
+def test_pose_noise_is_filtered_and_smoothed_poses_are_closer_to_the_trajectory():
     rng = np.random.default_rng(6)
     clean = wobble(np.arange(0, 5_000_000, 5_000))
     noisy = Poses(
@@ -123,21 +123,21 @@ def test_noise_of_poses_is_filtered_and_smoothed_poses_lie_closer_to_the_path():
         rotations.product(clean.orientation, rotations.exp(rng.normal(0, 1e-3, (clean.t.size, 3)))),
     )
     difference = twists(noisy).twist - twists(clean).twist
-    assert rms(difference[10:-10]).max() < 0.01  # differences of neighbours would have 0.28
+    assert rms(difference[10:-10]).max() < 0.01  # differences of neighbouring poses would have 0.28
     got = smoothed(noisy)
     assert rms(got.position_m - clean.position_m).max() < 0.5e-3
     turned = rotations.log(rotations.product(rotations.inverse(clean.orientation), got.orientation))
     assert rms(turned).max() < 0.5e-3
 
 
-def test_a_long_path_is_fitted_in_parts_without_a_seam():
+def test_a_long_trajectory_fitted_in_blocks_has_no_error_between_them():
     t_us = np.arange(36_000) * 10_000
     t_us[20_000:] += 20_000_000
     twist = np.array([1.0, 0, 5, 0, 0.3, 0])
     np.testing.assert_allclose(twists(screw_motion(twist, t_us)).twist, np.broadcast_to(twist, (36_000, 6)), atol=1e-3)
 
 
-def test_where_there_is_too_little_to_fit_the_twist_is_nan_and_beside_a_gap_it_is_not():
+def test_the_twist_is_nan_where_there_are_too_few_poses_but_not_next_to_a_gap():
     twist = np.array([0.0, 0, 2, 0, 0.5, 0])
     t_us = np.concatenate([np.arange(0, 500_000, 10_000), [1_000_000], np.arange(1_500_000, 2_000_000, 10_000)])
     got = twists(screw_motion(twist, t_us))
@@ -148,7 +148,7 @@ def test_where_there_is_too_little_to_fit_the_twist_is_nan_and_beside_a_gap_it_i
         assert np.isnan(twists(screw_motion(twist, np.arange(n) * 10_000)).twist).all()
 
 
-def test_the_filter_is_ten_samples_but_not_below_a_tenth_of_a_second():
+def test_the_filter_spans_ten_samples_but_at_least_a_tenth_of_a_second():
     for step_us, want_s in ((50_000, 0.5), (10_000, 0.1), (5_000, 0.1), (200_000, 2.0)):
         assert filter_for(wobble(np.arange(0, 3_000_000, step_us))) == pytest.approx(want_s)
 
@@ -164,7 +164,7 @@ def test_the_filter_is_ten_samples_but_not_below_a_tenth_of_a_second():
         ("position_m", lambda p: p._replace(position_m=p.position_m * np.inf)),
     ],
 )
-def test_what_is_no_path_is_refused_and_the_pose_named(field, change):
+def test_an_invalid_trajectory_is_refused_and_the_wrong_pose_is_named(field, change):
     with pytest.raises(InvalidField) as refused:
         twists(change(wobble(np.arange(0, 1_000_000, 10_000) + 10_000)))
     assert refused.value.details["field"] == field
@@ -172,7 +172,7 @@ def test_what_is_no_path_is_refused_and_the_pose_named(field, change):
 
 
 @pytest.mark.parametrize("filter_s", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_filter_without_length_is_refused(filter_s):
+def test_a_filter_length_that_is_not_positive_and_finite_is_refused(filter_s):
     with pytest.raises(InvalidField, match="filter_s"):
         twists(wobble(np.arange(0, 100_000, 10_000)), filter_s=filter_s)
 
@@ -180,14 +180,14 @@ def test_a_filter_without_length_is_refused(filter_s):
 # --- interpolation --------------------------------------------------------------------------------------------------
 
 
-def test_a_twist_between_two_samples_is_on_the_line_between_them_and_outside_nothing_is_known():
+def test_twists_are_interpolated_linearly_and_unknown_outside_the_samples():
     rows = np.arange(12.0).reshape(2, 6)
     got = Twists(np.array([100, 200]), rows).at(np.array([99, 100, 125, 200, 201]))
     assert np.isnan(got[[0, 4]]).all()
     np.testing.assert_allclose(got[1:4], [rows[0], 0.75 * rows[0] + 0.25 * rows[1], rows[1]])
 
 
-def test_an_unknown_sample_makes_its_neighbourhood_unknown_and_no_more():
+def test_an_unknown_sample_makes_only_the_times_next_to_it_unknown():
     rows = np.ones((4, 6))
     rows[1] = np.nan
     got = Twists(np.array([0, 10, 20, 30]), rows).at(np.array([0, 5, 10, 15, 20, 25, 30]))
@@ -206,7 +206,7 @@ def test_nothing_is_interpolated_over_a_gap():
     assert np.isfinite(twist.at(at, max_gap_us=10 * MAX_GAP_US)).all()
 
 
-def test_of_no_samples_nothing_is_known_and_of_one_only_its_own_time():
+def test_one_sample_is_known_only_at_its_own_time_and_no_samples_at_none():
     for n, known in ((0, 0), (1, 1)):
         twist = Twists(np.arange(n), np.ones((n, 6)))
         poses = screw_motion(np.ones(6), np.arange(n))
@@ -216,7 +216,7 @@ def test_of_no_samples_nothing_is_known_and_of_one_only_its_own_time():
         assert np.isfinite(interpolate_poses(poses, at).orientation[:, 0]).sum() == known
 
 
-def test_between_two_poses_the_camera_turns_at_a_constant_rate_the_short_way_round():
+def test_between_two_poses_the_camera_rotates_at_a_constant_rate_along_the_shorter_arc():
     twist = np.array([0.0, 0, 0, 1.0, 2.0, -2.0])
     poses = screw_motion(twist, np.array([0, 400_000]))
     poses = poses._replace(orientation=poses.orientation * [[1], [-1]])  # the same rotation
@@ -242,14 +242,14 @@ def euler_zyx(q: np.ndarray) -> np.ndarray:
 
 
 def steps(poses: Poses) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """From each pose to the next: relative rotation, relative position in the first's frame, dt [s]."""
+    """From each pose to the next: relative rotation, relative position in the frame of the first, dt [s]."""
     back = rotations.inverse(poses.orientation[:-1])
     q = rotations.product(back, poses.orientation[1:])
     return q, rotations.turn(back, np.diff(poses.position_m, axis=0)), np.diff(poses.t)[:, None] / 1e6
 
 
 @pytest.mark.parametrize("day", [1, 2])
-def test_angular_velocity_as_euler_angles_is_the_relative_rotation_over_dt_and_not_the_slope_of_absolute_angles(day):
+def test_angular_velocity_is_the_relative_rotation_over_dt_and_not_the_slope_of_euler_angles(day):
     poses, _, _ = mvsec(day)
     q, _, dt = steps(poses)
     body = rotations.log(q) / dt
@@ -259,7 +259,7 @@ def test_angular_velocity_as_euler_angles_is_the_relative_rotation_over_dt_and_n
 
 
 def running_mean(values: np.ndarray, half: int, *, in_place: bool) -> np.ndarray:
-    """Each row's mean with its neighbours; in place, means already taken enter the later ones."""
+    """The mean of each row and its neighbours; in place, the means of earlier rows enter the later ones."""
     out = values.copy()
     source = out if in_place else values
     for i in range(len(out)):
@@ -268,11 +268,11 @@ def running_mean(values: np.ndarray, half: int, *, in_place: bool) -> np.ndarray
 
 
 @pytest.mark.parametrize(("day", "apart_m_s"), [(1, (0.029, 0.025, 0.082)), (2, (0.014, 0.018, 0.039))])
-def test_mvsecs_stored_velocities_are_smoothed_in_place_and_so_differ_from_the_poses(day, apart_m_s):
+def test_mvsecs_stored_velocities_are_smoothed_in_place_and_therefore_differ_from_the_poses(day, apart_m_s):
     poses, stored, t_s = mvsec(day)
     _, moved, _ = steps(poses)
     raw = np.concatenate([np.zeros((1, 3)), moved / np.diff(t_s)[:, None]])
-    inner = slice(12, -12)  # whatever is done at the ends
+    inner = slice(12, -12)  # how the data set treats the ends is unknown
     assert np.abs(running_mean(raw, 10, in_place=True) - stored)[inner].max() < 1e-8  # the quaternions are rounded
     clean = running_mean(raw, 10, in_place=False)
     np.testing.assert_allclose(rms((clean - stored)[inner]), apart_m_s, atol=5e-4)
@@ -280,7 +280,7 @@ def test_mvsecs_stored_velocities_are_smoothed_in_place_and_so_differ_from_the_p
     assert (rms((ours - stored)[inner]) > 0.9 * np.array(apart_m_s)).all()
 
 
-def test_the_slider_moves_right_and_nothing_else():
+def test_the_slider_moves_only_to_the_right():
     rows = np.loadtxt(shared("slider_depth/groundtruth.txt"))
     got = twists(Poses(np.rint(rows[:, 0] * 1e6).astype(np.int64), rows[:, 1:4], rows[:, 4:])).twist
     assert (0.20 < got[0, 0] < 0.24, 0.30 < np.median(got[:, 0]) < 0.34) == (True, True)

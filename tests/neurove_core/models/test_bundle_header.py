@@ -10,12 +10,12 @@ from hypothesis import strategies as st
 
 import neurove_core
 from neurove_core.models import bundle, golden, manifest
-from neurove_core.models.about import About, BundleLimits, MadeBy
 from neurove_core.models.bundle import Header
+from neurove_core.models.metadata import BundleLimits, MadeBy, Metadata
 from neurove_protocol.errors import BadModel
 from tests.bundles import CONFIG, DATA, ORIGINAL, packed, refusal, unpacked, with_entries, with_fields
 
-TOLD = About(
+TOLD = Metadata(
     release=7,
     figures={"heldout_re_v_l": 0.19, "heldout_rmse_v_l_m_s": 1.49},
     made_by=MadeBy(
@@ -64,7 +64,7 @@ VALUES = st.recursive(
 
 
 def told_bytes() -> bytes:
-    return replace(ORIGINAL, about=TOLD).to_bytes()
+    return replace(ORIGINAL, metadata=TOLD).to_bytes()
 
 
 def edited(path, value):
@@ -80,7 +80,7 @@ def edited(path, value):
 
 def test_what_the_maker_tells_travels_with_the_model():
     loaded = bundle.from_bytes(told_bytes(), "x")
-    assert loaded.about == TOLD
+    assert loaded.metadata == TOLD
     assert (loaded.release, loaded.prime_windows, loaded.limits.mean_dv_m_s) == (7, 40, 1.5)
     assert loaded.to_bytes() == told_bytes()
 
@@ -96,7 +96,7 @@ def test_a_bundle_that_tells_nothing_is_the_file_that_it_always_was():
         "linear_unit",
     ]
     loaded = bundle.from_bytes(DATA, "x")
-    assert (loaded.release, loaded.limits, loaded.about.made_by) == (0, BundleLimits(), None)
+    assert (loaded.release, loaded.limits, loaded.metadata.made_by) == (0, BundleLimits(), None)
     assert loaded.prime_windows == CONFIG.settle_windows
 
 
@@ -137,7 +137,7 @@ def test_a_recipe_nested_deep_is_taken_or_refused_in_a_short_sentence(depth):
     entries["__metadata__"]["neurove"] = text
     data = packed(json.dumps(entries).encode(), tensors)
     if depth < 250:
-        assert bundle.from_bytes(data, "x").about.made_by is not None
+        assert bundle.from_bytes(data, "x").metadata.made_by is not None
     else:
         assert len(refusal(data)) < 500
 
@@ -150,7 +150,7 @@ def test_any_value_in_any_field_is_taken_or_refused_in_a_short_sentence(path, va
     except BadModel:
         assert len(refusal(data)) < 500
     else:
-        assert bundle.from_bytes(loaded.to_bytes(), "x").about == loaded.about
+        assert bundle.from_bytes(loaded.to_bytes(), "x").metadata == loaded.metadata
 
 
 @given(st.dictionaries(st.text(max_size=12), VALUES, max_size=6))

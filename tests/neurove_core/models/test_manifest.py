@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neurove_core.models import bundle, manifest, signing_keys
-from neurove_core.models.about import About
+from neurove_core.models.metadata import Metadata
 from neurove_protocol.errors import BadModel, Downgrade, InvalidField, Untrusted
 from tests.bundles import CONFIG, DATA, ORIGINAL, make_bundle
 
@@ -63,7 +63,7 @@ def test_what_a_trusted_key_signed_is_told_with_its_release():
 
 
 def test_the_release_is_the_bundles_own_where_none_is_given():
-    data = replace(ORIGINAL, about=About(release=9)).to_bytes()
+    data = replace(ORIGINAL, metadata=Metadata(release=9)).to_bytes()
     for given_release, want in ((None, 9), (0, 0), (12, 12)):
         signature = manifest.sign(data, KEY, release=given_release, allow_downgrade=True)
         signed = manifest.verify(data, signature, [PUBLIC])

@@ -299,7 +299,7 @@ def test_a_finished_run_goes_on_for_another_cycle_as_if_it_had_been_planned(fold
     at_once = bundle.load(train(planned, tmp_path / "planned", folder))
     train(TINY, tmp_path / "longer", folder)
     longer_run = bundle.load(train(planned, tmp_path / "longer", folder, resume=True))
-    assert longer_run.about.made_by.updates == 2 * TINY.recipe.steps
+    assert longer_run.metadata.made_by.updates == 2 * TINY.recipe.steps
     weights = longer_run.network.state_dict()
     assert all(torch.equal(tensor, weights[name]) for name, tensor in at_once.network.state_dict().items())
     with pytest.raises(BadModel, match="recipe.cycles=2, the configuration says 1"):
@@ -317,7 +317,7 @@ def test_a_run_begins_from_a_model_where_one_is_given(folder, sequences, tmp_pat
     assert torch.equal(run.offset, first.offset)
     made = bundle.load(train(config, tmp_path / "second", folder, start=first))
     assert f"begun from {first.digest[:12]}" in made.provenance
-    assert made.about.made_by.program == f"neurove train tiny, begun from {first.digest[:12]}"
+    assert made.metadata.made_by.program == f"neurove train tiny, begun from {first.digest[:12]}"
     assert json.loads((tmp_path / "second" / RUN_JSON).read_text())["start"] == first.digest
     resumed = bundle.load(train(config, tmp_path / "second", folder, resume=True))
     assert resumed.digest == made.digest
@@ -375,11 +375,11 @@ def test_the_trained_bundle_says_what_it_is(folder, tmp_path):
 
 def test_the_trained_bundle_tells_how_it_was_made_and_brings_windows_it_was_trained_on(folder, sequences, tmp_path):
     made = bundle.load(train(TINY, tmp_path, folder))
-    told = made.about.made_by
+    told = made.metadata.made_by
     assert (told.program, told.seed, told.updates) == ("neurove train tiny", 0, 12)
     assert TrainingConfig(name="tiny", model=made.config, data=told.data, recipe=told.recipe) == TINY
     curve = json.loads((tmp_path / RUN_JSON).read_text())["curve"]
-    assert made.about.figures == {
+    assert made.metadata.figures == {
         f"training_{name}": curve[-1][name] for name in ("linear_error_m_s", "angular_error_rad_s")
     }
     seen = [sequences.counts(index, 0, 10) for index in range(3)]

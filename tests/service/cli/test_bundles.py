@@ -12,11 +12,11 @@ import torch
 from neurove_core import self_test
 from neurove_core.estimator import Estimator
 from neurove_core.models import bundle, golden
-from neurove_core.models.about import About, BundleLimits, MadeBy
+from neurove_core.models.metadata import BundleLimits, MadeBy, Metadata
 from neurove_service.cli import main
 from tests.bundles import CONFIG, DATA, ORIGINAL, with_fields, with_tensors
 
-ABOUT = About(
+METADATA = Metadata(
     release=3,
     figures={"heldout_re_v_l": 0.188123456},
     made_by=MadeBy(program="neurove train night", seed=5, commit="93cc177", recipe={"steps": 4400}),
@@ -34,7 +34,7 @@ def run(run, tmp_path, monkeypatch):
 def bundle_bytes():
     counts = np.random.default_rng(0).poisson(0.3, (4, 4, 8, 10)).astype(np.uint8)
     test = self_test.record(Estimator(ORIGINAL), counts)
-    return replace(ORIGINAL, name="night", about=ABOUT, golden=test).to_bytes()
+    return replace(ORIGINAL, name="night", metadata=METADATA, golden=test).to_bytes()
 
 
 @pytest.fixture

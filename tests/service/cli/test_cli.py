@@ -93,7 +93,7 @@ def test_reproduce_firing_prints_its_table_and_writes_table_and_figure(run, tmp_
 
 
 def test_reproduce_firing_prints_json(run, monkeypatch):
-    measured = firing.Report(4, {"LIF": {"ou": firing.Rate(0.1, 0.01)}})
+    measured = firing.Results(4, {"LIF": {"ou": firing.Rate(0.1, 0.01)}})
     monkeypatch.setattr(firing, "run", lambda seed: measured._replace(seed=seed))
     code, out, err = run("reproduce", "firing", "--json", "--seed", "4")
     assert (code, out, err) == (0, firing.to_json(measured), "")

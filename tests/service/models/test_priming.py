@@ -9,7 +9,7 @@ import torch
 
 from neurove_core.config import ModelConfig
 from neurove_core.models import bundle
-from neurove_core.models.about import About
+from neurove_core.models.metadata import Metadata
 from neurove_protocol.errors import Diverged
 from neurove_service.models.change import Rules
 from neurove_service.models.slot import ModelSlot
@@ -31,8 +31,8 @@ def folder(tmp_path_factory):
     for model in (
         one,
         two,
-        replace(two, name="patient", about=About(prime_windows=40)),
-        replace(two, name="hasty", about=About(prime_windows=2)),
+        replace(two, name="patient", metadata=Metadata(prime_windows=40)),
+        replace(two, name="hasty", metadata=Metadata(prime_windows=2)),
         bundle.untrained(5, ModelConfig(**{**SMALL.model_dump(), "kind": "ann"}), "ann"),
     ):
         bundle.save(model, folder / f"{model.name}.safetensors")

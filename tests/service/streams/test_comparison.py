@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from neurove_core.models import about
+from neurove_core.models import metadata
 from neurove_service.streams.comparison import Comparison, TrialLimits, WindowResult, violation
 from tests.bundles import make_bundle
 
@@ -61,18 +61,18 @@ def test_a_slow_model_is_found_with_its_figure_and_bound():
 @pytest.mark.parametrize(
     ("own", "words"),
     [
-        (about.BundleLimits(mean_dv_m_s=0.4), "mean_dv_m_s 0.5, the bound is 0.4"),
-        (about.BundleLimits(mean_dw_rad_s=0.1), "mean_dw_rad_s 0.2, the bound is 0.1"),
-        (about.BundleLimits(latency_ratio=0.9), "latency_ratio 1, the bound is 0.9"),
+        (metadata.BundleLimits(mean_dv_m_s=0.4), "mean_dv_m_s 0.5, the bound is 0.4"),
+        (metadata.BundleLimits(mean_dw_rad_s=0.1), "mean_dw_rad_s 0.2, the bound is 0.1"),
+        (metadata.BundleLimits(latency_ratio=0.9), "latency_ratio 1, the bound is 0.9"),
     ],
 )
 def test_a_bundle_may_be_stricter_about_itself_than_the_node(own, words, serving_is_tried):
     figures = trial(DRIVING, (0.3, 0.4, 2, 0, 0.5, 0.2), serving_is_tried=serving_is_tried).figures()
     assert violation(figures, TrialLimits()) is None
-    strict = TrialLimits().and_of(replace(make_bundle(), about=about.About(limits=own)))
+    strict = TrialLimits().and_of(replace(make_bundle(), metadata=metadata.Metadata(limits=own)))
     assert str(violation(figures, strict)) == words
-    lax = about.BundleLimits(mean_dv_m_s=0.6, mean_dw_rad_s=0.3, latency_ratio=1.1)
-    lax_too = TrialLimits(divergence=0.1).and_of(replace(make_bundle(), about=about.About(limits=lax)))
+    lax = metadata.BundleLimits(mean_dv_m_s=0.6, mean_dw_rad_s=0.3, latency_ratio=1.1)
+    lax_too = TrialLimits(divergence=0.1).and_of(replace(make_bundle(), metadata=metadata.Metadata(limits=lax)))
     assert violation(figures, lax_too).field == "divergence"  # what the node says holds all the same
 
 

@@ -39,7 +39,7 @@ class BundleLimits(Config):
     latency_ratio: float | None = Field(None, gt=0, description="Time of a window, as a multiple of the other's.")
 
 
-class About(Config):
+class Metadata(Config):
     """The optional fields of a bundle's header."""
 
     release: int = Field(0, ge=0, le=MAX_RELEASE, description="Counter: a node does not go back to a lower one.")
@@ -50,7 +50,7 @@ class About(Config):
     )
     limits: BundleLimits | None = None
 
-    def told(self) -> set[str]:
+    def non_default_fields(self) -> set[str]:
         """The fields that say something: those that are not at their defaults."""
-        fields = About.model_fields
+        fields = Metadata.model_fields
         return {name for name in fields if getattr(self, name) != fields[name].default}
