@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from neurove_core.evaluation.judge import Judged
+from neurove_core.evaluation.evaluate import Judged
 from neurove_core.figures import blank_figure, save_figure
 from neurove_core.models.uncertainty import LEVEL, half_width
 from neurove_protocol.velocity import AXES

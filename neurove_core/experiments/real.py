@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from neurove_core.estimator import Estimator
 from neurove_core.evaluation.contrast import angular
-from neurove_core.evaluation.judge import NoTruth, answer
+from neurove_core.evaluation.evaluate import NoTruth, answer
 from neurove_core.evaluation.metrics import SKIP_S
 from neurove_core.experiments import save_text
 from neurove_core.io import open_source

@@ -101,7 +101,7 @@ def evaluate(args: argparse.Namespace) -> int:
 
     from neurove_core import models
     from neurove_core.estimator import Estimator
-    from neurove_core.evaluation import judge
+    from neurove_core.evaluation import evaluate as judge
     from neurove_core.io import open_source, read_poses
 
     torch.set_num_threads(1)

@@ -7,7 +7,7 @@ import pytest
 
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.estimator import Estimator
-from neurove_core.evaluation.judge import NoTruth, answer, judge, report
+from neurove_core.evaluation.evaluate import NoTruth, answer, judge, report
 from neurove_core.geometry.motion import Twists
 from neurove_core.io import open_source
 from neurove_core.io.packets import slices

@@ -10,7 +10,7 @@ from neurove_core import models
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.estimator import Estimator
 from neurove_core.evaluation.contrast import angular
-from neurove_core.evaluation.judge import answer
+from neurove_core.evaluation.evaluate import answer
 from neurove_core.experiments import real
 from neurove_core.io import open_source
 from neurove_core.models import bundle

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from neurove_core.estimator import Estimator
-from neurove_core.evaluation.judge import answer, judge
+from neurove_core.evaluation.evaluate import answer, judge
 from neurove_core.experiments import real
 from neurove_core.experiments.velocity import report as velocity_report
 from neurove_core.experiments.velocity import run as velocity

@@ -9,7 +9,7 @@ import torch
 from neurove_core import models
 from neurove_core.engine.engine import Engine
 from neurove_core.estimator import Estimator
-from neurove_core.evaluation.judge import answer, judge, report
+from neurove_core.evaluation.evaluate import answer, judge, report
 from neurove_core.io import open_source
 from neurove_core.models import bundle
 from neurove_core.networks.encoding import to_spikes

@@ -11,7 +11,7 @@ from torch import nn
 from neurove_core import self_test
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.estimator import Estimator, Push
-from neurove_core.evaluation.judge import answer, judge, report
+from neurove_core.evaluation.evaluate import answer, judge, report
 from neurove_core.io import open_source
 from neurove_core.models import bundle
 from neurove_core.models.bundle import PER_HEIGHT
