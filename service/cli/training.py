@@ -101,7 +101,7 @@ def evaluate(args: argparse.Namespace) -> int:
 
     from neurove_core import models
     from neurove_core.estimator import Estimator
-    from neurove_core.evaluation import evaluate as judge
+    from neurove_core.evaluation import evaluate as evaluation
     from neurove_core.io import open_source, read_poses
 
     torch.set_num_threads(1)
@@ -114,9 +114,9 @@ def evaluate(args: argparse.Namespace) -> int:
         truth = given or (None if recording.endless else recording.twists())
         if truth is None:
             why = "it never ends: say how many seconds" if recording.endless else "it holds no truth: give --truth FILE"
-            raise judge.NoTruth(f"{source}: {why}", source=source)
-        judged.append(judge.judge(judge.answer(estimator, recording), truth))
-    told = {"model": estimator.bundle.info.model_dump(), **judge.report(judged)}
+            raise evaluation.NoTruth(f"{source}: {why}", source=source)
+        judged.append(evaluation.evaluate(evaluation.estimate_recording(estimator, recording), truth))
+    told = {"model": estimator.bundle.info.model_dump(), **evaluation.report(judged)}
     print(json.dumps(told) if args.json else "\n".join(_table(told)))
     if args.plot:
         from neurove_core.evaluation.plots import plot, plot_reliability

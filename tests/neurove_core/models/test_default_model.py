@@ -9,7 +9,7 @@ import torch
 from neurove_core import models
 from neurove_core.engine.engine import Engine
 from neurove_core.estimator import Estimator
-from neurove_core.evaluation.evaluate import answer, judge, report
+from neurove_core.evaluation.evaluate import estimate_recording, evaluate, report
 from neurove_core.io import open_source
 from neurove_core.models import bundle
 from neurove_core.networks.encoding import to_spikes
@@ -31,7 +31,7 @@ def test_it_is_trained_small_and_says_how_it_was_made():
 def test_it_sees_how_fast_it_drives_from_any_height(height_m):
     source = f"sim://street?seed=7001&seconds=2.5&camera=pinhole:86x65:75&height={height_m}"
     recording = open_source(source)
-    told = report([judge(answer(Estimator(models.find("default")), recording), recording.twists())])
+    told = report([evaluate(estimate_recording(Estimator(models.find("default")), recording), recording.twists())])
     assert told["re_v_l"] < 0.4 < told["zero"]["re_v_l"]
     assert told["rmse_v_a_deg_s"] < 6
     assert told["scaled"]
