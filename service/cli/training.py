@@ -5,14 +5,11 @@ import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from neurove_core.geometry import motion
 from neurove_service.cli.arguments import command, sensor_size
 from neurove_service.cli.bars import progress
-
-if TYPE_CHECKING:
-    from neurove_core.models.bundle import Bundle
 
 _CALIBRATION_SEQUENCES = 96
 
@@ -22,37 +19,25 @@ def train(args: argparse.Namespace) -> int:
     import torch
 
     from neurove_core import models
-    from neurove_core.models import bundle
     from neurove_core.training import config as configs
-    from neurove_core.training import data, loop, ranks, recorded
-    from neurove_core.training import run as runs
+    from neurove_core.training import loop, pipeline
 
     torch.set_num_threads(args.threads)
     config = configs.load(args.config)
-    start = models.find(args.start) if args.start else None
-    if start is not None:
-        runs.check_start(start, config)
-    ranks.device_of(args.device, devices=args.devices)  # told before anything is simulated
     out: Path = args.out or Path("runs") / config.name
-    folder: Path = args.data or out / "data"
     with progress() as show:
-        cache = data.Cache(folder, config)
-        wanted = config.data.sequences
-        for done, name in enumerate(cache.fill(args.workers), wanted - len(cache.missing()) + 1):
-            show("simulated", done, wanted, name)
-        recordings = recorded.Recorded(folder, config)
-        missing = recordings.missing()
-        for done, name in enumerate(recordings.fill(), 1):
-            show("cut", done, missing, name)
-
-        def learned(at: loop.Progress) -> None:
-            errors = f"{at.linear_m_s:.3f} m/s {at.angular_rad_s:.4f} rad/s"
-            show("learned", at.step, at.steps, errors)
-
-        how: dict[str, Any] = {"resume": args.resume, "devices": args.devices, "device": args.device, "start": start}
-        path = loop.train(config, out, folder, **how, on_progress=learned)
-    if args.calibration and config.model.kind == "neurove":  # a baseline has no spread to fit
-        _calibrate(bundle.load(path), config, folder, args.calibration, args.workers, path)
+        path = pipeline.train(
+            config,
+            out,
+            data=args.data,
+            start=models.find(args.start) if args.start else None,
+            resume=args.resume,
+            devices=args.devices,
+            device=args.device,
+            workers=args.workers,
+            calibration_sequences=args.calibration,
+            on_progress=show,
+        )
     told = {"bundle": str(path), "bytes": path.stat().st_size, "run": str(out / loop.RUN_JSON)}
     print(json.dumps(told) if args.json else f"wrote {path}, {told['bytes']:,} bytes")
     return 0
@@ -65,13 +50,14 @@ def calibrate(args: argparse.Namespace) -> int:
     from neurove_core import models
     from neurove_core.models import bundle
     from neurove_core.training import config as configs
+    from neurove_core.training import pipeline
 
     torch.set_num_threads(1)
     config, model = configs.load(args.config), models.find(args.model)
     out: Path = args.out or Path(f"{model.name}{bundle.SUFFIX}")
-    report = _calibrate(
-        model, config, args.data or Path("runs") / config.name / "data", args.sequences, args.workers, out
-    )
+    data: Path = args.data or Path("runs") / config.name / "data"
+    with progress() as show:
+        report = pipeline.calibrate(model, config, data, out, args.sequences, args.workers, show)
     if args.json:
         print(json.dumps({"bundle": str(out), **report}))
         return 0
@@ -80,19 +66,6 @@ def calibrate(args: argparse.Namespace) -> int:
     for name, axes in report["groups"].items():
         print(f"{name:26}", *(f"{axis} {row[str(report['level'])]:.2f}" for axis, row in axes.items()))
     return 0
-
-
-def _calibrate(model: "Bundle", config: Any, folder: Path, count: int, workers: int, out: Path) -> Any:
-    """Calibrate a model and write it; returns the report."""
-    from neurove_core.models import bundle
-    from neurove_core.training import calibration
-
-    with progress() as show:
-        for done, name in enumerate(calibration.fill(config, folder, count, workers), 1):
-            show("simulated to calibrate", done, count, name)
-    made = calibration.calibrate(model, config, folder, count)
-    bundle.save(made.bundle, out)
-    return made.report
 
 
 def evaluate(args: argparse.Namespace) -> int:
