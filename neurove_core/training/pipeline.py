@@ -20,7 +20,7 @@ from neurove_core.training import calibration, loop
 from neurove_core.training.config import TrainingConfig
 from neurove_core.training.data import Cache
 from neurove_core.training.ranks import device_of
-from neurove_core.training.recorded import Recorded
+from neurove_core.training.recorded import RecordedSequences
 from neurove_core.training.run import check_start
 
 OnProgress = Callable[[str, int, int, str], None]
@@ -121,7 +121,7 @@ def _fill(config: TrainingConfig, folder: Path, workers: int, on_progress: OnPro
     cache, wanted = Cache(folder, config), config.data.sequences
     for done, name in enumerate(cache.fill(workers), wanted - len(cache.missing()) + 1):
         on_progress("simulated", done, wanted, name)
-    recordings = Recorded(folder, config)
+    recordings = RecordedSequences(folder, config)
     missing = recordings.missing()
     for done, name in enumerate(recordings.fill(), 1):
         on_progress("split into windows", done, missing, name)

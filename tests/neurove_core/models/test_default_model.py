@@ -14,7 +14,7 @@ from neurove_core.io import open_source
 from neurove_core.models import bundle
 from neurove_core.networks.encoding import to_spikes
 from neurove_core.training import data
-from neurove_core.training.batches import regained
+from neurove_core.training.batches import with_gain
 
 
 def test_it_is_trained_small_and_says_how_it_was_made():
@@ -74,7 +74,7 @@ def test_it_is_sure_of_a_plain_drive_and_unsure_while_it_sees_nothing_or_little(
     assert flagged[16:].mean() < 0.2
     blank, few = drive.copy(), drive.copy()
     blank[30:] = 0
-    few[30:] = regained(np.random.default_rng(0), few[30:], 0.01)
+    few[30:] = with_gain(np.random.default_rng(0), few[30:], 0.01)
     for counts, wider in ((blank, 1.2), (few, 1.4)):  # a window without events is flagged low_activity besides
         sigma, _, _ = claimed(counts)
         assert (sigma[:30] == usual[:30]).all()
