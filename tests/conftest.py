@@ -16,7 +16,7 @@ torch.set_num_threads(1)
 
 
 def pytest_collection_modifyitems(items):
-    """For `--dist loadgroup`: tests of a file stay together, for its fixtures; live tests run one by one in one process.
+    """For `--dist loadgroup`: tests of a file stay together; live tests run one by one in one process.
 
     Live tests come first, because they take longest and mostly wait.
     """

@@ -1,4 +1,4 @@
-"""Who may import whom, read from the sources: a table of rooms, no circle, nothing upwards, no room that grew too large.
+"""Who may import whom, read from the sources: a table of rooms, no circle, nothing upwards, and bounded sizes.
 
 A room is a folder of a package, or a file that lies directly in a package. `MAY_IMPORT` says what a room may import;
 every room may import `neurove_protocol` and what is installed, except for what `FOREIGN` restricts.
@@ -58,7 +58,9 @@ MAY_IMPORT = {
     "neurove_service.transport": "logs",
     "neurove_service.streams": "logs core:estimator core:ingest core:models core:networks",
     "neurove_service.models": "logs streams core:files core:models core:estimator core:self_test core:ingest",
-    "neurove_service.clients": "logs config transport core:io core:io.formats core:bench core:config core:geometry core:ingest",
+    "neurove_service.clients": (
+        "logs config transport core:io core:io.formats core:bench core:config core:geometry core:ingest"
+    ),
     "neurove_service.node": "logs config lifecycle latency transport streams models core:models",
     "neurove_service": "",
     "neurove_service.cli": "*",
@@ -225,9 +227,11 @@ def test_no_module_and_no_class_is_two_things():
         lines = source.count("\n")
         if lines > MAX_LINES and path.as_posix() not in COMPILED_KERNELS:
             long.append(f"{path}: {lines} lines, at most {MAX_LINES}")
-        for node in ast.walk(ast.parse(source)):
-            if isinstance(node, ast.ClassDef) and (size := (node.end_lineno or 0) - node.lineno + 1) > MAX_CLASS_LINES:
-                long.append(f"{path}: class {node.name} has {size} lines, at most {MAX_CLASS_LINES}")
+        long += [
+            f"{path}: class {node.name} has {size} lines, at most {MAX_CLASS_LINES}"
+            for node in ast.walk(ast.parse(source))
+            if isinstance(node, ast.ClassDef) and (size := (node.end_lineno or 0) - node.lineno + 1) > MAX_CLASS_LINES
+        ]
     assert long == []
 
 

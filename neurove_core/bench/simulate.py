@@ -16,7 +16,7 @@ from torch import Tensor
 from neurove_core.bench import Row, interleaved
 from neurove_core.sim.motion.generated import driving
 from neurove_core.sim.render.camera import as_image, named_camera, rays_of
-from neurove_core.sim.render.pixels import QUIET, at_rest, events_of, make_pixels
+from neurove_core.sim.render.pixels import QUIET, events_of, make_pixels, settled_state
 from neurove_core.sim.simulate import Simulation, simulate
 
 FRAME_US: Final = 2_000
@@ -65,7 +65,7 @@ def _pictures(simulation: Simulation, frames: int) -> list[NDArray[np.float32]]:
 def _ours(simulation: Simulation, pictures: list[NDArray[np.float32]]) -> NDArray[np.int64]:
     """Events of each pixel (H * W,)."""
     pixels = make_pixels(QUIET, pictures[0].size, 0)
-    state = at_rest(pixels, pictures[0].ravel())
+    state = settled_state(pixels, pictures[0].ravel())
     state = state._replace(level=pictures[0].ravel().astype(np.float64))
     parts = []
     for k, picture in enumerate(pictures[1:]):

@@ -33,21 +33,21 @@ _STEPS: Final = 40  # most steps of one search
 _TOLERANCE_PX: Final = 3e-3  # a step below it ends the search
 
 
-class Turning(NamedTuple):
+class AngularMotion(NamedTuple):
     """A camera's rate of rotation as its events tell it."""
 
     w_rad_s: Array  # (3,) wx wy wz in the optical frame
     contrast: float  # variance of the image of moved events [events^2 per px]
-    contrast_at_rest: float  # the same if it had not turned: the more below `contrast`, the surer
+    contrast_stationary: float  # the same if it had not turned: the more below `contrast`, the surer
 
 
-class Sliding(NamedTuple):
+class PlanarMotion(NamedTuple):
     """A camera's motion along a fronto-parallel plane as its events tell it."""
 
     flow_px_s: Array  # (2,) how the image moves, right and down, at the optical centre
     velocity_per_depth: Array  # (2,) vx and vy of the camera over the plane's depth [1/s]
-    contrast: float  # as in Turning
-    contrast_at_rest: float
+    contrast: float  # as in AngularMotion
+    contrast_stationary: float
 
 
 class _Rays(NamedTuple):
@@ -65,10 +65,10 @@ class Grid(NamedTuple):
     width: int
     height: int
     turning: bool  # motions are rotations, else shifts
-    bell: Array  # (7,) weights that smooth it
+    kernel: Array  # (7,) weights that smooth it
 
 
-def angular(events: Events, camera: CameraInfo, start: Array | None = None) -> Turning:
+def angular(events: Events, camera: CameraInfo, start: Array | None = None) -> AngularMotion:
     """The constant rate of rotation that explains the events best, if the camera did nothing but turn.
 
     Args:
@@ -81,11 +81,11 @@ def angular(events: Events, camera: CameraInfo, start: Array | None = None) -> T
     """
     rays, duration_s = _rays(events, camera)
     to_rad = 1 / camera.fx  # a motion is sought in pixels over the duration
-    found, contrast, at_rest = _search(rays, camera, True, None if start is None else start * duration_s / to_rad)
-    return Turning(found * to_rad / duration_s, contrast, at_rest)
+    found, contrast, stationary = _search(rays, camera, True, None if start is None else start * duration_s / to_rad)
+    return AngularMotion(found * to_rad / duration_s, contrast, stationary)
 
 
-def planar(events: Events, camera: CameraInfo, start: Array | None = None) -> Sliding:
+def planar(events: Events, camera: CameraInfo, start: Array | None = None) -> PlanarMotion:
     """The constant velocity that explains the events best, if the camera slid along a fronto-parallel plane.
 
     Events tell velocity only over depth: times the plane's depth [m] it is in m/s.
@@ -101,9 +101,9 @@ def planar(events: Events, camera: CameraInfo, start: Array | None = None) -> Sl
     rays, duration_s = _rays(events, camera)
     focal = np.array([camera.fx, camera.fy])
     begin = None if start is None else np.append(-start / focal * camera.fx * duration_s, 0.0)
-    found, contrast, at_rest = _search(rays, camera, False, begin)
+    found, contrast, stationary = _search(rays, camera, False, begin)
     velocity = found[:2] / camera.fx / duration_s
-    return Sliding(-velocity * focal, velocity, contrast, at_rest)
+    return PlanarMotion(-velocity * focal, velocity, contrast, stationary)
 
 
 def _rays(events: Events, camera: CameraInfo) -> tuple[_Rays, float]:
@@ -129,13 +129,13 @@ def _search(rays: _Rays, camera: CameraInfo, turning: bool, start: Array | None)
     for scale, smoothing in SCALES:
         grid = image_grid(camera, scale, smoothing, turning)
         some = rays if scale == 1 else _thinned(rays, _COARSE_EVENTS // scale)
-        climbed = [_climb(some, grid, motion, camera.fx) for motion in motions]
-        climbed.sort(key=lambda pair: -pair[1])
-        best = climbed[0][0]
+        found = [_ascend(some, grid, motion, camera.fx) for motion in motions]
+        found.sort(key=lambda pair: -pair[1])
+        best = found[0][0]
         # the best of a coarse image may not be that of a fine one: the next best goes on too, if it is another
-        others = [motion for motion, _ in climbed if np.abs(motion - best).max() > scale]
+        others = [motion for motion, _ in found if np.abs(motion - best).max() > scale]
         motions = [best, *others[:1]]
-    return climbed[0][0], climbed[0][1], _contrast(rays, grid, np.zeros(3), camera.fx)[0]
+    return found[0][0], found[0][1], _contrast(rays, grid, np.zeros(3), camera.fx)[0]
 
 
 def _thinned(rays: _Rays, most: int) -> _Rays:
@@ -147,19 +147,21 @@ def _thinned(rays: _Rays, most: int) -> _Rays:
 def image_grid(camera: CameraInfo, scale: int, smoothing: float, turning: bool) -> Grid:
     """An image somewhat larger than the sensor's, with cells of `scale` px and smoothing in cells."""
     width, height = (int(side * (1 + 2 * MARGIN) / scale) for side in (camera.width, camera.height))
-    bell = np.exp(-0.5 * (np.arange(-3, 4) / smoothing) ** 2)
-    return Grid(camera.fx / scale, width, height, turning, bell / bell.sum())
+    kernel = np.exp(-0.5 * (np.arange(-3, 4) / smoothing) ** 2)
+    return Grid(camera.fx / scale, width, height, turning, kernel / kernel.sum())
 
 
-def _climb(rays: _Rays, grid: Grid, motion: Array, focal_px: float) -> tuple[Array, float]:
+def _ascend(rays: _Rays, grid: Grid, motion: Array, focal_px: float) -> tuple[Array, float]:
     """The nearest motion (3,) of locally greatest contrast, and that contrast: BFGS with a halving line search."""
     value, slope = _contrast(rays, grid, motion, focal_px)
-    bend = np.eye(3) * (focal_px / grid.focal) / max(float(np.linalg.norm(slope)), 1e-12)  # a first step of one cell
+    inverse_hessian = (
+        np.eye(3) * (focal_px / grid.focal) / max(float(np.linalg.norm(slope)), 1e-12)
+    )  # a first step of one cell
     for _ in range(_STEPS):
-        step = bend @ slope
+        step = inverse_hessian @ slope
         if step @ slope <= 0:  # rounding has spoilt it
-            bend = np.eye(3) / max(float(np.linalg.norm(slope)), 1e-12)
-            step = bend @ slope
+            inverse_hessian = np.eye(3) / max(float(np.linalg.norm(slope)), 1e-12)
+            step = inverse_hessian @ slope
         while np.abs(step).max() > _TOLERANCE_PX:
             here, slope_here = _contrast(rays, grid, motion + step, focal_px)
             if here > value + 1e-4 * float(step @ slope):
@@ -167,18 +169,18 @@ def _climb(rays: _Rays, grid: Grid, motion: Array, focal_px: float) -> tuple[Arr
             step = step / 2
         else:
             break
-        bend = _updated(bend, step, slope - slope_here)
+        inverse_hessian = _updated_inverse_hessian(inverse_hessian, step, slope - slope_here)
         motion, value, slope = motion + step, here, slope_here
     return motion, value
 
 
-def _updated(bend: Array, step: Array, change: Array) -> Array:
+def _updated_inverse_hessian(inverse_hessian: Array, step: Array, change: Array) -> Array:
     """The BFGS estimate of the inverse curvature after a step that changed the slope by this."""
     along = float(step @ change)
     if along <= 1e-12 * float(np.linalg.norm(step) * np.linalg.norm(change)):
-        return bend
+        return inverse_hessian
     left = np.eye(len(step)) - np.outer(step, change) / along
-    return np.asarray(left @ bend @ left.T + np.outer(step, step) / along)
+    return np.asarray(left @ inverse_hessian @ left.T + np.outer(step, step) / along)
 
 
 def _contrast(rays: _Rays, grid: Grid, motion: Array, focal_px: float) -> tuple[float, Array]:
@@ -186,25 +188,25 @@ def _contrast(rays: _Rays, grid: Grid, motion: Array, focal_px: float) -> tuple[
     rate = motion / focal_px  # [rad or 1/depth, over the duration]
     image = np.zeros((grid.height, grid.width))
     accumulate(rays.x, rays.y, rays.time, rate, grid, image)
-    smooth = _smoothed(image, grid.bell)
+    smooth = _smoothed(image, grid.kernel)
     deviation = smooth - smooth.mean()
     # the slope of the sum of squares by each event's place is that of the image smoothed once more
-    slope = _slope(rays.x, rays.y, rays.time, rate, grid, _smoothed(deviation, grid.bell))
+    slope = _slope(rays.x, rays.y, rays.time, rate, grid, _smoothed(deviation, grid.kernel))
     return float((deviation**2).mean()), slope * (2 / image.size / focal_px)
 
 
 @compiled
-def _smoothed(image: Array, bell: Array) -> Array:  # pragma: no cover (machine code)
+def _smoothed(image: Array, kernel: Array) -> Array:  # pragma: no cover (machine code)
     """The image smoothed along rows and columns, dark beyond its borders."""
     height, width = image.shape
     rows, out = np.zeros_like(image), np.zeros_like(image)
     for y in range(height):
         for k in range(-3, 4):
-            weight = bell[k + 3]
+            weight = kernel[k + 3]
             for x in range(max(0, -k), min(width, width - k)):
                 rows[y, x] += weight * image[y, x + k]
     for k in range(-3, 4):
-        weight = bell[k + 3]
+        weight = kernel[k + 3]
         for y in range(max(0, -k), min(height, height - k)):
             for x in range(width):
                 out[y, x] += weight * rows[y + k, x]

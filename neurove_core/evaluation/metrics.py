@@ -51,25 +51,25 @@ def relative_error(error: Array, truth: Array, floor: float = 0.0) -> float | No
     return float((np.linalg.norm(error[counted], axis=-1) / length[counted]).mean())
 
 
-def figures(truth: Array, answer: Array, bins: int) -> dict[str, Any]:
+def figures(truth: Array, estimate: Array, bins: int) -> dict[str, Any]:
     """All figures of some answers.
 
     Args:
         truth: twists (N, 6) [m/s, rad/s], one per bin; finite.
-        answer: of the same bins.
+        estimate: of the same bins.
         bins: per window: N is a multiple of it.
 
     Returns:
         the paper's RMSE and RE for v_l and v_a, speed error and direction error apart, medians, the worst window
         (by the mean length of its errors), R2, and all that is defined for one axis, by axis.
     """
-    error = answer - truth
+    error = estimate - truth
     found: dict[str, Any] = {"windows": len(truth) // bins}
     for group, part, unit, floor in (
         ("v_l", LINEAR, "m_s", LINEAR_FLOOR_M_S),
         ("v_a", ANGULAR, "rad_s", ANGULAR_FLOOR_RAD_S),
     ):
-        e, t, a = error[:, part], truth[:, part], answer[:, part]
+        e, t, a = error[:, part], truth[:, part], estimate[:, part]
         length = np.linalg.norm(e, axis=1)
         worst = length.reshape(-1, bins).mean(1)
         found |= {
@@ -86,37 +86,37 @@ def figures(truth: Array, answer: Array, bins: int) -> dict[str, Any]:
         }
     for name in [name for name in found if name.endswith("_rad_s")]:
         found[name.removesuffix("_rad_s") + "_deg_s"] = float(np.degrees(found[name]))
-    found["per_axis"] = {axis: _axis(truth[:, i], answer[:, i], angular=i >= 3) for i, axis in enumerate(AXES)}
+    found["per_axis"] = {axis: _axis(truth[:, i], estimate[:, i], angular=i >= 3) for i, axis in enumerate(AXES)}
     return found
 
 
-def r2(truth: Array, answer: Array) -> float | None:
+def r2(truth: Array, estimate: Array) -> float | None:
     """Share of the truth's variance that the answers explain; None where the truth does not vary."""
     variance = ((truth - truth.mean(0)) ** 2).sum()
-    return float(1 - ((answer - truth) ** 2).sum() / variance) if variance > 0 else None
+    return float(1 - ((estimate - truth) ** 2).sum() / variance) if variance > 0 else None
 
 
-def direction_error_deg(truth: Array, answer: Array, floor: float) -> float | None:
+def direction_error_deg(truth: Array, estimate: Array, floor: float) -> float | None:
     """Median angle between the vectors [deg], where the truth is above the floor; None if nowhere."""
-    lengths = np.linalg.norm(truth, axis=1), np.linalg.norm(answer, axis=1)
+    lengths = np.linalg.norm(truth, axis=1), np.linalg.norm(estimate, axis=1)
     counted = (lengths[0] > floor) & (lengths[1] > 0)
     if not counted.any():
         return None
-    cosine = (truth * answer).sum(1)[counted] / (lengths[0] * lengths[1])[counted]
+    cosine = (truth * estimate).sum(1)[counted] / (lengths[0] * lengths[1])[counted]
     return float(np.degrees(np.median(np.arccos(np.clip(cosine, -1, 1)))))
 
 
-def _axis(truth: Array, answer: Array, *, angular: bool) -> Figures:
-    error = answer - truth
+def _axis(truth: Array, estimate: Array, *, angular: bool) -> Figures:
+    error = estimate - truth
     unit = "rad_s" if angular else "m_s"
-    correlated = truth.std() > 0 and answer.std() > 0
+    correlated = truth.std() > 0 and estimate.std() > 0
     found: Figures = {
         f"rmse_{unit}": rmse(error[:, None]),
         f"median_error_{unit}": float(np.median(np.abs(error))),
         f"bias_{unit}": float(error.mean()),
         f"spread_{unit}": float(truth.std()),
-        "r2": r2(truth[:, None], answer[:, None]),
-        "correlation": float(np.corrcoef(truth, answer)[0, 1]) if correlated else None,
+        "r2": r2(truth[:, None], estimate[:, None]),
+        "correlation": float(np.corrcoef(truth, estimate)[0, 1]) if correlated else None,
     }
     if angular:
         found |= {name.replace("rad_s", "deg_s"): _degrees(value) for name, value in found.items() if "rad_s" in name}

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from neurove_core.evaluation.judge import Judged
+from neurove_core.evaluation.evaluate import Evaluation
 from neurove_core.figures import blank_figure, save_figure
 from neurove_core.models.uncertainty import LEVEL, half_width
 from neurove_protocol.velocity import AXES
@@ -13,39 +13,39 @@ from neurove_protocol.velocity import AXES
 _GAP_S = 0.2  # lines are broken where windows are missing for so long
 
 
-def plot(judged: Judged, folder: Path) -> list[Path]:
+def plot(evaluation: Evaluation, folder: Path) -> list[Path]:
     """Write a recording's figure as PNG and SVG, named after it; returns the files.
 
     Raises:
         MissingExtra: matplotlib is not installed. InvalidField: a file can not be written.
     """
     figure = blank_figure(14, 10)
-    t_s = judged.end_us / 1e6
-    holes = np.flatnonzero(np.diff(t_s) > _GAP_S) + 1
+    t_s = evaluation.end_us / 1e6
+    gaps = np.flatnonzero(np.diff(t_s) > _GAP_S) + 1
     panels = figure.subplots(6, 2, sharex=True, gridspec_kw={"width_ratios": [2, 1]})
     for i, (axis, (beside, error)) in enumerate(zip(AXES, panels, strict=True)):
         unit = "m/s" if i < 3 else "rad/s"
         for values, label, panel in (
-            (judged.truth[:, i], "truth", beside),
-            (judged.answer[:, i], "estimate", beside),
-            (judged.answer[:, i] - judged.truth[:, i], "error", error),
+            (evaluation.truth[:, i], "truth", beside),
+            (evaluation.estimate[:, i], "estimate", beside),
+            (evaluation.estimate[:, i] - evaluation.truth[:, i], "error", error),
         ):
-            panel.plot(np.insert(t_s, holes, np.nan), np.insert(values, holes, np.nan), label=label, linewidth=0.9)
+            panel.plot(np.insert(t_s, gaps, np.nan), np.insert(values, gaps, np.nan), label=label, linewidth=0.9)
             panel.grid(visible=True, alpha=0.3)
-        if judged.sigma is not None:
-            wide = half_width(LEVEL) * judged.sigma[:, i]
-            low, high = judged.answer[:, i] - wide, judged.answer[:, i] + wide
-            gone = (np.insert(t_s, holes, np.nan), np.insert(low, holes, np.nan), np.insert(high, holes, np.nan))
+        if evaluation.sigma is not None:
+            wide = half_width(LEVEL) * evaluation.sigma[:, i]
+            low, high = evaluation.estimate[:, i] - wide, evaluation.estimate[:, i] + wide
+            gone = (np.insert(t_s, gaps, np.nan), np.insert(low, gaps, np.nan), np.insert(high, gaps, np.nan))
             beside.fill_between(*gone, alpha=0.2, color="C1", linewidth=0, label=f"{LEVEL:.0%} interval")
         beside.set_ylabel(f"{axis} [{unit}]")
         error.axhline(0, color="black", linewidth=0.5)
     panels[0, 0].legend(loc="upper right")
     panels[0, 1].set_title("error")
-    panels[0, 0].set_title(judged.answers.name)
+    panels[0, 0].set_title(evaluation.estimates.name)
     for panel in panels[-1]:
         panel.set_xlabel("sensor time [s]")
     folder.mkdir(parents=True, exist_ok=True)
-    stem = "".join(c if c.isalnum() or c in "-_." else "_" for c in judged.answers.name)
+    stem = "".join(c if c.isalnum() or c in "-_." else "_" for c in evaluation.estimates.name)
     return save_figure(figure, folder / stem)
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from neurove_core.estimator import Estimator
 from neurove_core.evaluation.contrast import angular
-from neurove_core.evaluation.judge import NoTruth, answer
+from neurove_core.evaluation.evaluate import NoTruth, estimate_recording
 from neurove_core.evaluation.metrics import SKIP_S
 from neurove_core.experiments import save_text
 from neurove_core.io import open_source
@@ -166,7 +166,7 @@ def _estimate_series(estimator: Estimator, path: Path) -> _EstimateSeries:
         size = {"width": recording.sensor.width, "height": recording.sensor.height}
         lens = {"fx": camera.fx * wider, "fy": camera.fy * higher, "cx": camera.cx * wider, "cy": camera.cy * higher}
         camera = camera.model_copy(update=size | lens)
-    answers = answer(estimator, recording, camera)
+    answers = estimate_recording(estimator, recording, camera)
     window_us = answers.bin_us * answers.twists.shape[1]
     first_us, last_us = int(next(recording.chunks()).t[0]), _last_us(recording)
     whole = (answers.start_us >= first_us) & (answers.start_us + window_us <= last_us)

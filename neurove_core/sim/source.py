@@ -71,9 +71,9 @@ def simulation_of(url: str, sensor: Sensor | None = None) -> Simulation:
         return Mounted(parse_trajectory(named, None if math.isinf(seconds) else seconds), *mount)
 
     first = trajectory(0)
-    following = trajectory if math.isinf(seconds) and text in _SEEDED else None
-    duration_s = math.inf if following else min(seconds, first.duration_s)
-    return Simulation(scene, make_scene, first, camera, PixelConfig(), seed, duration_s, following)
+    next_trajectory = trajectory if math.isinf(seconds) and text in _SEEDED else None
+    duration_s = math.inf if next_trajectory else min(seconds, first.duration_s)
+    return Simulation(scene, make_scene, first, camera, PixelConfig(), seed, duration_s, next_trajectory)
 
 
 def _seed(url: str, text: str) -> int:

@@ -59,7 +59,7 @@ def augment(
         recipe: how often each change is made.
     """
     if _happens(rng, recipe.still):
-        rest = at_rest(rng, counts.shape, math.exp(rng.uniform(*np.log(recipe.still_noise))))
+        rest = stationary(rng, counts.shape, math.exp(rng.uniform(*np.log(recipe.still_noise))))
         return with_hot_pixels(rng, rest, recipe) if _happens(rng, recipe.hot) else rest, np.zeros_like(twists)
     chance = rng.uniform(size=5)
     gain, noise = math.exp(rng.uniform(*np.log(recipe.gain))), rng.uniform(0, recipe.noise_max)
@@ -70,9 +70,9 @@ def augment(
     if chance[1] < recipe.polarity_flip:
         counts = polarity_flipped(counts)
     if chance[2] < recipe.regained:
-        counts = regained(rng, counts, gain)
+        counts = with_gain(rng, counts, gain)
     if chance[3] < recipe.noisy:
-        counts = noisy(rng, counts, noise)
+        counts = with_noise(rng, counts, noise)
     if _happens(rng, recipe.lopsided):
         counts = lopsided(rng, counts, math.exp(rng.uniform(*np.log(recipe.lopsided_by))))
     if _happens(rng, recipe.hot):
@@ -80,7 +80,7 @@ def augment(
     if _happens(rng, recipe.thinned):
         counts = thinned(rng, counts, recipe)
     if _happens(rng, recipe.holes):
-        counts = with_holes(rng, counts, recipe)
+        counts = with_gaps(rng, counts, recipe)
     return counts, twists
 
 
@@ -93,7 +93,7 @@ def lopsided(rng: np.random.Generator, counts: NDArray[np.uint8], ratio: float) 
     """Counts (S, 2n, H, W) of pixels whose thresholds differ: ON over OFF becomes so many times what it was."""
     seen = counts.copy(order="C")
     for polarity, gain in ((0, ratio**-0.5), (1, ratio**0.5)):
-        seen[:, polarity::2] = regained(rng, seen[:, polarity::2], gain)
+        seen[:, polarity::2] = with_gain(rng, seen[:, polarity::2], gain)
     return seen
 
 
@@ -112,11 +112,11 @@ def with_hot_pixels(rng: np.random.Generator, counts: NDArray[np.uint8], recipe:
 def thinned(rng: np.random.Generator, counts: NDArray[np.uint8], recipe: RecipeConfig) -> NDArray[np.uint8]:
     """A segment (S, 2n, H, W) that has few events from some window on, while the camera moves as before."""
     first, seen = int(rng.integers(_SEEN_FIRST, max(_SEEN_FIRST + 1, len(counts) // 2))), counts.copy(order="C")
-    seen[first:] = regained(rng, seen[first:], math.exp(rng.uniform(*np.log(recipe.thinned_to))))
+    seen[first:] = with_gain(rng, seen[first:], math.exp(rng.uniform(*np.log(recipe.thinned_to))))
     return seen
 
 
-def with_holes(rng: np.random.Generator, counts: NDArray[np.uint8], recipe: RecipeConfig) -> NDArray[np.uint8]:
+def with_gaps(rng: np.random.Generator, counts: NDArray[np.uint8], recipe: RecipeConfig) -> NDArray[np.uint8]:
     """A segment (S, 2n, H, W) with holes in its feed, while the camera moves on: something was seen before each."""
     seen, at = counts.copy(order="C"), 0
     while at < len(seen):
@@ -169,7 +169,7 @@ def polarity_flipped(counts: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return counts[:, np.arange(2 * bins) ^ 1]
 
 
-def regained(rng: np.random.Generator, counts: NDArray[np.uint8], gain: float) -> NDArray[np.uint8]:
+def with_gain(rng: np.random.Generator, counts: NDArray[np.uint8], gain: float) -> NDArray[np.uint8]:
     """Each count times a gain, rounded at random so that the mean is exact; saturating as a window does."""
     scaled = counts.copy(order="C").reshape(-1)
     seen = np.flatnonzero(scaled)
@@ -177,7 +177,7 @@ def regained(rng: np.random.Generator, counts: NDArray[np.uint8], gain: float) -
     return scaled.reshape(counts.shape)
 
 
-def at_rest(rng: np.random.Generator, shape: tuple[int, ...], mean: float) -> NDArray[np.uint8]:
+def stationary(rng: np.random.Generator, shape: tuple[int, ...], mean: float) -> NDArray[np.uint8]:
     """What a camera sees that stands still in a world that does: the noise of its pixels, some louder than others.
 
     Args:
@@ -191,7 +191,7 @@ def at_rest(rng: np.random.Generator, shape: tuple[int, ...], mean: float) -> ND
     return np.minimum(drawn, 255).astype(np.uint8)
 
 
-def noisy(rng: np.random.Generator, counts: NDArray[np.uint8], mean: float) -> NDArray[np.uint8]:
+def with_noise(rng: np.random.Generator, counts: NDArray[np.uint8], mean: float) -> NDArray[np.uint8]:
     """Random events added, `mean` of them per cell and bin."""
     added = counts.copy(order="C").reshape(-1)
     where = rng.integers(added.size, size=rng.poisson(mean * added.size))

@@ -28,7 +28,7 @@ from neurove_core.models.bundle import PER_HEIGHT, Bundle
 from neurove_core.models.uncertainty import LEVEL, LEVELS, Uncertainty, half_width
 from neurove_core.networks.encoding import to_spikes
 from neurove_core.networks.neurove import NeuroVE
-from neurove_core.training.batches import mirrored, noisy, regained
+from neurove_core.training.batches import mirrored, with_gain, with_noise
 from neurove_core.training.config import DataConfig, TrainingConfig
 from neurove_core.training.data import Cache, Sequences
 from neurove_core.training.loop import commit
@@ -39,7 +39,7 @@ SEQUENCES: Final = 96
 UNCERTAIN_ABOVE: Final = 0.3
 """Of the linear sigma over the speed: from here on an estimate is flagged (decision 48)."""
 
-SEEN: Final = ("as it is", "holes", "few events", "noise")
+VARIANTS: Final = ("as it is", "holes", "few events", "noise")
 """The ways in which each sequence is seen."""
 
 _SECONDS: Final = 3.0  # many short sequences tell more than few long ones: what errs, errs for a whole sequence
@@ -55,25 +55,25 @@ _SHRUNK: Final = 0.02  # towards no correlation: what makes it positive definite
 Array = NDArray[np.float64]
 
 
-class Watched(NamedTuple):
+class SequenceErrors(NamedTuple):
     """What a model did on one sequence seen in one way, over T windows."""
 
     inputs: Array  # (T, N + 1): potential that the spread's neurons would have by each weight alone, and by the bias
     error: Array  # (T, n, 6) answer less truth, in units of the bundle's scale
     sequence: int
-    seen: str  # one of SEEN
+    variant: str  # one of VARIANTS
     hard: bool
 
 
 @dataclass(frozen=True)
-class Calibrated:
+class Calibration:
     """A bundle with its uncertainty, and how well that held on what was not used to fit it."""
 
     bundle: Bundle
     report: dict[str, Any]
 
 
-def kinds(config: TrainingConfig, sequences: int) -> list[tuple[TrainingConfig, bool]]:
+def calibration_sets(config: TrainingConfig, sequences: int) -> list[tuple[TrainingConfig, bool]]:
     """What is simulated to calibrate a model of this configuration, and whether it is hard.
 
     Raises:
@@ -101,11 +101,11 @@ def kinds(config: TrainingConfig, sequences: int) -> list[tuple[TrainingConfig, 
 
 def fill(config: TrainingConfig, folder: Path, sequences: int, workers: int = 1) -> Iterator[str]:
     """Simulate what is missing of the sequences; yields the name of each as it is done."""
-    for one, _ in kinds(config, sequences):
+    for one, _ in calibration_sets(config, sequences):
         yield from Cache(folder, one).fill(workers)
 
 
-def calibrate(bundle: Bundle, config: TrainingConfig, folder: Path, sequences: int = SEQUENCES) -> Calibrated:
+def calibrate(bundle: Bundle, config: TrainingConfig, folder: Path, sequences: int = SEQUENCES) -> Calibration:
     """Give a model its uncertainty; one that it already has is replaced.
 
     Args:
@@ -122,22 +122,22 @@ def calibrate(bundle: Bundle, config: TrainingConfig, folder: Path, sequences: i
         raise BadModel(bundle.name, "its windows or its canonical camera are not those of the configuration")
     if bundle.linear_unit != PER_HEIGHT:
         raise BadModel(bundle.name, f"linear_unit={bundle.linear_unit!r}: the sequences' truth is in {PER_HEIGHT!r}")
-    parts = [(Cache(folder, one).open(), hard) for one, hard in kinds(config, sequences)]
-    first = kinds(config, sequences)[0][0].data
+    parts = [(Cache(folder, one).open(), hard) for one, hard in calibration_sets(config, sequences)]
+    first = calibration_sets(config, sequences)[0][0].data
     about = (
         f"neurove calibrate: {sequences} simulated sequences of {first.seconds:g} s from seed {first.seed}, each seen "
-        f"{len(SEEN)} times, {_FOLDS} folds, commit {commit() or 'unknown'}"
+        f"{len(VARIANTS)} times, {_FOLDS} folds, commit {commit() or 'unknown'}"
     )
-    return fitted(bundle, list(watch(bundle, parts)), about)
+    return with_uncertainty(bundle, list(collect_errors(bundle, parts)), about)
 
 
-def fitted(bundle: Bundle, watched: list[Watched], about: str) -> Calibrated:
+def with_uncertainty(bundle: Bundle, watched: list[SequenceErrors], about: str) -> Calibration:
     """A bundle whose spread is fitted on what it did; `about` says in one line what that was.
 
     Its golden test, where it has one, is recorded anew: it is of the model as it will be saved.
     """
-    held = [one for fold in range(_FOLDS) for one in _judge(watched, fold)]
-    usual = [(one, sigma) for one, sigma in held if one.seen == SEEN[0] and not one.hard]
+    held = [one for fold in range(_FOLDS) for one in _held_out(watched, fold)]
+    usual = [(one, sigma) for one, sigma in held if one.variant == VARIANTS[0] and not one.hard]
     ratio = np.concatenate([np.abs(one.error) / sigma[:, None] for one, sigma in usual]).reshape(-1, 6)
     factor = np.quantile(ratio, LEVEL, axis=0) / half_width(LEVEL)
     weights = _fit(watched)
@@ -151,11 +151,11 @@ def fitted(bundle: Bundle, watched: list[Watched], about: str) -> Calibrated:
     made = replace(bundle, network=network.eval(), uncertainty=uncertainty)
     if made.golden:  # a wider last layer may round otherwise
         made = replace(made, golden=self_test.record(Estimator(made), made.golden.counts, made.golden.tolerance))
-    return Calibrated(made.with_digest(), _report(held, factor, about))
+    return Calibration(made.with_digest(), _report(held, factor, about))
 
 
-def watch(bundle: Bundle, parts: list[tuple[Sequences, bool]]) -> Iterator[Watched]:
-    """Follow the model through all sequences, each seen in every way of SEEN; the bool says which are hard."""
+def collect_errors(bundle: Bundle, parts: list[tuple[Sequences, bool]]) -> Iterator[SequenceErrors]:
+    """Follow the model through all sequences, each seen in every way of VARIANTS; the bool says which are hard."""
     probe = _copy(bundle)
     width = probe.readout.in_features
     layer: nn.Linear = probe.add_spread(width + 1)
@@ -168,7 +168,7 @@ def watch(bundle: Bundle, parts: list[tuple[Sequences, bool]]) -> Iterator[Watch
         for index in range(len(found)):
             rng = np.random.default_rng((203, number))
             counts, twists = found.counts(index, 0, len(found.twists[index])), found.twists[index]
-            ways = seen_in_all_ways(rng, counts, twists)
+            ways = variants_of(rng, counts, twists)
             spikes = to_spikes(torch.from_numpy(np.stack([way for way, _ in ways], 1)), bundle.config.network.encoding)
             state, inputs, answers = probe.initial_state(len(ways)), [], []
             for step in range(len(counts)):
@@ -179,15 +179,15 @@ def watch(bundle: Bundle, parts: list[tuple[Sequences, bool]]) -> Iterator[Watch
                 answers.append(answer[0].double().numpy())
             truth = np.stack([true for _, true in ways], 1)
             error = np.stack(answers) - (truth - bundle.offset.double().numpy()) / bundle.scale.double().numpy()
-            for way, seen in enumerate(SEEN):
-                yield Watched(np.stack(inputs)[:, way], error[:, way], number, seen, hard)
+            for way, seen in enumerate(VARIANTS):
+                yield SequenceErrors(np.stack(inputs)[:, way], error[:, way], number, seen, hard)
             number += 1
 
 
-def seen_in_all_ways(
+def variants_of(
     rng: np.random.Generator, counts: NDArray[np.uint8], twists: NDArray[np.float32]
 ) -> list[tuple[NDArray[np.uint8], NDArray[np.float32]]]:
-    """A sequence (T, 2n, H, W) with its twists (T, n, 6) in the ways of SEEN, in their order."""
+    """A sequence (T, 2n, H, W) with its twists (T, n, 6) in the ways of VARIANTS, in their order."""
     from_here, windows = int(rng.integers(2, max(3, len(counts) // 2))), len(counts)
     other, turned = mirrored(counts, twists)
     holes, at = other.copy(order="C"), 0
@@ -197,8 +197,8 @@ def seen_in_all_ways(
         holes[at : at + length] = 0
         at += length
     few, many = counts.copy(order="C"), counts.copy(order="C")
-    few[from_here:] = regained(rng, few[from_here:], float(np.exp(rng.uniform(np.log(0.01), np.log(0.5)))))
-    many[from_here:] = noisy(rng, many[from_here:], float(np.exp(rng.uniform(np.log(0.01), np.log(0.4)))))
+    few[from_here:] = with_gain(rng, few[from_here:], float(np.exp(rng.uniform(np.log(0.01), np.log(0.5)))))
+    many[from_here:] = with_noise(rng, many[from_here:], float(np.exp(rng.uniform(np.log(0.01), np.log(0.4)))))
     return [(counts, twists), (holes, turned), (few, twists), (many, twists)]
 
 
@@ -245,20 +245,20 @@ def _copy(bundle: Bundle) -> NeuroVE:
     return copy.deepcopy(bundle.network)
 
 
-def _fit(watched: list[Watched]) -> Array:
+def _fit(watched: list[SequenceErrors]) -> Array:
     """Weights (N + 1, 6) of the spread."""
     inputs = np.concatenate([one.inputs for one in watched])
     size = np.concatenate([np.abs(one.error).mean(1) for one in watched])
     return np.stack([laplace_scale(inputs, size[:, axis], _PENALTY) for axis in range(6)], 1)
 
 
-def _judge(watched: list[Watched], fold: int) -> list[tuple[Watched, Array]]:
+def _held_out(watched: list[SequenceErrors], fold: int) -> list[tuple[SequenceErrors, Array]]:
     """The sequences of a fold with sigma (T, 6) by a fit on all others."""
     weights = _fit([one for one in watched if one.sequence % _FOLDS != fold])
     return [(one, np.exp(one.inputs @ weights)) for one in watched if one.sequence % _FOLDS == fold]
 
 
-def _correlation(usual: list[tuple[Watched, Array]], factor: Array) -> torch.Tensor:
+def _correlation(usual: list[tuple[SequenceErrors, Array]], factor: Array) -> torch.Tensor:
     ratio = np.concatenate([one.error / (sigma * factor)[:, None] for one, sigma in usual]).reshape(-1, 6)
     clipped = np.clip(ratio, -_CLIPPED, _CLIPPED)
     spread = np.sqrt((clipped**2).mean(0)) + 1e-12
@@ -267,11 +267,11 @@ def _correlation(usual: list[tuple[Watched, Array]], factor: Array) -> torch.Ten
     return torch.tensor((found + found.T) / 2, dtype=torch.float32)
 
 
-def _report(held: list[tuple[Watched, Array]], factor: Array, about: str) -> dict[str, Any]:
+def _report(held: list[tuple[SequenceErrors, Array]], factor: Array, about: str) -> dict[str, Any]:
     """Coverage by axis, of each sequence by a fit that did not see it: as it is usual, and in each hard way."""
-    groups: dict[str, list[tuple[Watched, Array]]] = {}
+    groups: dict[str, list[tuple[SequenceErrors, Array]]] = {}
     for one, sigma in held:
-        groups.setdefault(f"hard scenes, {one.seen}" if one.hard else one.seen, []).append((one, sigma * factor))
+        groups.setdefault(f"hard scenes, {one.variant}" if one.hard else one.variant, []).append((one, sigma * factor))
     told: dict[str, Any] = {
         "provenance": about,
         "level": LEVEL,

@@ -29,7 +29,7 @@ from neurove_core.sim.motion.trajectory import Mounted, Trajectory, driving, han
 from neurove_core.sim.render.camera import Camera, named_camera
 from neurove_core.sim.render.pixels import PixelConfig
 from neurove_core.sim.simulate import Simulation
-from neurove_core.sim.world.path import Moving
+from neurove_core.sim.world.path import CameraPath
 from neurove_core.sim.world.scene import named_scene
 from neurove_core.training.config import DataConfig, Span, TrainingConfig
 
@@ -39,7 +39,7 @@ FORMAT: Final = 1
 DRIVE_S: Final = 120.0
 """A sequence is a part of a drive of this length."""
 
-IN_A_HAND: Final = ("room", "plain-room")
+HAND_HELD_SCENES: Final = ("room", "plain-room")
 """Scenes through which nothing drives."""
 
 _SAMPLES: Final = 4  # of the exact twist in each bin, whose mean is the bin's
@@ -75,16 +75,16 @@ class Part(Trajectory):
         """Of the trajectory, and which part of it."""
         return f"{self.trajectory.name} from {self.start_s:.1f} s, {self.slowed:.2f} times slower"
 
-    def placed(self, t_s: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def position_orientation(self, t_s: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """See `Trajectory`."""
-        return self.trajectory.placed(self.start_s + self._within(t_s) / self.slowed)
+        return self.trajectory.position_orientation(self.start_s + self._within(t_s) / self.slowed)
 
     def twist(self, t_s: ArrayLike) -> NDArray[np.float64]:
         """See `Trajectory`."""
         return self.trajectory.twist(self.start_s + self._within(t_s) / self.slowed) / self.slowed
 
 
-def drawn(config: DataConfig, index: int) -> Simulation:
+def draw_simulation(config: DataConfig, index: int) -> Simulation:
     """The simulation that sequence `index` of a configuration is; the same each time."""
     rng = np.random.default_rng((config.seed, 201, index))
     seed = config.seed + index
@@ -102,11 +102,11 @@ def drawn(config: DataConfig, index: int) -> Simulation:
         cutoff_hz=log_uniform(rng, config.cutoff_hz),
         eps=log_uniform(rng, config.eps),
     )
-    in_a_hand = scene in IN_A_HAND
-    slowed = log_uniform(rng, config.slowed_hand if in_a_hand else config.slowed_drive)
+    hand_held_scene = scene in HAND_HELD_SCENES
+    slowed = log_uniform(rng, config.slowed_hand if hand_held_scene else config.slowed_drive)
     trajectory: Trajectory
-    if in_a_hand:
-        trajectory = _in_a_hand(rng, config, seed, slowed)
+    if hand_held_scene:
+        trajectory = _hand_held(rng, config, seed, slowed)
     else:
         trajectory = turning_part(rng, driving(seed, DRIVE_S + config.seconds), slowed, config.seconds)
     mounted = Mounted(trajectory, camera.height_m, camera.pitch_deg)
@@ -129,7 +129,7 @@ def sequence_of(simulation: Simulation, config: ModelConfig) -> Sequence:
     return Sequence(np.stack(counts), twists.astype(np.float32), height_m, name)
 
 
-def true_twists(trajectory: Moving, count: int, config: ModelConfig) -> NDArray[np.float64]:
+def true_twists(trajectory: CameraPath, count: int, config: ModelConfig) -> NDArray[np.float64]:
     """Mean exact twist (count, n, 6) [m/s, rad/s] of each bin of the first windows of a trajectory."""
     bins = count * config.window.bins
     t_s = (np.arange(bins * _SAMPLES, dtype=np.float64) + 0.5) * (config.window.bin_us / _SAMPLES * 1e-6)
@@ -192,7 +192,7 @@ class Cache:
 
 def _make(job: tuple[TrainingConfig, int, Path]) -> str:
     config, index, path = job
-    sequence = sequence_of(drawn(config.data, index), config.model)
+    sequence = sequence_of(draw_simulation(config.data, index), config.model)
     save(sequence, path)
     return sequence.name
 
@@ -243,7 +243,7 @@ class Sequences:
         return found
 
 
-def _in_a_hand(rng: np.random.Generator, config: DataConfig, seed: int, slowed: float) -> Trajectory:
+def _hand_held(rng: np.random.Generator, config: DataConfig, seed: int, slowed: float) -> Trajectory:
     """A camera that is waved about, only turned, or only moved; or one that spins on a random axis."""
     way = _choice(rng, config.hands)
     if way == "spun":

@@ -27,9 +27,9 @@ from neurove_core.training.config import RecipeConfig, TrainingConfig
 from neurove_core.training.curve import Scalars, draw_curve
 from neurove_core.training.data import Cache, Sequences
 from neurove_core.training.loss import group_loss, scaled_sum
-from neurove_core.training.ranks import Ranks, together
-from neurove_core.training.recorded import Recorded
-from neurove_core.training.run import Run
+from neurove_core.training.ranks import Ranks, process_group
+from neurove_core.training.recorded import RecordedSequences
+from neurove_core.training.run import TrainingRun
 
 CHECKPOINT: Final = "checkpoint.safetensors"
 RUN_JSON: Final = "run.json"
@@ -90,7 +90,7 @@ def train(
     Args:
         config: of the run.
         out: folder for the checkpoint, run.json, the curve and the bundle.
-        data: folder of the sequences, filled by `Cache.fill` and `Recorded.fill`.
+        data: folder of the sequences, filled by `Cache.fill` and `RecordedSequences.fill`.
         more: files of further sequences, as `data.save` writes them.
         resume: go on from the checkpoint in `out`, where there is one.
         start: a model to begin from; a checkpoint that is gone on from knows its own.
@@ -108,58 +108,58 @@ def train(
     """
     out.mkdir(parents=True, exist_ok=True)
     resume = resume and (out / CHECKPOINT).exists()
-    sequences = Sequences([*Cache(data, config).paths(), *Recorded(data, config).paths(), *more])
-    how = Beginning(resume, start)
-    begin(config, out, sequences, how, Ranks(count=devices))  # so that what is wrong is told by one
-    with together(devices, device, follow, (config, out, sequences.paths, how)) as ranks:
-        run = begin(config, out, sequences, how, ranks)
+    sequences = Sequences([*Cache(data, config).paths(), *RecordedSequences(data, config).paths(), *more])
+    how = Start(resume, start)
+    begin_run(config, out, sequences, how, Ranks(count=devices))  # so that what is wrong is told by one
+    with process_group(devices, device, train_rank, (config, out, sequences.paths, how)) as ranks:
+        run = begin_run(config, out, sequences, how, ranks)
         with Scalars(out, run.step) as scalars:
-            descend(run, sequences, out, on_progress, scalars.add)
+            train_to_end(run, sequences, out, on_progress, scalars.add)
     draw_curve(run.curve, out, f"{config.name}: {run.step} updates")
     path = out / f"{config.name}{bundle.SUFFIX}"
-    made = run.bundle(provenance(run, len(more)), about(run))
+    made = run.bundle(provenance(run, len(more)), metadata_of(run))
     test = self_test.record(Estimator(made), golden_windows(sequences))
     bundle.save(replace(made, golden=test), path)
     return path
 
 
-class Beginning(NamedTuple):
+class Start(NamedTuple):
     """Where a run's first weights come from: a checkpoint, a model, or the recipe's seed."""
 
     resume: bool
     start: Bundle | None
 
 
-def begin(config: TrainingConfig, out: Path, sequences: Sequences, how: Beginning, ranks: Ranks) -> Run:
+def begin_run(config: TrainingConfig, out: Path, sequences: Sequences, how: Start, ranks: Ranks) -> TrainingRun:
     """A rank's run at its first update, or at that of the checkpoint."""
     if how.resume:
-        return Run.restore(out / CHECKPOINT, config, ranks)
-    return Run.begin(config, sequences, ranks, how.start)
+        return TrainingRun.restore(out / CHECKPOINT, config, ranks)
+    return TrainingRun.begin(config, sequences, ranks, how.start)
 
 
-def follow(config: TrainingConfig, out: Path, paths: list[Path], how: Beginning, ranks: Ranks) -> None:
+def train_rank(config: TrainingConfig, out: Path, paths: list[Path], how: Start, ranks: Ranks) -> None:
     """What every rank but the first does: learn, and write nothing."""
     sequences = Sequences(paths)
-    descend(begin(config, out, sequences, how, ranks), sequences, out)
+    train_to_end(begin_run(config, out, sequences, how, ranks), sequences, out)
 
 
-def descend(
-    run: Run,
+def train_to_end(
+    run: TrainingRun,
     sequences: Sequences,
     out: Path,
     on_progress: Callable[[Progress], None] = lambda _: None,
     on_point: Callable[[dict[str, float]], None] = lambda _: None,
 ) -> None:
     """Learn to the end of the recipe; the first rank leaves checkpoints and run.json in `out`."""
-    recipe, share = run.config.recipe, run.share
+    recipe, share = run.config.recipe, run.rank_recipe
     spent_s, saved_s, began_s, recent = run.cpu_s, time.monotonic(), time.process_time(), list[_Losses]()
     while run.step < recipe.updates:
-        recent += learn(run, draw(run.rng, sequences, share))
+        recent += train_segment(run, draw(run.rng, sequences, share))
         mean = _mean(recent)
         on_progress(Progress(run.step, recipe.updates, 2 * mean.linear, 2 * mean.angular))
         if len(recent) < min(_CURVE_STEPS, recipe.steps / 100) and run.step < recipe.updates:
             continue
-        ranks = run.ranks.gathered((run.order, time.process_time() - began_s))
+        ranks = run.ranks.gather((run.rng_state, time.process_time() - began_s))
         run.cpu_s = spent_s + sum(cpu_s for _, cpu_s in ranks)
         run.curve.append(_point(run, mean))
         on_point(run.curve[-1])
@@ -171,18 +171,18 @@ def descend(
             saved_s = time.monotonic()
 
 
-def learn(run: Run, segment: Segment) -> list[_Losses]:
+def train_segment(run: TrainingRun, segment: Segment) -> list[_Losses]:
     """Follow a segment's streams from rest, chunk by chunk, with an update of the weights after each."""
     recipe, ranks = run.config.recipe, run.ranks
     segment = Segment(*(tensor.to(ranks.device) for tensor in segment))
-    state, losses = run.network.initial_state(segment.counts.shape[1]), []
+    state, steps = run.network.initial_state(segment.counts.shape[1]), []
     for first in range(0, recipe.segment_windows, recipe.chunk_windows):
         chunk = slice(first, first + recipe.chunk_windows)
         for group in run.optimiser.param_groups:
             group["lr"] = learning_rate(run.step, recipe)
         spikes = to_spikes(segment.counts[chunk], run.config.model.network.encoding)
         answers, state = run.network(spikes, state)
-        linear, angular = (ranks.mean(loss) for loss in errors(run, answers, segment, chunk))
+        linear, angular = (ranks.mean(loss) for loss in losses(run, answers, segment, chunk))
         loss, run.balance = scaled_sum(linear, angular, run.balance, recipe.balance_decay)
         run.optimiser.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]  # torch's own
@@ -191,11 +191,11 @@ def learn(run: Run, segment: Segment) -> list[_Losses]:
         run.optimiser.step()
         run.step += 1
         state = detached(state)
-        losses.append(_Losses(float(linear.detach()), float(angular.detach())))
-    return losses
+        steps.append(_Losses(float(linear.detach()), float(angular.detach())))
+    return steps
 
 
-def errors(run: Run, answers: Tensor, segment: Segment, chunk: slice) -> tuple[Tensor, Tensor]:
+def losses(run: TrainingRun, answers: Tensor, segment: Segment, chunk: slice) -> tuple[Tensor, Tensor]:
     """L_l in m/s and L_a in rad/s of a chunk's answers (T, B, n, 6).
 
     The linear part is learned per metre of camera height, but its error counts in m/s: else streams near the ground,
@@ -206,7 +206,7 @@ def errors(run: Run, answers: Tensor, segment: Segment, chunk: slice) -> tuple[T
     return group_loss(error[..., :3] * segment.height_m[:, None, None]), group_loss(error[..., 3:])
 
 
-def provenance(run: Run, more: int = 0) -> str:
+def provenance(run: TrainingRun, more: int = 0) -> str:
     """One line: how this model was made; `more` sequences were learned from beside the configuration's."""
     recipe, data = run.config.recipe, run.config.data
     names = ", ".join(Path(one.source).name for one in data.recordings)
@@ -221,7 +221,7 @@ def provenance(run: Run, more: int = 0) -> str:
     return text[:_PROVENANCE_CHARS]
 
 
-def about(run: Run) -> Metadata:
+def metadata_of(run: TrainingRun) -> Metadata:
     """How this model was made, as fields, and how far off it was at its last updates."""
     config = run.config
     made_by = MadeBy(
@@ -239,7 +239,7 @@ def about(run: Run) -> Metadata:
     return Metadata(made_by=made_by, figures={f"training_{name}": last[name] for name in errors if name in last})
 
 
-def _program(run: Run) -> str:
+def _program(run: TrainingRun) -> str:
     begun = f", begun from {run.start[:12]}" if run.start else ""
     return f"neurove train {run.config.name}{begun}"
 
@@ -272,7 +272,7 @@ def _mean(losses: list[_Losses]) -> _Losses:
     return _Losses(*(sum(values) / len(values) for values in zip(*losses, strict=True)))
 
 
-def _point(run: Run, mean: _Losses) -> dict[str, float]:
+def _point(run: TrainingRun, mean: _Losses) -> dict[str, float]:
     return {
         "step": run.step,
         "linear_error_m_s": 2 * mean.linear,
@@ -282,7 +282,7 @@ def _point(run: Run, mean: _Losses) -> dict[str, float]:
     }
 
 
-def _write_run(run: Run, out: Path) -> None:
+def _write_run(run: TrainingRun, out: Path) -> None:
     about: dict[str, Any] = {
         "config": run.config.model_dump(mode="json"),
         "seed": run.config.recipe.seed,

@@ -46,7 +46,7 @@ def scaled_sum(linear: Tensor, angular: Tensor, balance: Balance, decay: float) 
         decay: of the running means, 0 to below 1.
 
     Returns:
-        the loss to descend, about 2 while nothing is learned, and the balance after this update.
+        the loss to train_to_end, about 2 while nothing is learned, and the balance after this update.
     """
     means = [
         torch.where(mean > 0, decay * mean + (1 - decay) * loss.detach(), loss.detach()).clamp_min(1e-12)

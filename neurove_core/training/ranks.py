@@ -65,7 +65,7 @@ class Ranks:
         for gradient, mean in zip(gradients, torch.split(means, [one.numel() for one in gradients]), strict=True):
             gradient.copy_(mean.view_as(gradient))
 
-    def gathered(self, value: Any) -> list[Any]:
+    def gather(self, value: Any) -> list[Any]:
         """What each rank has, in their order."""
         if self.count == 1:
             return [value]
@@ -162,7 +162,7 @@ def device_of(wanted: str, rank: int = 0, devices: int = 1) -> torch.device:
 
 
 @contextlib.contextmanager
-def together(devices: int, device: str, work: Callable[..., Any], arguments: tuple[Any, ...]) -> Iterator[Ranks]:
+def process_group(devices: int, device: str, work: Callable[..., Any], arguments: tuple[Any, ...]) -> Iterator[Ranks]:
     """Inside this, `devices` processes of this machine learn together, and this one is the first of them.
 
     Args:

@@ -33,7 +33,7 @@ _STREAM: Final = "train"
 _IS_RECORDING: Final = ("events.txt", "metadata.yaml")  # what makes a folder one recording, not some
 
 
-class Recorded:
+class RecordedSequences:
     """The sequences of a configuration's recordings, in a folder; what is missing is cut, what is there is read.
 
     Args:
@@ -49,7 +49,7 @@ class Recorded:
     def __init__(self, folder: Path, config: TrainingConfig) -> None:
         self._config, self._folder = config, folder
         self._found = [
-            _opened(f"data.recordings.{i}", source, one)
+            _open(f"data.recordings.{i}", source, one)
             for i, one in enumerate(config.data.recordings)
             for source in _sources(one)
         ]
@@ -66,7 +66,7 @@ class Recorded:
             if not (folder / INDEX).exists():
                 folder.mkdir(parents=True, exist_ok=True)
                 lengths: list[int] = []
-                for sequence in pieces(found.recording, found.truth, found.height_m, self._config):
+                for sequence in split_recording(found.recording, found.truth, found.height_m, self._config):
                     save(sequence, folder / f"{len(lengths):06d}.safetensors")
                     lengths.append(len(sequence.twists))
                 write_atomically(folder / INDEX, json.dumps({"source": found.source, "windows": lengths}).encode())
@@ -85,7 +85,7 @@ class Recorded:
         """
         return [path for found in self._found for path in self._paths_of(found)]
 
-    def _paths_of(self, found: "_Found") -> list[Path]:
+    def _paths_of(self, found: "_OpenRecording") -> list[Path]:
         folder, takes = self._folder_of(found), self._config.recipe.most_windows
         lengths = json.loads((folder / INDEX).read_bytes())["windows"]
         paths = [folder / f"{i:06d}.safetensors" for i, length in enumerate(lengths) if length >= takes]
@@ -94,7 +94,7 @@ class Recorded:
             raise InvalidField("training", f"{found.field}.source", found.source, most)
         return paths
 
-    def _folder_of(self, found: "_Found") -> Path:
+    def _folder_of(self, found: "_OpenRecording") -> Path:
         model = self._config.model
         kind = [FORMAT, model.window.model_dump(), model.canonical.model_dump(), self._config.sequence_windows]
         kind += [found.height_m, found.digest]
@@ -102,7 +102,7 @@ class Recorded:
         return self._folder / f"recorded-{name}"
 
 
-def pieces(recording: Recording, truth: Twists, height_m: float, config: TrainingConfig) -> Iterator[Sequence]:
+def split_recording(recording: Recording, truth: Twists, height_m: float, config: TrainingConfig) -> Iterator[Sequence]:
     """The windows of a recording as the service cuts them, in sequences of at most `config.sequence_windows`.
 
     A sequence ends where the service would skip windows, and where a window has bins of which nothing is known.
@@ -153,7 +153,7 @@ def _sequence(run: list[tuple[Window, NDArray[np.float64]]], height_m: float, na
     return Sequence(counts, twist.astype(np.float32), height_m, f"{name} from {start_s:.1f} s, h={height_m:.2f} m")
 
 
-class _Found(NamedTuple):
+class _OpenRecording(NamedTuple):
     """A recording that is learned from."""
 
     field: str  # of the configuration
@@ -195,7 +195,7 @@ def _opens(path: Path, topic: str | None) -> bool:
     return True
 
 
-def _opened(field: str, source: str, one: RecordedConfig) -> _Found:
+def _open(field: str, source: str, one: RecordedConfig) -> _OpenRecording:
     recording = open_source(source, topic=one.topic)
     if recording.endless:
         raise InvalidField("training", f"{field}.source", source, "it never ends: say how many seconds")
@@ -211,7 +211,7 @@ def _opened(field: str, source: str, one: RecordedConfig) -> _Found:
     about += [hashlib.sha256(column.tobytes()).hexdigest() for column in truth]
     about += [source] if "://" in source else [_digest(file, *_version(file)) for file in _files(Path(source))]
     digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
-    return _Found(field, source, recording, truth, height_m or 1.0, digest)
+    return _OpenRecording(field, source, recording, truth, height_m or 1.0, digest)
 
 
 def _files(path: Path) -> list[Path]:

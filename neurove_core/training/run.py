@@ -35,7 +35,7 @@ _SYMMETRIC = [0, 4, 5]  # vx wy wz: as often to one side as to the other, for ha
 
 
 @dataclass
-class Run:
+class TrainingRun:
     """All that a run carries from one segment to the next."""
 
     config: TrainingConfig
@@ -79,7 +79,7 @@ class Run:
         return run
 
     @property
-    def share(self) -> RecipeConfig:
+    def rank_recipe(self) -> RecipeConfig:
         """The recipe with this rank's part of the batch."""
         batch = self.config.recipe.batch // self.ranks.count
         return self.config.recipe.model_copy(update={"batch": batch})
@@ -118,7 +118,7 @@ class Run:
         write_atomically(path, safetensors.torch.save(stored, {_KEY: json.dumps(about)}))
 
     @property
-    def order(self) -> Any:
+    def rng_state(self) -> Any:
         """What decides which segments this rank draws from here on."""
         return self.rng.bit_generator.state
 

@@ -5,13 +5,10 @@ import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from neurove_service.cli.arguments import add_recording_flags, command
 from neurove_service.cli.bars import progress
-
-if TYPE_CHECKING:
-    from neurove_core.models.bundle import Bundle
 
 _CALIBRATION_SEQUENCES = 96
 
@@ -21,37 +18,25 @@ def train(args: argparse.Namespace) -> int:
     import torch
 
     from neurove_core import models
-    from neurove_core.models import bundle
     from neurove_core.training import config as configs
-    from neurove_core.training import data, loop, ranks, recorded
-    from neurove_core.training import run as runs
+    from neurove_core.training import loop, pipeline
 
     torch.set_num_threads(args.threads)
     config = configs.load(args.config)
-    start = models.find(args.start) if args.start else None
-    if start is not None:
-        runs.check_start(start, config)
-    ranks.device_of(args.device, devices=args.devices)  # reports a wrong device before anything is simulated
     out: Path = args.out or Path("runs") / config.name
-    folder: Path = args.data or out / "data"
     with progress() as show:
-        cache = data.Cache(folder, config)
-        wanted = config.data.sequences
-        for done, name in enumerate(cache.fill(args.workers), wanted - len(cache.missing()) + 1):
-            show("simulated", done, wanted, name)
-        recordings = recorded.Recorded(folder, config)
-        missing = recordings.missing()
-        for done, name in enumerate(recordings.fill(), 1):
-            show("split into windows", done, missing, name)
-
-        def trained(at: loop.Progress) -> None:
-            errors = f"{at.linear_m_s:.3f} m/s {at.angular_rad_s:.4f} rad/s"
-            show("trained", at.step, at.steps, errors)
-
-        how: dict[str, Any] = {"resume": args.resume, "devices": args.devices, "device": args.device, "start": start}
-        path = loop.train(config, out, folder, **how, on_progress=trained)
-    if args.calibration_sequences and config.model.kind == "neurove":  # a baseline has no uncertainty
-        _calibrate(bundle.load(path), config, folder, args.calibration_sequences, args.workers, path)
+        path = pipeline.train(
+            config,
+            out,
+            data=args.data,
+            start=models.find(args.start) if args.start else None,
+            resume=args.resume,
+            devices=args.devices,
+            device=args.device,
+            workers=args.workers,
+            calibration_sequences=args.calibration_sequences,
+            on_progress=show,
+        )
     size = path.stat().st_size
     summary = {"bundle": str(path), "bytes": size, "run": str(out / loop.RUN_JSON)}
     print(json.dumps(summary) if args.json else f"wrote {path}, {size:,} bytes")
@@ -65,13 +50,14 @@ def calibrate(args: argparse.Namespace) -> int:
     from neurove_core import models
     from neurove_core.models import bundle
     from neurove_core.training import config as configs
+    from neurove_core.training import pipeline
 
     torch.set_num_threads(1)
     config, model = configs.load(args.config), models.find(args.model)
     out: Path = args.out or Path(f"{model.name}{bundle.SUFFIX}")
-    report = _calibrate(
-        model, config, args.data or Path("runs") / config.name / "data", args.calibration_sequences, args.workers, out
-    )
+    data: Path = args.data or Path("runs") / config.name / "data"
+    with progress() as show:
+        report = pipeline.calibrate(model, config, data, out, args.calibration_sequences, args.workers, show)
     if args.json:
         print(json.dumps({"bundle": str(out), **report}))
         return 0
@@ -82,26 +68,13 @@ def calibrate(args: argparse.Namespace) -> int:
     return 0
 
 
-def _calibrate(model: "Bundle", config: Any, folder: Path, count: int, workers: int, out: Path) -> Any:
-    """Calibrate a model and write it; returns the report."""
-    from neurove_core.models import bundle
-    from neurove_core.training import calibration
-
-    with progress() as show:
-        for done, name in enumerate(calibration.fill(config, folder, count, workers), 1):
-            show("simulated to calibrate", done, count, name)
-    made = calibration.calibrate(model, config, folder, count)
-    bundle.save(made.bundle, out)
-    return made.report
-
-
 def evaluate(args: argparse.Namespace) -> int:
     """Compare a model's estimates with the truth: RMSE and RE as in the paper, per axis and per recording."""
     import torch
 
     from neurove_core import models
     from neurove_core.estimator import Estimator
-    from neurove_core.evaluation import judge
+    from neurove_core.evaluation import evaluate as evaluation
     from neurove_core.geometry import motion
     from neurove_core.io import open_source, read_poses
 
@@ -109,20 +82,20 @@ def evaluate(args: argparse.Namespace) -> int:
     estimator = Estimator(models.find(args.model))
     estimator.warm_up()
     given = motion.twists(read_poses(args.truth)) if args.truth else None
-    judged = []
+    evaluated = []
     for source in args.recordings:
         recording = open_source(source, args.sensor, args.topic)
         truth = given or (None if recording.endless else recording.twists())
         if truth is None:
             why = "it never ends: add ?seconds=S" if recording.endless else "it holds no truth: give --truth FILE"
-            raise judge.NoTruth(f"{source}: {why}", source=source)
-        judged.append(judge.judge(judge.answer(estimator, recording), truth))
-    report = {"model": estimator.bundle.info.model_dump(), **judge.report(judged)}
+            raise evaluation.NoTruth(f"{source}: {why}", source=source)
+        evaluated.append(evaluation.evaluate(evaluation.estimate_recording(estimator, recording), truth))
+    report = {"model": estimator.bundle.info.model_dump(), **evaluation.report(evaluated)}
     print(json.dumps(report) if args.json else "\n".join(_table(report)))
     if args.plot:
         from neurove_core.evaluation.plots import plot, plot_reliability
 
-        files = [file for one in judged for file in plot(one, args.plot)]
+        files = [file for one in evaluated for file in plot(one, args.plot)]
         if report["uncertainty"]:
             files += plot_reliability(report["uncertainty"], args.plot)
         for file in files:

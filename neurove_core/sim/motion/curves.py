@@ -28,7 +28,7 @@ class Trajectory(ABC):
     duration_s: float  # inf: it never ends
 
     @abstractmethod
-    def placed(self, t_s: ArrayLike) -> tuple[Array, Array]:
+    def position_orientation(self, t_s: ArrayLike) -> tuple[Array, Array]:
         """Position (..., 3) [m] and orientation as unit quaternion (..., 4) x y z w, camera to world.
 
         Raises:
@@ -40,21 +40,21 @@ class Trajectory(ABC):
         """Exact twist (..., 6), vx vy vz [m/s] wx wy wz [rad/s], in the camera's optical frame at that time.
 
         Raises:
-            InvalidField: as `placed`.
+            InvalidField: as `position_orientation`.
         """
 
     def pose(self, t_s: ArrayLike) -> tuple[Array, Array]:
         """Position (..., 3) [m] and rotation matrix (..., 3, 3), camera to world.
 
         Raises:
-            InvalidField: as `placed`.
+            InvalidField: as `position_orientation`.
         """
-        position, q = self.placed(t_s)
+        position, q = self.position_orientation(t_s)
         return position, rotations.matrix_of(q)
 
     def poses(self, t_us: NDArray[np.int64]) -> Poses:
         """The poses at these times (N,) [us] since the start."""
-        return Poses(t_us, *self.placed(t_us / 1e6))
+        return Poses(t_us, *self.position_orientation(t_us / 1e6))
 
     def twists(self, t_us: NDArray[np.int64]) -> Twists:
         """The exact twists at these times (N,) [us] since the start."""
@@ -77,7 +77,7 @@ class ScrewTrajectory(Trajectory):
     constant: tuple[float, ...]  # vx vy vz [m/s] wx wy wz [rad/s]
     duration_s: float = math.inf
 
-    def placed(self, t_s: ArrayLike) -> tuple[Array, Array]:
+    def position_orientation(self, t_s: ArrayLike) -> tuple[Array, Array]:
         """See `Trajectory`."""
         q, position = rotations.pose_of(np.array(self.constant) * self._within(t_s)[..., None])
         return position, q
@@ -121,7 +121,7 @@ class SplineTrajectory(Trajectory):
         whole_s = step_s * (len(knots) - 1)
         return cls(name, min(duration_s, whole_s), step_s, np.concatenate([before, knots, after]))
 
-    def placed(self, t_s: ArrayLike) -> tuple[Array, Array]:
+    def position_orientation(self, t_s: ArrayLike) -> tuple[Array, Array]:
         """See `Trajectory`."""
         value, _ = self._evaluate(t_s)
         q = value[..., 3:]
@@ -181,9 +181,9 @@ class Mounted(Trajectory):
         """Quaternion (4,) from the mounted camera's axes to the level one's."""
         return rotations.exp(np.array([-math.radians(self.pitch_deg), 0.0, 0.0]))
 
-    def placed(self, t_s: ArrayLike) -> tuple[Array, Array]:
+    def position_orientation(self, t_s: ArrayLike) -> tuple[Array, Array]:
         """See `Trajectory`; the ground is at y = 0 and the camera above it, at negative y."""
-        position, q = self.trajectory.placed(t_s)
+        position, q = self.trajectory.position_orientation(t_s)
         return position - np.array([0.0, self.height_m, 0.0]), rotations.product(q, self._mount)
 
     def twist(self, t_s: ArrayLike) -> Array:

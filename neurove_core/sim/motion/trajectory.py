@@ -170,7 +170,7 @@ def parse_trajectory(text: str, seconds: float | None = None) -> Trajectory:
         InvalidField: the name or a parameter is unknown, or a value out of its bound; or the file holds no path.
     """
     name, _, query = text.rpartition("?") if "?" in text else (text, "", "")
-    given = _Given(text, query)
+    given = _Parameters(text, query)
     seconds = given.optional("seconds", 1e-3, MAX_SECONDS) or seconds
     match name:
         case "driving" | "handheld":
@@ -189,7 +189,7 @@ def parse_trajectory(text: str, seconds: float | None = None) -> Trajectory:
             return _from_file(name, given, seconds)
 
 
-def _from_file(name: str, given: "_Given", seconds: float | None) -> SplineTrajectory:
+def _from_file(name: str, given: "_Parameters", seconds: float | None) -> SplineTrajectory:
     """The trajectory along a file's poses, from `start` s after the first on."""
     path = Path(name)
     if not path.is_file():
@@ -210,7 +210,7 @@ def _from_file(name: str, given: "_Given", seconds: float | None) -> SplineTraje
     return SplineTrajectory(whole.name, lasting, whole.step_s, whole.control)
 
 
-class _Given:
+class _Parameters:
     """The parameters that were given; each is asked for, and none may be left over."""
 
     def __init__(self, text: str, query: str) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from neurove_core.sim.render.camera import Rays
 from neurove_core.sim.render.compile import fast
 from neurove_core.sim.render.cull import Candidates
-from neurove_core.sim.render.pixels import Found, Mismatch, PixelState, find_crossings
+from neurove_core.sim.render.pixels import EventBuffer, Mismatch, PixelState, find_crossings
 from neurove_core.sim.render.tile import render_tile
 from neurove_core.sim.render.tile_rows import DEPTH, LANES, LIGHT, ROWS, load_tile
 from neurove_core.sim.render.views import Backdrop
@@ -61,10 +61,10 @@ def run_tiles(
     parts: NDArray[np.int64],
     span_us: float,
     weights: NDArray[np.float64],
-    made: Mismatch,
+    mismatch: Mismatch,
     state: PixelState,
     depth: NDArray[np.float32],
-) -> Found:  # pragma: no cover (machine code)
+) -> EventBuffer:  # pragma: no cover (machine code)
     """Render each tile in equal steps to the end of the interval; events not yet in order.
 
     Args:
@@ -76,7 +76,7 @@ def run_tiles(
         parts: (M,) into how many steps each tile's interval is cut; each divides G.
         span_us: the interval's length.
         weights: (G + 1, 3) of low_pass for an interval cut into so many steps.
-        made: the pixels of the sensor, as the rays are ordered.
+        mismatch: of the pixels of the sensor, as the rays are ordered.
         state: of the pixels, changed.
         depth: (N,) changed.
     """
@@ -96,7 +96,7 @@ def run_tiles(
             start_us, stop_us, done = (k - 1) * span_us / count, k * span_us / count, 0
             while True:
                 done, n = find_crossings(
-                    made, state, light, first, done, weight, start_us, stop_us, Found(t, pixel, p, n)
+                    mismatch, state, light, first, done, weight, start_us, stop_us, EventBuffer(t, pixel, p, n)
                 )
                 if done == light.size:
                     break
@@ -104,4 +104,4 @@ def run_tiles(
                 pixel = np.concatenate((pixel, np.empty_like(pixel)))
                 p = np.concatenate((p, np.empty_like(p)))
         depth[first:stop] = work[DEPTH : DEPTH + stop - first]
-    return Found(t, pixel, p, n)
+    return EventBuffer(t, pixel, p, n)

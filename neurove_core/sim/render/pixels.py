@@ -68,13 +68,13 @@ class Pixels(NamedTuple):
 
     config: PixelConfig
     seed: int
-    made: Mismatch
+    mismatch: Mismatch
     hot: NDArray[np.int64]  # places of those that never rest
 
     @property
     def n(self) -> int:
         """How many there are."""
-        return int(self.made.on.size)
+        return int(self.mismatch.on.size)
 
 
 class PixelState(NamedTuple):
@@ -86,7 +86,7 @@ class PixelState(NamedTuple):
     last_us: NDArray[np.int64]  # (N,) when the last event was
 
 
-class Found(NamedTuple):
+class EventBuffer(NamedTuple):
     """Events of one interval as they are found, pixel after pixel; of M rows the first `n` count."""
 
     t: NDArray[np.int32]  # (M,) from the interval's start [us]
@@ -95,7 +95,7 @@ class Found(NamedTuple):
     n: int
 
     @classmethod
-    def room(cls, rows: int) -> "Found":
+    def empty(cls, rows: int) -> "EventBuffer":
         """None yet, and room for so many."""
         return cls(np.empty(rows, np.int32), np.empty(rows, np.int32), np.empty(rows, np.uint8), 0)
 
@@ -110,10 +110,10 @@ def make_pixels(config: PixelConfig, n: int, seed: int) -> Pixels:
     return Pixels(config, seed, Mismatch(on, off, leak), np.flatnonzero(rng.uniform(size=n) < config.hot_fraction))
 
 
-def at_rest(pixels: Pixels, light: NDArray[np.float32]) -> PixelState:
+def settled_state(pixels: Pixels, light: NDArray[np.float32]) -> PixelState:
     """The pixels after a long past under a first render (N,): each anywhere between its thresholds."""
     rng = np.random.default_rng((pixels.seed, 107))
-    level = light + rng.uniform(-0.999, 0.999, light.size) * np.minimum(pixels.made.on, pixels.made.off)
+    level = light + rng.uniform(-0.999, 0.999, light.size) * np.minimum(pixels.mismatch.on, pixels.mismatch.off)
     never = np.full(light.size, np.iinfo(np.int64).min // 2)
     return PixelState(light.astype(np.float32), light.astype(np.float64), level, never)
 
@@ -136,7 +136,7 @@ def low_pass(cutoff_hz: float, span_us: float) -> tuple[float, float, float]:
 
 @exact
 def find_crossings(
-    made: Mismatch,
+    mismatch: Mismatch,
     state: PixelState,
     light: NDArray[np.float32],
     first: int,
@@ -144,12 +144,12 @@ def find_crossings(
     weights: tuple[float, float, float],
     start_us: float,
     stop_us: float,
-    found: Found,
+    found: EventBuffer,
 ) -> tuple[int, int]:  # pragma: no cover (machine code)
     """Let pixels see a new render, and write down their events until all have seen it or the room is used up.
 
     Args:
-        made: all made.
+        mismatch: of all pixels.
         state: of all of them, changed.
         light: (K,) log intensity now, of the pixels from `first` on.
         first: the pixel that light[0] belongs to.
@@ -168,14 +168,14 @@ def find_crossings(
         i = first + k
         seen = state.seen[i]
         now = weights[0] * seen + weights[1] * state.light[i] + weights[2] * light[k]
-        level, leak = state.level[i], made.leak[i] * span
+        level, leak = state.level[i], mismatch.leak[i] * span
         before, after = seen - level, now - level + leak
         events = 0
-        if after >= made.on[i]:
-            step = made.on[i]
+        if after >= mismatch.on[i]:
+            step = mismatch.on[i]
             events = int(after / step)
-        elif after <= -made.off[i]:
-            step = -made.off[i]
+        elif after <= -mismatch.off[i]:
+            step = -mismatch.off[i]
             events = int(after / step)
         if events:
             if n + events > room:
@@ -194,7 +194,7 @@ def find_crossings(
 
 
 def find_crossings_reference(
-    made: Mismatch,
+    mismatch: Mismatch,
     state: PixelState,
     light: NDArray[np.float32],
     weights: tuple[float, float, float],
@@ -205,7 +205,12 @@ def find_crossings_reference(
     rows, levels, seens = [], [], []
     span = stop_us - start_us
     for i, (was, new) in enumerate(zip(state.light.tolist(), light.tolist(), strict=True)):
-        seen, on, off, leak = float(state.seen[i]), float(made.on[i]), float(made.off[i]), float(made.leak[i])
+        seen, on, off, leak = (
+            float(state.seen[i]),
+            float(mismatch.on[i]),
+            float(mismatch.off[i]),
+            float(mismatch.leak[i]),
+        )
         now = weights[0] * seen + weights[1] * was + weights[2] * new
         level = float(state.level[i])
         before, after = seen - level, now - level + leak * span
@@ -219,7 +224,7 @@ def find_crossings_reference(
     return rows, PixelState(light, np.array(seens), np.array(levels), state.last_us)
 
 
-def add_noise(pixels: Pixels, start_us: int, stop_us: int, found: Found) -> Found:
+def add_noise(pixels: Pixels, start_us: int, stop_us: int, found: EventBuffer) -> EventBuffer:
     """The events, and those that nothing made: shot noise of all pixels, and hot ones'; the same for the same times."""
     config, span = pixels.config, stop_us - start_us
     rng = np.random.default_rng((pixels.seed, 108, start_us & ((1 << 63) - 1)))
@@ -228,7 +233,7 @@ def add_noise(pixels: Pixels, start_us: int, stop_us: int, found: Found) -> Foun
     where = np.concatenate([rng.integers(pixels.n, size=shots), np.repeat(pixels.hot, hot)])
     t, p = rng.integers(span, size=where.size), rng.integers(2, size=where.size)
     n = found.n
-    return Found(
+    return EventBuffer(
         np.append(found.t[:n], t.astype(np.int32)),
         np.append(found.pixel[:n], where.astype(np.int32)),
         np.append(found.p[:n], p.astype(np.uint8)),
@@ -237,9 +242,9 @@ def add_noise(pixels: Pixels, start_us: int, stop_us: int, found: Found) -> Foun
 
 
 @exact
-def put_in_order(
-    found: Found, start_us: int, span_us: int, refractory_us: int, last_us: NDArray[np.int64]
-) -> Found:  # pragma: no cover (machine code)
+def sort_events(
+    found: EventBuffer, start_us: int, span_us: int, refractory_us: int, last_us: NDArray[np.int64]
+) -> EventBuffer:  # pragma: no cover (machine code)
     """The events by time, without those that come too soon after the last of their pixel.
 
     A lost event has moved its pixel's level all the same, as in ESIM.
@@ -271,7 +276,7 @@ def put_in_order(
         last_us[pixel] = t
         out_t[n], out_pixel[n], out_p[n] = found.t[i], pixel, found.p[i]
         n += 1
-    return Found(out_t, out_pixel, out_p, n)
+    return EventBuffer(out_t, out_pixel, out_p, n)
 
 
 def events_of(
@@ -311,23 +316,23 @@ def events_of(
     state = PixelState(*columns)
     weights = low_pass(pixels.config.cutoff_hz, stop_us - start_us)
     flat, span = np.ascontiguousarray(light, np.float32).ravel(), float(stop_us - start_us)
-    found, done = Found.room(4 * flat.size), 0
+    found, done = EventBuffer.empty(4 * flat.size), 0
     while True:
-        done, n = find_crossings(pixels.made, state, flat, 0, done, weights, 0.0, span, found)
+        done, n = find_crossings(pixels.mismatch, state, flat, 0, done, weights, 0.0, span, found)
         found = found._replace(n=n)
         if done == flat.size:
             break
-        found = with_more_room(found)
+        found = with_double_size(found)
     found = add_noise(pixels, start_us, stop_us, found)
-    found = put_in_order(found, start_us, stop_us - start_us, pixels.config.refractory_us, state.last_us)
+    found = sort_events(found, start_us, stop_us - start_us, pixels.config.refractory_us, state.last_us)
     y, x = np.divmod(found.pixel[: found.n], sensor.width)
     return Events.from_columns(found.t[: found.n] + np.int64(start_us), x, y, found.p[: found.n]), state
 
 
-def with_more_room(found: Found) -> Found:
+def with_double_size(found: EventBuffer) -> EventBuffer:
     """The same events, and room for twice as many."""
-    more = Found.room(found.t.size)
-    return Found(
+    more = EventBuffer.empty(found.t.size)
+    return EventBuffer(
         np.concatenate((found.t, more.t)),
         np.concatenate((found.pixel, more.pixel)),
         np.concatenate((found.p, more.p)),

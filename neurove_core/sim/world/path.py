@@ -13,7 +13,7 @@ _SPAN: Final = 200  # positions asked at once
 _STANDING_S: Final = 300.0  # who stands so long is taken to have arrived
 
 
-class Moving(Protocol):
+class CameraPath(Protocol):
     """What a scene and a simulation need of a trajectory; see trajectory.Trajectory."""
 
     @property
@@ -31,7 +31,7 @@ class Moving(Protocol):
         """(N, 6) vx vy vz [m/s] wx wy wz [rad/s] in the optical frame."""
 
 
-class Path:
+class Waypoints:
     """Waypoints of a trajectory on the ground, STEP_M apart; before its start and after its end it goes straight on.
 
     Args:
@@ -39,7 +39,7 @@ class Path:
         reach_m: how much of the way is known before and after where the trajectory is.
     """
 
-    def __init__(self, trajectory: Moving, reach_m: float) -> None:
+    def __init__(self, trajectory: CameraPath, reach_m: float) -> None:
         self._trajectory, self._reach = trajectory, int(np.ceil(reach_m / STEP_M)) * STEP_M
         position, rotation = trajectory.pose(np.zeros(1))
         here = position[0, [0, 2]]

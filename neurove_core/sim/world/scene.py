@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.sim.world.panels import ENDLESS, SKY_COLUMNS, SKY_ROWS, Panels, Sky, box, panel, upright
-from neurove_core.sim.world.path import Moving
+from neurove_core.sim.world.path import CameraPath
 from neurove_core.sim.world.street import BARE, CORRIDOR, STREET, Street
 from neurove_protocol.errors import InvalidField
 
@@ -21,7 +21,7 @@ class Scene(Protocol):
         """All panels that may be seen at this time; asked with times that never run backwards."""
 
 
-class Fixed:
+class FixedScene:
     """A scene that is all there from the beginning."""
 
     def __init__(self, panels: Panels, sky: Sky) -> None:
@@ -32,22 +32,22 @@ class Fixed:
         return self._panels
 
 
-def street(trajectory: Moving, seed: int) -> Scene:
+def street(trajectory: CameraPath, seed: int) -> Scene:
     """Ground with lane lines, houses on both sides with gaps and side streets, parked cars, poles, a skyline."""
     return Street(trajectory, seed, STREET, _skyline(seed, STREET.far))
 
 
-def bare_street(trajectory: Moving, seed: int) -> Scene:
+def bare_street(trajectory: CameraPath, seed: int) -> Scene:
     """The same street on a ground of one plain colour, without lines: nothing on it moves."""
     return Street(trajectory, seed, BARE, _skyline(seed, BARE.far))
 
 
-def corridor(trajectory: Moving, seed: int) -> Scene:
+def corridor(trajectory: CameraPath, seed: int) -> Scene:
     """Ground, ceiling, walls close by, boxes along them."""
     return Street(trajectory, seed, CORRIDOR, Sky(_flat(0.1), 0.1, CORRIDOR.far))
 
 
-def room(trajectory: Moving, seed: int) -> Scene:
+def room(trajectory: CameraPath, seed: int) -> Scene:
     """A textured room around the whole trajectory, with boards and boxes along its walls.
 
     Of a trajectory longer than two minutes it is around those.
@@ -74,10 +74,10 @@ def room(trajectory: Moving, seed: int) -> Scene:
         texture = ("plaster", "posters", "brick", "plaster")[i]
         parts.append(_lowered(upright(start, end, height, texture, repeat_m=3.5), floor))
         parts += [_lowered(part, floor) for part in _furniture(rng, start, end, height)]
-    return Fixed(Panels.join(parts), Sky(_flat(0.3), 0.3, 200.0))
+    return FixedScene(Panels.join(parts), Sky(_flat(0.3), 0.3, 200.0))
 
 
-def plain_room(trajectory: Moving, seed: int) -> Scene:
+def plain_room(trajectory: CameraPath, seed: int) -> Scene:
     """A room of plain walls around the whole trajectory, with a few flat shapes on them: little to see but edges.
 
     Of a trajectory longer than two minutes it is around those.
@@ -96,7 +96,7 @@ def plain_room(trajectory: Moving, seed: int) -> Scene:
             centre = middle + side * size[axis] / 2 * axes[axis]
             parts.append(panel(centre, u, v, sides, "paint", repeat_m=3.0, gain=light * rng.uniform(0.8, 1.0)))
             parts += _shapes(rng, centre, -side * axes[axis], u, v, sides)
-    return Fixed(Panels.join(parts), Sky(_flat(0.3), 0.3, 200.0))
+    return FixedScene(Panels.join(parts), Sky(_flat(0.3), 0.3, 200.0))
 
 
 def _shapes(
@@ -150,16 +150,16 @@ def _lowered(panels: Panels, down_m: float) -> Panels:
     return panels._replace(centre=panels.centre + np.array([0.0, down_m, 0.0]))
 
 
-def wall(trajectory: Moving, seed: int, distance_m: float = 1.0) -> Scene:
+def wall(trajectory: CameraPath, seed: int, distance_m: float = 1.0) -> Scene:
     """One textured plane without end, square to where the camera looks at first, so far from it [m]."""
     position, rotation = trajectory.pose(np.zeros(1))
     right, down, ahead = rotation[0].T
     size, offset = (2 * ENDLESS, 2 * ENDLESS), tuple(np.random.default_rng((seed, 104)).uniform(size=2))
     plane = panel(position[0] + ahead * distance_m, right, down, size, "posters", repeat_m=1.2, offset=offset)
-    return Fixed(plane, Sky(_flat(0.3), 0.3, 1000.0))
+    return FixedScene(plane, Sky(_flat(0.3), 0.3, 1000.0))
 
 
-SCENES: Final[dict[str, Callable[[Moving, int], Scene]]] = {
+SCENES: Final[dict[str, Callable[[CameraPath, int], Scene]]] = {
     "street": street,
     "bare-street": bare_street,
     "corridor": corridor,
@@ -170,7 +170,7 @@ SCENES: Final[dict[str, Callable[[Moving, int], Scene]]] = {
 """Scenes by name: trajectory, as the camera goes, and seed."""
 
 
-def named_scene(name: str) -> Callable[[Moving, int], Scene]:
+def named_scene(name: str) -> Callable[[CameraPath, int], Scene]:
     """The scene of this name.
 
     Raises:

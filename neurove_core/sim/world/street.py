@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.sim.world.panels import ENDLESS, NOTHING, Panels, Sky, box, panel, upright
-from neurove_core.sim.world.path import STEP_M, Moving, Path
+from neurove_core.sim.world.path import STEP_M, CameraPath, Waypoints
 
 BLOCK: Final = 6
 """Waypoints of one block: 12 m of street."""
 
 _FACADES: Final = ("facade", "brick", "plaster", "facade", "foliage", "posters")
-_THINGS: Final = ("metal", "posters", "brick", "foliage")
+_OBJECTS: Final = ("metal", "posters", "brick", "foliage")
 
 
 class Style(NamedTuple):
@@ -23,25 +23,25 @@ class Style(NamedTuple):
     height: tuple[float, float]  # of the walls
     gap: float  # which share of the blocks has none
     clearance: float  # nothing stands nearer to the way
-    things: float  # how many stand beside it, per block and side
+    objects: float  # how many stand beside it, per block and side
     lanes: bool  # lines on the ground
     ceiling: float | None  # how high it is
     ground: float = 9.0  # the ground's texture repeats so often; one as wide as BARE is a plain colour
 
 
 STREET: Final = Style(
-    far=100.0, verge=(4.0, 10.0), height=(4.0, 12.0), gap=0.18, clearance=1.7, things=1.2, lanes=True, ceiling=None
+    far=100.0, verge=(4.0, 10.0), height=(4.0, 12.0), gap=0.18, clearance=1.7, objects=1.2, lanes=True, ceiling=None
 )
 BARE: Final = STREET._replace(lanes=False, ground=1e6)
 """A street whose ground shows nothing: its speed is known to nobody who can not see how far the houses are."""
 
 CORRIDOR: Final = Style(
-    far=50.0, verge=(1.6, 2.4), height=(3.0, 3.0), gap=0.0, clearance=0.9, things=0.25, lanes=False, ceiling=3.0
+    far=50.0, verge=(1.6, 2.4), height=(3.0, 3.0), gap=0.0, clearance=0.9, objects=0.25, lanes=False, ceiling=3.0
 )
 
 
 class Street:
-    """Ground, walls and things along the way of a trajectory; see scene.Scene.
+    """Ground, walls and objects along the way of a trajectory; see scene.Scene.
 
     A block is the same for the same seed and number. Everything that would stand in the way is left out. Where the way
     comes back to a place, the place has changed: a street is no map.
@@ -53,9 +53,9 @@ class Street:
         sky: above it.
     """
 
-    def __init__(self, trajectory: Moving, seed: int, style: Style, sky: Sky) -> None:
+    def __init__(self, trajectory: CameraPath, seed: int, style: Style, sky: Sky) -> None:
         self._trajectory, self._seed, self._style, self.sky = trajectory, seed, style, sky
-        self._path = Path(trajectory, 1.5 * style.far + 2 * BLOCK * STEP_M)
+        self._path = Waypoints(trajectory, 1.5 * style.far + 2 * BLOCK * STEP_M)
         self._blocks: dict[int, Panels] = {}
         self._standing = NOTHING  # all of the blocks
         self._reach = int(1.5 * style.far / STEP_M / BLOCK)
@@ -99,7 +99,7 @@ class Street:
         for side in (-1.0, 1.0):
             out = side * np.array([ahead[1], -ahead[0]])  # to the right for 1: x right, z forward
             parts += self._walls(rng, start, end, out)
-            parts += self._things(rng, start, ahead, out, float(np.linalg.norm(end - start)))
+            parts += self._objects(rng, start, ahead, out, float(np.linalg.norm(end - start)))
         return Panels.join([NOTHING, *(part for part in parts if self._stands_clear(part, way))])
 
     def _lines(self, start: NDArray[np.float64], ahead: NDArray[np.float64]) -> list[Panels]:
@@ -128,7 +128,7 @@ class Street:
             return [upright(a, b, height, texture, repeat_m=repeat, offset=offset), *sides]
         return [upright(a, b, height, texture, repeat_m=repeat, offset=offset)]
 
-    def _things(
+    def _objects(
         self,
         rng: np.random.Generator,
         start: NDArray[np.float64],
@@ -139,9 +139,9 @@ class Street:
         """Parked cars, poles and boxes between the way and the walls."""
         style = self._style
         parts = []
-        for _ in range(rng.poisson(style.things)):
+        for _ in range(rng.poisson(style.objects)):
             at = start + ahead * rng.uniform(0, length)
-            kind, texture, offset = rng.uniform(), str(rng.choice(_THINGS)), (rng.uniform(), rng.uniform())
+            kind, texture, offset = rng.uniform(), str(rng.choice(_OBJECTS)), (rng.uniform(), rng.uniform())
             if style.ceiling:
                 size = (rng.uniform(0.4, 1.0), rng.uniform(0.3, 0.6), rng.uniform(0.4, 1.6))
                 parts.append(box(at + out * (style.clearance + 0.35), ahead, size, texture, offset=offset))

@@ -55,7 +55,7 @@ def test_the_rate_of_a_turning_camera_is_found_within_two_percent_through_its_le
     w = np.array(w)
     found = angular(of_rotation(camera, w, min(0.1, 0.25 / np.linalg.norm(w))), camera)
     assert np.linalg.norm(found.w_rad_s - w) < 0.02 * np.linalg.norm(w)
-    assert found.contrast > 1.2 * found.contrast_at_rest
+    assert found.contrast > 1.2 * found.contrast_stationary
 
 
 @pytest.mark.parametrize("velocity", [(0.35, 0.0), (-0.8, 0.5), (0.1, -1.5)], ids=str)
@@ -63,7 +63,7 @@ def test_the_velocity_over_depth_of_a_sliding_camera_is_found_and_the_image_move
     found = planar(of_slide(ECD, np.array(velocity), 0.1), ECD)
     np.testing.assert_allclose(found.velocity_per_depth, velocity, atol=0.02 * np.linalg.norm(velocity))
     np.testing.assert_allclose(found.flow_px_s, -np.array(velocity) * [ECD.fx, ECD.fy], rtol=0.1, atol=3)
-    assert found.contrast > 1.2 * found.contrast_at_rest
+    assert found.contrast > 1.2 * found.contrast_stationary
 
 
 def test_events_of_all_over_the_place_have_no_contrast_to_gain():
@@ -73,7 +73,7 @@ def test_events_of_all_over_the_place_have_no_contrast_to_gain():
     found = angular(
         Events.from_columns(t, rng.integers(0, 240, n), rng.integers(0, 180, n), rng.integers(0, 2, n)), ECD
     )
-    assert found.contrast < 1.1 * found.contrast_at_rest
+    assert found.contrast < 1.1 * found.contrast_stationary
 
 
 def test_a_search_from_a_given_start_finds_a_motion_too_fast_for_the_usual_starts():
@@ -126,7 +126,7 @@ def test_too_little_to_tell_a_motion_is_refused(estimate):
 def test_a_real_turning_camera_turns_as_another_implementation_says(name, estimate):
     found = angular(*ecd(f"ecd/{name}/events.txt", f"ecd/{name}/calib.txt"))
     assert np.linalg.norm(found.w_rad_s - estimate) < 0.03 * np.linalg.norm(estimate)
-    assert found.contrast > 1.5 * found.contrast_at_rest
+    assert found.contrast > 1.5 * found.contrast_stationary
 
 
 def test_a_real_camera_rests_yaws_left_rests_and_yaws_right():
@@ -146,4 +146,4 @@ def test_the_real_slider_moves_the_image_left_at_its_known_speed_over_the_scenes
     assert found.flow_px_s[0] == pytest.approx(-110, abs=8)
     assert abs(found.flow_px_s[1]) < 10
     assert 0.29 / found.velocity_per_depth[0] == pytest.approx(0.9, abs=0.1)  # depth [m]
-    assert found.contrast > 1.5 * found.contrast_at_rest
+    assert found.contrast > 1.5 * found.contrast_stationary

@@ -1,4 +1,4 @@
-"""A model is judged by what the service would publish, beside the truth of each bin."""
+"""A model is evaluation by what the service would publish, beside the truth of each bin."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import pytest
 
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.estimator import Estimator
-from neurove_core.evaluation.judge import NoTruth, answer, judge, report
+from neurove_core.evaluation.evaluate import NoTruth, estimate_recording, evaluate, report
 from neurove_core.geometry.motion import Twists
 from neurove_core.io import open_source
 from neurove_core.io.packets import slices
@@ -42,7 +42,7 @@ def test_the_answers_are_those_that_the_running_service_publishes(recording, mod
     for seq, piece in enumerate(slices(recording.chunks())):
         packet = EventPacket("cam0", seq, recording.sensor, piece.t0_us, piece.events)
         published += stream.accept(packet, Arrival(0, 0))
-    said = answer(Estimator(model), recording)
+    said = estimate_recording(Estimator(model), recording)
     assert said.start_us.tolist() == [one.start_us for one in published]
     assert said.events.tolist() == [one.events for one in published]
     np.testing.assert_array_equal(said.twists, np.array([one.twists for one in published]))
@@ -51,23 +51,23 @@ def test_the_answers_are_those_that_the_running_service_publishes(recording, mod
 
 
 def test_each_bin_stands_beside_the_truth_of_its_own_time(recording, model):
-    judged = judge(answer(Estimator(model), recording), recording.twists())
-    assert judged.end_us[0] == 510_000  # the first half second is skipped
-    middle = recording.trajectory.twist((judged.end_us - 5_000) / 1e6)
-    np.testing.assert_allclose(judged.truth, middle, atol=2e-3)
+    evaluation = evaluate(estimate_recording(Estimator(model), recording), recording.twists())
+    assert evaluation.end_us[0] == 510_000  # the first half second is skipped
+    middle = recording.trajectory.twist((evaluation.end_us - 5_000) / 1e6)
+    np.testing.assert_allclose(evaluation.truth, middle, atol=2e-3)
 
 
 def test_windows_without_truth_are_left_out_and_none_at_all_is_said(recording, model):
-    said, whole = answer(Estimator(model), recording), recording.twists()
+    said, whole = estimate_recording(Estimator(model), recording), recording.twists()
     part = Twists(whole.t[:901], whole.twist[:901])
-    assert judge(said, part).end_us[-1] == 900_000
+    assert evaluate(said, part).end_us[-1] == 900_000
     with pytest.raises(NoTruth, match="none lies after the first 0.5 s and within the truth"):
-        judge(said, Twists(whole.t[:300], whole.twist[:300]))
+        evaluate(said, Twists(whole.t[:300], whole.twist[:300]))
 
 
 def test_a_model_per_metre_of_height_is_told_by_the_cameras_height(recording, model):
-    per_height = answer(Estimator(replace(model, linear_unit=PER_HEIGHT)), recording)
-    plain = answer(Estimator(model), recording)
+    per_height = estimate_recording(Estimator(replace(model, linear_unit=PER_HEIGHT)), recording)
+    plain = estimate_recording(Estimator(model), recording)
     np.testing.assert_allclose(per_height.twists, plain.twists * [2, 2, 2, 1, 1, 1])
     assert per_height.scaled
 
@@ -95,8 +95,8 @@ def test_a_bundle_keeps_its_linear_unit_and_an_old_one_is_in_metres_per_second(m
 
 
 def test_the_report_has_rows_for_predictors_that_see_nothing(recording, model):
-    judged = judge(answer(Estimator(model), recording), recording.twists())
-    told = report([judged, judged])
+    evaluation = evaluate(estimate_recording(Estimator(model), recording), recording.twists())
+    told = report([evaluation, evaluation])
     assert told["zero"]["re_v_l"] == pytest.approx(1)
     assert told["mean"]["r2_v_l"] == pytest.approx(0, abs=1e-9)
     assert told["windows"] == 2 * told["recordings"][0]["windows"]

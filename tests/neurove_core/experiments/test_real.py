@@ -10,7 +10,7 @@ from neurove_core import models
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.estimator import Estimator
 from neurove_core.evaluation.contrast import angular
-from neurove_core.evaluation.judge import answer
+from neurove_core.evaluation.evaluate import estimate_recording
 from neurove_core.experiments import real
 from neurove_core.io import open_source
 from neurove_core.models import bundle
@@ -61,7 +61,7 @@ def test_a_turning_camera_is_held_against_contrast_maximisation_over_whole_windo
     camera = recording.camera("real")
     first, stop = events.t.searchsorted([50_000, 100_000])
     true = angular(events.span(int(first), int(stop)), camera).w_rad_s
-    said = answer(estimator, recording)
+    said = estimate_recording(estimator, recording)
     found = said.twists[said.start_us.tolist().index(50_000), :, 3:].mean(0)
     assert row["made_of"]["contrast maximisation [rad/s]"] == pytest.approx(true.tolist(), rel=1e-3)
     assert row["made_of"]["estimate [rad/s]"] == pytest.approx(found.tolist())

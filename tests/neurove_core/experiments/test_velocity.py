@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from neurove_core.estimator import Estimator
-from neurove_core.evaluation.judge import answer, judge
+from neurove_core.evaluation.evaluate import estimate_recording, evaluate
 from neurove_core.experiments import real
 from neurove_core.experiments.velocity import report, run
 from neurove_core.experiments.velocity.held_out import (
@@ -101,12 +101,12 @@ def test_a_track_is_what_the_estimator_says_of_the_same_recording(finished):
     model = bundle.load(folder / "nve-0" / "nve-0.safetensors")
     scenario = next(scenario for scenario in held_out_scenarios(quick=True) if scenario.group == "driving")
     track, _ = follow(model, HeldOutCache(folder / "data", experiment.config.model).path(scenario), scenario)
-    judged = judge(answer(Estimator(model), scenario.simulation), scenario.simulation.twists())
-    bins = len(judged.truth)
+    evaluated = evaluate(estimate_recording(Estimator(model), scenario.simulation), scenario.simulation.twists())
+    bins = len(evaluated.truth)
     assert len(track.truth) - bins in (0, 5)  # a recording's last window is closed by an event after it
-    np.testing.assert_allclose(track.estimate[:bins], judged.answer, atol=1e-4)
-    np.testing.assert_allclose(track.truth[:bins], judged.truth, atol=2e-3)
-    np.testing.assert_allclose(track.t_s[:bins] * 1e6, judged.end_us - 5_000)
+    np.testing.assert_allclose(track.estimate[:bins], evaluated.estimate, atol=1e-4)
+    np.testing.assert_allclose(track.truth[:bins], evaluated.truth, atol=2e-3)
+    np.testing.assert_allclose(track.t_s[:bins] * 1e6, evaluated.end_us - 5_000)
     told = found[0].row["recordings"][f"driving: {scenario.name}"]
     assert told["rmse_v_l_m_s"] == pytest.approx(summary([track])["rmse_v_l_m_s"])
 

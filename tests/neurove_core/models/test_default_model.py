@@ -9,12 +9,12 @@ import torch
 from neurove_core import models
 from neurove_core.engine.engine import Engine
 from neurove_core.estimator import Estimator
-from neurove_core.evaluation.judge import answer, judge, report
+from neurove_core.evaluation.evaluate import estimate_recording, evaluate, report
 from neurove_core.io import open_source
 from neurove_core.models import bundle
 from neurove_core.networks.encoding import to_spikes
 from neurove_core.training import data
-from neurove_core.training.batches import regained
+from neurove_core.training.batches import with_gain
 
 
 def test_it_is_trained_small_and_says_how_it_was_made():
@@ -31,7 +31,7 @@ def test_it_is_trained_small_and_says_how_it_was_made():
 def test_it_sees_how_fast_it_drives_from_any_height(height_m):
     source = f"sim://street?seed=7001&seconds=2.5&camera=pinhole:86x65:75&height={height_m}"
     recording = open_source(source)
-    told = report([judge(answer(Estimator(models.find("default")), recording), recording.twists())])
+    told = report([evaluate(estimate_recording(Estimator(models.find("default")), recording), recording.twists())])
     assert told["re_v_l"] < 0.4 < told["zero"]["re_v_l"]
     assert told["rmse_v_a_deg_s"] < 6
     assert told["scaled"]
@@ -74,7 +74,7 @@ def test_it_is_sure_of_a_plain_drive_and_unsure_while_it_sees_nothing_or_little(
     assert flagged[16:].mean() < 0.2
     blank, few = drive.copy(), drive.copy()
     blank[30:] = 0
-    few[30:] = regained(np.random.default_rng(0), few[30:], 0.01)
+    few[30:] = with_gain(np.random.default_rng(0), few[30:], 0.01)
     for counts, wider in ((blank, 1.2), (few, 1.4)):  # a window without events is flagged low_activity besides
         sigma, _, _ = claimed(counts)
         assert (sigma[:30] == usual[:30]).all()

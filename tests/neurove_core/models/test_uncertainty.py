@@ -14,7 +14,7 @@ from neurove_core.models import bundle
 from neurove_core.models.bundle import PER_HEIGHT
 from neurove_core.models.uncertainty import Uncertainty, coverage, half_width
 from neurove_core.training import calibration
-from neurove_core.training.calibration import Watched, fitted, laplace_scale, seen_in_all_ways
+from neurove_core.training.calibration import SequenceErrors, laplace_scale, variants_of, with_uncertainty
 from neurove_core.training.config import TrainingConfig
 from neurove_protocol import CameraInfo, Sensor
 from neurove_protocol.errors import BadModel, InvalidField
@@ -34,18 +34,18 @@ TWO_METRES = CameraInfo(stream="c", width=20, height=16, lens="pinhole", fx=9, f
 def wild(rng, sequences, windows=60):
     """A model whose errors, unknown to it, grow with what its first unit says; and each sequence has a bias."""
     for number in range(sequences):
-        for seen in calibration.SEEN:
+        for seen in calibration.VARIANTS:
             inputs = np.concatenate([rng.normal(size=(windows, HIDDEN)), np.full((windows, 1), STEADY)], 1)
             size = np.exp(0.8 * inputs[:, 0] - 1)[:, None, None] * [1, 2, 3, 1, 2, 3]
             error = size * (rng.normal(size=(windows, 2, 6)) + 0.2 * rng.normal(size=6))
             error[..., 4] -= 0.8 * error[..., 0]
-            yield Watched(inputs, error, number, seen, hard=number % 4 == 3)
+            yield SequenceErrors(inputs, error, number, seen, hard=number % 4 == 3)
 
 
 @pytest.fixture(scope="module")
 def made():
     model = replace(bundle.untrained(1, SMALL), linear_unit=PER_HEIGHT, scale=torch.tensor([2.0] * 3 + [0.5] * 3))
-    return fitted(model, list(wild(np.random.default_rng(0), 40)), "a test")
+    return with_uncertainty(model, list(wild(np.random.default_rng(0), 40)), "a test")
 
 
 def answers(model, camera=TWO_METRES):
@@ -84,7 +84,7 @@ def test_intervals_of_a_fitted_model_hold_what_they_claim_on_sequences_it_never_
 
 def test_the_report_tells_coverage_by_axis_of_each_way_of_seeing(made):
     groups = made.report["groups"]
-    assert set(groups) == set(calibration.SEEN) | {f"hard scenes, {seen}" for seen in calibration.SEEN}
+    assert set(groups) == set(calibration.VARIANTS) | {f"hard scenes, {seen}" for seen in calibration.VARIANTS}
     assert groups["as it is"]["vz"]["0.9"] == pytest.approx(0.9, abs=0.01)
     assert groups["as it is"]["vz"]["0.99"] > groups["as it is"]["vz"]["0.5"]
 
@@ -102,7 +102,7 @@ def test_calibrating_changes_no_answer_and_doing_it_again_replaces_it(made):
         np.testing.assert_allclose(one.twists, other.twists, rtol=1e-6)
         assert (one.covariance, one.uncertain) == (None, False)
         assert other.covariance is not None
-    again = fitted(made.bundle, list(wild(np.random.default_rng(0), 40)), "a test")
+    again = with_uncertainty(made.bundle, list(wild(np.random.default_rng(0), 40)), "a test")
     assert again.bundle.digest == made.bundle.digest
 
 
@@ -110,7 +110,7 @@ def test_a_golden_test_is_that_of_the_calibrated_model(tmp_path):
     before = replace(bundle.untrained(1, SMALL), linear_unit=PER_HEIGHT, scale=torch.tensor([2.0] * 3 + [0.5] * 3))
     counts = np.random.default_rng(0).poisson(0.4, (5, 4, 8, 10)).astype(np.uint8)
     wrong = self_test.record(Estimator(before), counts, 0.03)._replace(twists=np.zeros((5, 2, 6), np.float32))
-    after = fitted(replace(before, golden=wrong), list(wild(np.random.default_rng(0), 16)), "a test").bundle
+    after = with_uncertainty(replace(before, golden=wrong), list(wild(np.random.default_rng(0), 16)), "a test").bundle
     bundle.save(after, tmp_path / "a.safetensors")
     loaded = bundle.load(tmp_path / "a.safetensors")
     np.testing.assert_array_equal(self_test.answers(Estimator(loaded), counts), loaded.golden.twists)
@@ -131,7 +131,7 @@ def test_a_covariance_is_symmetric_positive_definite_and_grows_with_the_square_o
 def test_streams_that_are_answered_together_have_the_covariances_of_each_alone(precision):
     config = SMALL.model_copy(update={"network": SMALL.network.model_copy(update={"precision": precision})})
     model = replace(bundle.untrained(1, config), linear_unit=PER_HEIGHT)
-    estimator = Estimator(fitted(model, list(wild(np.random.default_rng(0), 16)), "a test").bundle)
+    estimator = Estimator(with_uncertainty(model, list(wild(np.random.default_rng(0), 16)), "a test").bundle)
     estimator.warm_up()
     seen = [make_events(3_000, sensor=SENSOR, duration_us=60_000, seed=seed) for seed in range(3)]
     pushes = [Push(events, estimator.initial_state(SENSOR, TWO_METRES), 60_000) for events in seen]
@@ -190,13 +190,13 @@ def test_a_bundle_of_another_camera_or_unit_is_not_calibrated(made, tmp_path):
     with pytest.raises(BadModel, match="linear_unit='m/s'"):
         calibration.calibrate(replace(made.bundle, linear_unit="m/s"), TrainingConfig(model=SMALL), tmp_path)
     with pytest.raises(InvalidField, match="sequences=15: at least 16"):
-        calibration.kinds(TrainingConfig(), 15)
+        calibration.calibration_sets(TrainingConfig(), 15)
 
 
 def test_a_sequence_is_seen_as_it_is_with_holes_with_few_events_and_with_many():
     rng = np.random.default_rng(3)
     counts = rng.integers(0, 4, (60, 4, 5, 6)).astype(np.uint8)
-    plain, holes, few, many = (way for way, _ in seen_in_all_ways(rng, counts, np.ones((60, 2, 6), np.float32)))
+    plain, holes, few, many = (way for way, _ in variants_of(rng, counts, np.ones((60, 2, 6), np.float32)))
     assert (plain == counts).all()
     empty = (holes == 0).all(axis=(1, 2, 3))
     assert 0 < empty.sum() < 60

@@ -11,7 +11,7 @@ from torch import nn
 from neurove_core import self_test
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.estimator import Estimator, Push
-from neurove_core.evaluation.judge import answer, judge, report
+from neurove_core.evaluation.evaluate import estimate_recording, evaluate, report
 from neurove_core.io import open_source
 from neurove_core.models import bundle
 from neurove_core.models.bundle import PER_HEIGHT
@@ -95,8 +95,8 @@ def test_a_bundle_keeps_its_kind_and_serves(kind, tmp_path):
     assert (loaded.config.kind, type(loaded.network)) == (kind, type(made.network))
     estimator, recording = Estimator(replace(loaded, linear_unit=PER_HEIGHT)), open_source(SOURCE)
     estimator.warm_up()
-    said = answer(estimator, recording)
-    told = report([judge(said, recording.twists())])
+    said = estimate_recording(estimator, recording)
+    told = report([evaluate(said, recording.twists())])
     assert np.isfinite(said.twists).all()
     assert (told["firing_rate"] is None) == (kind == "ann")
     layers = {"neurove": {"block 1", "block 2", "cell 1", "cell 2"}, "snn-ang": {"block 1", "block 2"}, "ann": set()}

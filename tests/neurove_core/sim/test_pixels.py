@@ -6,15 +6,15 @@ from pydantic import ValidationError
 
 from neurove_core.sim.render.pixels import (
     QUIET,
-    Found,
+    EventBuffer,
     PixelConfig,
     PixelState,
-    at_rest,
     events_of,
     find_crossings,
     find_crossings_reference,
     low_pass,
     make_pixels,
+    settled_state,
 )
 from neurove_protocol import Sensor
 from neurove_protocol.errors import InvalidField, TimeBackwards
@@ -32,7 +32,7 @@ def quiet(**changes: float) -> PixelConfig:
 def film(config: PixelConfig, frames: np.ndarray, seed: int = 0, period_us: int = FRAME_US):
     """Events of frames (T, H, W) of log intensity, in order, and the last state."""
     pixels = make_pixels(config, N, seed)
-    state = at_rest(pixels, frames[0].astype(np.float32).ravel())
+    state = settled_state(pixels, frames[0].astype(np.float32).ravel())
     parts, levels = [], [state.level]
     for k, frame in enumerate(frames[1:]):
         events, state = events_of(pixels, state, frame, k * period_us, (k + 1) * period_us, SENSOR)
@@ -55,14 +55,14 @@ def test_the_compiled_pixels_do_bit_for_bit_what_the_plain_ones_do(seed, cutoff_
     rng = np.random.default_rng(seed)
     pixels = make_pixels(config, N, seed)
     light = rng.normal(-1, 1, N).astype(np.float32)
-    state = plain = at_rest(pixels, light)
+    state = plain = settled_state(pixels, light)
     state = PixelState(*(column.copy() for column in state))
     for _ in range(5):
         light = (light + rng.normal(0, 0.5, N)).astype(np.float32)
         weights = low_pass(config.cutoff_hz, 700.0)
-        found = Found.room(100 * N)
-        done, n = find_crossings(pixels.made, state, light, 0, 0, weights, 300.0, 1000.0, found)
-        rows, plain = find_crossings_reference(pixels.made, plain, light, weights, 300.0, 1000.0)
+        found = EventBuffer.empty(100 * N)
+        done, n = find_crossings(pixels.mismatch, state, light, 0, 0, weights, 300.0, 1000.0, found)
+        rows, plain = find_crossings_reference(pixels.mismatch, plain, light, weights, 300.0, 1000.0)
         assert done == N
         assert n == len(rows) > 100
         np.testing.assert_array_equal(np.stack([found.t[:n], found.pixel[:n], found.p[:n]], 1), rows)
@@ -74,12 +74,12 @@ def test_pixels_that_find_no_room_go_on_where_they_stopped():
     pixels = make_pixels(QUIET, N, 0)
     light = np.zeros(N, np.float32)
     jump = np.linspace(-3, 3, N).astype(np.float32)
-    whole, state = Found.room(100 * N), at_rest(pixels, light)
-    _, n = find_crossings(pixels.made, state, jump, 0, 0, (0.0, 0.0, 1.0), 0.0, 900.0, whole)
-    state, done, rows = at_rest(pixels, light), 0, []
+    whole, state = EventBuffer.empty(100 * N), settled_state(pixels, light)
+    _, n = find_crossings(pixels.mismatch, state, jump, 0, 0, (0.0, 0.0, 1.0), 0.0, 900.0, whole)
+    state, done, rows = settled_state(pixels, light), 0, []
     while done < N:
-        little = Found.room(100)
-        done, some = find_crossings(pixels.made, state, jump, 0, done, (0.0, 0.0, 1.0), 0.0, 900.0, little)
+        little = EventBuffer.empty(100)
+        done, some = find_crossings(pixels.mismatch, state, jump, 0, done, (0.0, 0.0, 1.0), 0.0, 900.0, little)
         rows += list(zip(little.t[:some], little.pixel[:some], strict=True))
     assert rows == list(zip(whole.t[:n], whole.pixel[:n], strict=True))
 
@@ -91,10 +91,10 @@ def test_events_times_threshold_add_up_to_the_change_of_log_intensity(seed):
     total = np.zeros(N)
     for events in parts:
         where = events.y.astype(int) * SENSOR.width + events.x
-        np.add.at(total, where, np.where(events.p > 0, pixels.made.on[where], -pixels.made.off[where]))
+        np.add.at(total, where, np.where(events.p > 0, pixels.mismatch.on[where], -pixels.mismatch.off[where]))
     changed = (frames[-1] - frames[0]).ravel()
     np.testing.assert_allclose(levels[-1] - levels[0], total, atol=1e-6)
-    assert (np.abs(total - changed) <= pixels.made.on + pixels.made.off + 1e-5).all()
+    assert (np.abs(total - changed) <= pixels.mismatch.on + pixels.mismatch.off + 1e-5).all()
 
 
 @pytest.mark.parametrize("contrast", [1.0, 2.0, 4.0])
@@ -182,7 +182,7 @@ def test_the_same_seed_gives_the_same_events_and_another_others():
 
 def test_one_step_leaves_the_state_it_was_given_as_it_was():
     pixels = make_pixels(QUIET, N, 0)
-    state = at_rest(pixels, np.zeros(N, np.float32))
+    state = settled_state(pixels, np.zeros(N, np.float32))
     kept = [column.copy() for column in state]
     events_of(pixels, state, np.ones((SENSOR.height, SENSOR.width)), 0, 1000, SENSOR)
     for before, after in zip(kept, state, strict=True):
@@ -213,5 +213,5 @@ def test_a_threshold_not_above_zero_is_refused_by_name_value_and_bound(field, va
 def test_a_frame_that_does_not_fit_is_refused(frame, stop_us, error, field):
     pixels = make_pixels(QUIET, N, 0)
     with pytest.raises(error) as caught:
-        events_of(pixels, at_rest(pixels, np.zeros(N, np.float32)), frame, 0, stop_us, SENSOR)
+        events_of(pixels, settled_state(pixels, np.zeros(N, np.float32)), frame, 0, stop_us, SENSOR)
     assert field is None or caught.value.details["field"] == field

@@ -59,7 +59,7 @@ def differences(trajectory: Trajectory, t: np.ndarray, dt: float) -> np.ndarray:
     """Twist by central differences of the pose, of fourth order."""
 
     def screw(by: float) -> np.ndarray:
-        (p0, q0), (p1, q1) = trajectory.placed(t), trajectory.placed(t + by)
+        (p0, q0), (p1, q1) = trajectory.position_orientation(t), trajectory.position_orientation(t + by)
         back = rotations.inverse(q0)
         return np.concatenate([rotations.turn(back, p1 - p0), rotations.log(rotations.product(back, q1))], axis=1)
 

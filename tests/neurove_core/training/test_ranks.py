@@ -18,10 +18,10 @@ from neurove_core.networks.state import detached
 from neurove_core.training import data
 from neurove_core.training.batches import Segment, draw
 from neurove_core.training.config import TrainingConfig
-from neurove_core.training.loop import CHECKPOINT, RUN_JSON, descend, errors, learn, learning_rate, train
+from neurove_core.training.loop import CHECKPOINT, RUN_JSON, learning_rate, losses, train, train_segment, train_to_end
 from neurove_core.training.loss import scaled_sum
-from neurove_core.training.ranks import ALONE, LostRank, SharedNorm, device_of, together
-from neurove_core.training.run import Run
+from neurove_core.training.ranks import ALONE, LostRank, SharedNorm, device_of, process_group
+from neurove_core.training.run import TrainingRun
 from neurove_protocol.errors import BadModel, InvalidField
 from tests.neurove_core.training.test_training import TINY
 
@@ -64,13 +64,13 @@ def part(segment: Segment, first: int, stop: int) -> Segment:
 def learn_apart(config, paths, out, ranks):
     """What each rank does in the test below: an update on its half of one batch, then a whole run."""
     sequences = data.Sequences(paths)
-    run = Run.begin(one_update(config), sequences, ranks)
+    run = TrainingRun.begin(one_update(config), sequences, ranks)
     batch = draw(np.random.default_rng(5), sequences, run.config.recipe)
-    learn(run, part(batch, 2 * ranks.rank, 2 * ranks.rank + 2))
+    train_segment(run, part(batch, 2 * ranks.rank, 2 * ranks.rank + 2))
     kept = {f"gradient.{name}": tensor.grad for name, tensor in run.network.named_parameters()}
     kept |= {f"once.{name}": tensor.clone() for name, tensor in run.network.state_dict().items()}
-    run = Run.begin(config, sequences, ranks)
-    descend(run, sequences, out)
+    run = TrainingRun.begin(config, sequences, ranks)
+    train_to_end(run, sequences, out)
     kept |= run.network.state_dict() | {"curve": torch.tensor([list(point.values())[:4] for point in run.curve])}
     kept = {name: tensor.contiguous() for name, tensor in kept.items()}
     safetensors.torch.save_file(kept, out / f"rank-{ranks.rank}.safetensors")
@@ -78,13 +78,13 @@ def learn_apart(config, paths, out, ranks):
 
 def test_two_processes_take_the_step_that_one_takes_and_end_with_the_same_bits(sequences, tmp_path):
     arguments = (CONFIG, sequences.paths, tmp_path)
-    with together(2, "cpu", learn_apart, arguments) as ranks:
+    with process_group(2, "cpu", learn_apart, arguments) as ranks:
         learn_apart(*arguments, ranks)
     one, other = (safetensors.torch.load_file(tmp_path / f"rank-{rank}.safetensors") for rank in (0, 1))
     assert one.keys() == other.keys()
     assert all(torch.equal(tensor, other[name]) for name, tensor in one.items())
-    alone = Run.begin(one_update(CONFIG), sequences)
-    learn(alone, draw(np.random.default_rng(5), sequences, alone.config.recipe))
+    alone = TrainingRun.begin(one_update(CONFIG), sequences)
+    train_segment(alone, draw(np.random.default_rng(5), sequences, alone.config.recipe))
     for name, parameter in alone.network.named_parameters():
         torch.testing.assert_close(one[f"gradient.{name}"], parameter.grad, rtol=1e-3, atol=1e-5)
     for name, buffer in alone.network.named_buffers():
@@ -118,7 +118,7 @@ def test_a_run_whose_second_process_dies_goes_on_to_where_it_would_have_come(fol
 
 def test_one_process_learns_what_the_recipe_says_bit_for_bit(folder, sequences, tmp_path):
     """The loop written out plainly, without ranks."""
-    run = Run.begin(CONFIG, sequences)
+    run = TrainingRun.begin(CONFIG, sequences)
     network, optimiser, rng, balance = run.network, run.optimiser, run.rng, run.balance
     for step in range(0, RECIPE.steps, RECIPE.chunks):
         segment, state = draw(rng, sequences, RECIPE), network.initial_state(RECIPE.batch)
@@ -126,7 +126,7 @@ def test_one_process_learns_what_the_recipe_says_bit_for_bit(folder, sequences, 
             windows = slice(2 * chunk, 2 * chunk + 2)
             optimiser.param_groups[0]["lr"] = learning_rate(step + chunk, RECIPE)
             answers, state = network(to_spikes(segment.counts[windows], "log1p"), state)
-            loss, balance = scaled_sum(*errors(run, answers, segment, windows), balance, RECIPE.balance_decay)
+            loss, balance = scaled_sum(*losses(run, answers, segment, windows), balance, RECIPE.balance_decay)
             optimiser.zero_grad()
             loss.backward()
             nn.utils.clip_grad_norm_(network.parameters(), RECIPE.clip_norm)

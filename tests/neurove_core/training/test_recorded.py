@@ -11,9 +11,9 @@ from neurove_core.training import config as configs
 from neurove_core.training import data
 from neurove_core.training.batches import draw
 from neurove_core.training.config import DataConfig, TrainingConfig
-from neurove_core.training.loop import learn, train
-from neurove_core.training.recorded import Recorded, pieces
-from neurove_core.training.run import Run
+from neurove_core.training.loop import train, train_segment
+from neurove_core.training.recorded import RecordedSequences, split_recording
+from neurove_core.training.run import TrainingRun
 from neurove_protocol.errors import InvalidField
 from tests.builders import make_events
 from tests.neurove_core.training.test_training import MODEL, TINY
@@ -46,7 +46,7 @@ def ecd(tmp_path):
 
 def test_a_recorded_simulation_gives_the_sequences_of_the_simulation(ours, tmp_path):
     config = learning_from(str(ours))
-    recorded = Recorded(tmp_path, config)
+    recorded = RecordedSequences(tmp_path, config)
     assert recorded.missing() == 1
     assert list(recorded.fill()) == ["drive.mcap"]
     learned, simulated = data.Sequences(recorded.paths()), data.sequence_of(open_source(SOURCE), MODEL)
@@ -59,13 +59,13 @@ def test_a_recorded_simulation_gives_the_sequences_of_the_simulation(ours, tmp_p
 
 
 def test_what_was_cut_is_not_cut_again_until_something_of_it_changes(ours, tmp_path):
-    assert list(Recorded(tmp_path, learning_from(str(ours))).fill())
-    assert not list(Recorded(tmp_path, learning_from(str(ours))).fill())
-    assert Recorded(tmp_path, learning_from({"source": str(ours), "height_m": 3.0})).missing() == 1
-    assert Recorded(tmp_path, learning_from(SOURCE)).missing() == 1
+    assert list(RecordedSequences(tmp_path, learning_from(str(ours))).fill())
+    assert not list(RecordedSequences(tmp_path, learning_from(str(ours))).fill())
+    assert RecordedSequences(tmp_path, learning_from({"source": str(ours), "height_m": 3.0})).missing() == 1
+    assert RecordedSequences(tmp_path, learning_from(SOURCE)).missing() == 1
     copy = tmp_path / "drive.mcap"
     write_mcap(open_source(SOURCE.replace("seed=3", "seed=4")), copy)
-    assert Recorded(tmp_path, learning_from(str(copy))).missing() == 1
+    assert RecordedSequences(tmp_path, learning_from(str(copy))).missing() == 1
 
 
 def test_sequences_simulated_before_there_were_recordings_stay_valid(tmp_path):
@@ -77,7 +77,7 @@ def test_sequences_simulated_before_there_were_recordings_stay_valid(tmp_path):
 
 def test_a_model_learns_from_recordings_alone_and_says_so(ours, tmp_path):
     config = learning_from(str(ours))
-    list(Recorded(tmp_path, config).fill())
+    list(RecordedSequences(tmp_path, config).fill())
     made = bundle.load(train(config, tmp_path / "out", tmp_path))
     assert "0 simulated sequences" in made.provenance
     assert "1 recordings (drive.mcap)" in made.provenance
@@ -87,18 +87,18 @@ def test_a_folder_is_the_recordings_in_it(ours, ecd, tmp_path):
     (tmp_path / "notes.md").write_text("no recording")
     write_mcap(open_source(SOURCE), tmp_path / "a.mcap")
     config = learning_from({"source": str(tmp_path), "height_m": 1.5})
-    assert list(Recorded(tmp_path / "data", config).fill()) == ["a.mcap", "slider"]
+    assert list(RecordedSequences(tmp_path / "data", config).fill()) == ["a.mcap", "slider"]
     with pytest.raises(InvalidField, match="holds 2 recordings; name each"):
-        Recorded(tmp_path, learning_from({"source": str(tmp_path), "truth": "poses.txt"}))
+        RecordedSequences(tmp_path, learning_from({"source": str(tmp_path), "truth": "poses.txt"}))
     (tmp_path / "empty").mkdir()
     with pytest.raises(UnknownSource, match="nor a folder that holds some"):
-        Recorded(tmp_path, learning_from(str(tmp_path / "empty")))
+        RecordedSequences(tmp_path, learning_from(str(tmp_path / "empty")))
 
 
 def test_linear_truth_needs_the_cameras_height(ecd, tmp_path):
     with pytest.raises(InvalidField, match=r"data.recordings.0.height_m=None: .* how high its camera is"):
-        Recorded(tmp_path, learning_from(str(ecd)))
-    recorded = Recorded(tmp_path, learning_from({"source": str(ecd), "height_m": 2.0}))
+        RecordedSequences(tmp_path, learning_from(str(ecd)))
+    recorded = RecordedSequences(tmp_path, learning_from({"source": str(ecd), "height_m": 2.0}))
     list(recorded.fill())
     learned = data.Sequences(recorded.paths())
     np.testing.assert_allclose(learned.twists[0], np.tile([0.5, 0, 0, 0, 0, 0], (10, 5, 1)), atol=1e-4)
@@ -108,15 +108,15 @@ def test_linear_truth_needs_the_cameras_height(ecd, tmp_path):
 def test_poses_in_a_file_are_a_truth(ecd, tmp_path):
     truth = (ecd / "groundtruth.txt").rename(tmp_path / "poses.txt")
     with pytest.raises(InvalidField, match=r"data.recordings.0.truth=None: .* holds no truth"):
-        Recorded(tmp_path, learning_from({"source": str(ecd), "height_m": 2.0}))
+        RecordedSequences(tmp_path, learning_from({"source": str(ecd), "height_m": 2.0}))
     given = {"source": str(ecd), "height_m": 2.0, "truth": str(truth)}
-    assert list(Recorded(tmp_path, learning_from(given)).fill()) == ["slider"]
+    assert list(RecordedSequences(tmp_path, learning_from(given)).fill()) == ["slider"]
 
 
 def test_what_can_not_be_learned_from_is_refused_with_its_field(ours, tmp_path):
     with pytest.raises(InvalidField, match="never ends"):
-        Recorded(tmp_path, learning_from("sim://street"))
-    short = Recorded(tmp_path, learning_from(SOURCE.replace("1.3", "0.3")))
+        RecordedSequences(tmp_path, learning_from("sim://street"))
+    short = RecordedSequences(tmp_path, learning_from(SOURCE.replace("1.3", "0.3")))
     with pytest.raises(InvalidField, match=r"data.recordings.0.source=.*at most 5 windows in a row"):
         list(short.fill())
     with pytest.raises(ValueError, match="nothing to learn from"):
@@ -132,17 +132,17 @@ def test_a_truth_of_some_axes_is_learned_from_and_the_others_do_not_pull(ours, t
     only_x = np.full_like(truth.twist, np.nan)
     only_x[:, 3] = truth.twist[:, 3]
     only_x[truth.t > 1_000_000, 3] = np.nan
-    some = list(pieces(recording, Twists(truth.t, only_x), 1.0, config))
+    some = list(split_recording(recording, Twists(truth.t, only_x), 1.0, config))
     assert [len(one.twists) for one in some] == [10, 10]  # beyond 1 s nothing is known
-    full = list(pieces(recording, truth, 1.0, config))
+    full = list(split_recording(recording, truth, 1.0, config))
     paths = [tmp_path / f"{index}.safetensors" for index in range(4)]
     for path, one in zip(paths, some + full[:2], strict=True):
         data.save(one, path)
     mixed = data.Sequences(paths)
-    run = Run.begin(config, mixed)
-    losses = learn(run, draw(np.random.default_rng(0), mixed, config.recipe))
+    run = TrainingRun.begin(config, mixed)
+    losses = train_segment(run, draw(np.random.default_rng(0), mixed, config.recipe))
     assert np.isfinite(losses).all()
     assert all(torch.isfinite(parameter).all() for parameter in run.network.parameters())
     alone = data.Sequences(paths[:2])
     with pytest.raises(InvalidField, match="none of them has a truth of the linear velocity"):
-        Run.begin(config, alone)
+        TrainingRun.begin(config, alone)

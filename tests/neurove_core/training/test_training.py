@@ -22,22 +22,22 @@ from neurove_core.sim.world.scene import named_scene
 from neurove_core.training import config as configs
 from neurove_core.training import data
 from neurove_core.training.batches import (
-    at_rest,
     backwards,
     doubled,
     draw,
     lopsided,
     mirrored,
-    noisy,
     polarity_flipped,
-    regained,
+    stationary,
     thinned,
-    with_holes,
+    with_gain,
+    with_gaps,
     with_hot_pixels,
+    with_noise,
 )
 from neurove_core.training.config import DataConfig, RecipeConfig, TrainingConfig
-from neurove_core.training.loop import CHECKPOINT, RUN_JSON, golden_windows, learn, learning_rate, train
-from neurove_core.training.run import Run
+from neurove_core.training.loop import CHECKPOINT, RUN_JSON, golden_windows, learning_rate, train, train_segment
+from neurove_core.training.run import TrainingRun
 from neurove_protocol import Events
 from neurove_protocol.errors import BadModel, InvalidField
 
@@ -70,7 +70,7 @@ def longer(steps):
 
 
 def test_a_sequence_has_the_counts_that_the_service_sees_and_the_truth_of_each_bin():
-    simulation = data.drawn(TINY.data, 0)
+    simulation = data.draw_simulation(TINY.data, 0)
     sequence = data.sequence_of(simulation, MODEL)
     assert sequence.counts.shape == (10, 10, 16, 22)
     assert sequence.twists.shape == (10, 5, 6)
@@ -92,10 +92,10 @@ def test_a_sequence_has_the_counts_that_the_service_sees_and_the_truth_of_each_b
 
 
 def test_sequences_are_drawn_by_seed_and_number_alone():
-    first, again, other = (data.drawn(TINY.data, index) for index in (1, 1, 2))
+    first, again, other = (data.draw_simulation(TINY.data, index) for index in (1, 1, 2))
     assert (first.name, first.pixels, first.lens) == (again.name, again.pixels, again.lens)
     assert first.pixels != other.pixels
-    heights = [data.drawn(DataConfig(seconds=0.5), index).lens.height_m for index in range(20)]
+    heights = [data.draw_simulation(DataConfig(seconds=0.5), index).lens.height_m for index in range(20)]
     assert 0.3 <= min(heights) < 0.8 < 1.5 < max(heights) <= 2.5
 
 
@@ -180,7 +180,7 @@ def test_a_count_that_is_doubled_does_not_wrap():
 def test_each_way_of_a_hand_moves_and_turns_as_its_name_says(way):
     config = DataConfig(seconds=2.0, scenes={"room": 1.0}, hands={way: 1.0})
     for index in range(3):
-        twist = data.drawn(config, index).trajectory.twist(np.linspace(0, 2, 50))
+        twist = data.draw_simulation(config, index).trajectory.twist(np.linspace(0, 2, 50))
         speed, rate = np.linalg.norm(twist[:, :3], axis=1).max(), np.linalg.norm(twist[:, 3:], axis=1).max()
         assert (speed > 1e-3) == (way in ("waved", "slid"))
         assert (rate > 1e-3) == (way != "slid")
@@ -190,16 +190,16 @@ def test_gain_and_noise_change_the_mean_as_told_and_never_wrap():
     rng = np.random.default_rng(0)
     counts = rng.poisson(0.5, (20, 4, 30, 30)).astype(np.uint8)
     for gain in (0.5, 3.0):
-        assert regained(rng, counts, gain).mean() == pytest.approx(gain * counts.mean(), rel=0.02)
-    assert noisy(rng, counts, 0.1).mean() == pytest.approx(counts.mean() + 0.1, rel=0.02)
+        assert with_gain(rng, counts, gain).mean() == pytest.approx(gain * counts.mean(), rel=0.02)
+    assert with_noise(rng, counts, 0.1).mean() == pytest.approx(counts.mean() + 0.1, rel=0.02)
     full = np.full((1, 2, 10, 10), 255, np.uint8)
-    assert (regained(rng, full, 4.0) == 255).all()
-    assert (noisy(rng, full, 5.0) == 255).all()
+    assert (with_gain(rng, full, 4.0) == 255).all()
+    assert (with_noise(rng, full, 5.0) == 255).all()
 
 
 def test_a_camera_at_rest_sees_noise_whose_pixels_differ_and_no_motion(sequences):
     rng = np.random.default_rng(3)
-    noise = at_rest(rng, (40, 10, 16, 22), 0.3)
+    noise = stationary(rng, (40, 10, 16, 22), 0.3)
     assert noise.dtype == np.uint8
     assert noise.mean() == pytest.approx(0.3, rel=0.1)
     rates = noise.reshape(200, 2, 16, 22).mean(axis=0)
@@ -215,7 +215,7 @@ def test_holes_come_after_something_was_seen_and_the_camera_moves_on_through_the
     counts = np.random.default_rng(1).integers(1, 9, (48, 4, 5, 6), np.uint8)
     rng, lengths = np.random.default_rng(0), []
     for _ in range(50):
-        seen = with_holes(rng, counts, recipe)
+        seen = with_gaps(rng, counts, recipe)
         empty = ~seen.any(axis=(1, 2, 3))
         assert (seen[~empty] == counts[~empty]).all()
         assert empty.any()
@@ -310,7 +310,7 @@ def test_a_run_begins_from_a_model_where_one_is_given(folder, sequences, tmp_pat
     first = bundle.load(train(TINY, tmp_path / "first", folder))
     network = MODEL.network.model_copy(update={"precision": "int8", "surrogate": "arctan"})
     config = TINY.model_copy(update={"model": MODEL.model_copy(update={"network": network, "settle_windows": 3})})
-    run = Run.begin(config, sequences, start=first)
+    run = TrainingRun.begin(config, sequences, start=first)
     weights = run.network.state_dict()
     assert all(torch.equal(tensor, weights[name]) for name, tensor in first.network.state_dict().items())
     assert torch.equal(run.scale, first.scale)
@@ -326,7 +326,7 @@ def test_a_run_begins_from_a_model_where_one_is_given(folder, sequences, tmp_pat
 def test_a_model_with_a_measure_of_its_errors_is_begun_from_without_it(folder, sequences, tmp_path):
     first = bundle.load(train(TINY, tmp_path, folder))
     first.network.add_spread()
-    assert Run.begin(TINY, sequences, start=first).network.spread is None
+    assert TrainingRun.begin(TINY, sequences, start=first).network.spread is None
 
 
 @pytest.mark.parametrize(
@@ -340,12 +340,12 @@ def test_a_model_with_a_measure_of_its_errors_is_begun_from_without_it(folder, s
 def test_a_run_does_not_begin_from_a_model_of_another_shape(sequences, change, why):
     start = replace(bundle.untrained(config=MODEL), linear_unit=bundle.PER_HEIGHT)
     with pytest.raises(BadModel, match=why):
-        Run.begin(TINY.model_copy(update={"model": MODEL.model_copy(update=change)}), sequences, start=start)
+        TrainingRun.begin(TINY.model_copy(update={"model": MODEL.model_copy(update=change)}), sequences, start=start)
 
 
 def test_a_run_does_not_begin_from_a_model_that_answers_in_another_unit(sequences):
     with pytest.raises(BadModel, match="linear_unit='m/s'"):
-        Run.begin(TINY, sequences, start=bundle.untrained(config=MODEL))
+        TrainingRun.begin(TINY, sequences, start=bundle.untrained(config=MODEL))
 
 
 def test_a_checkpoint_of_another_recipe_is_refused_with_the_field_that_differs(folder, tmp_path):
@@ -359,8 +359,8 @@ def test_a_checkpoint_of_another_recipe_is_refused_with_the_field_that_differs(f
 
 def test_a_few_updates_learn_something(sequences):
     recipe = TINY.recipe.model_copy(update={"steps": 400, "learning_rate": 0.01})
-    run = Run.begin(TINY.model_copy(update={"recipe": recipe}), sequences)
-    losses = [learn(run, draw(run.rng, sequences, recipe)) for _ in range(100)]
+    run = TrainingRun.begin(TINY.model_copy(update={"recipe": recipe}), sequences)
+    losses = [train_segment(run, draw(run.rng, sequences, recipe)) for _ in range(100)]
     first, last = (np.mean([loss.linear for one in part for loss in one]) for part in (losses[:5], losses[-5:]))
     assert last < 0.8 * first
 

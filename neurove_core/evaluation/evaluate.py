@@ -29,7 +29,7 @@ class NoTruth(NeuroVEError):
 
 
 @dataclass(frozen=True)
-class Answers:
+class Estimates:
     """What a model said of one recording."""
 
     name: str
@@ -46,18 +46,18 @@ class Answers:
 
 
 @dataclass(frozen=True)
-class Judged:
-    """Answers beside the truth, windows of a known truth after the settling time alone."""
+class Evaluation:
+    """Estimates beside the truth, windows of a known truth after the settling time alone."""
 
-    answers: Answers
+    estimates: Estimates
     end_us: NDArray[np.int64]  # (N,) of the bins
     truth: NDArray[np.float64]  # (N, 6)
-    answer: NDArray[np.float64]  # (N, 6)
+    estimate: NDArray[np.float64]  # (N, 6)
     sigma: NDArray[np.float64] | None = None  # (N, 6), or None
     uncertain: NDArray[np.bool_] | None = None  # (N,), or None
 
 
-def answer(estimator: Estimator, recording: Recording, camera: CameraInfo | None = None) -> Answers:
+def estimate_recording(estimator: Estimator, recording: Recording, camera: CameraInfo | None = None) -> Estimates:
     """Run a model over a recording, packet by packet as a driver sends it.
 
     Args:
@@ -83,7 +83,7 @@ def answer(estimator: Estimator, recording: Recording, camera: CameraInfo | None
         if pushed.estimates and state.age:
             fired.add(state.network)
     bins = estimator.config.window.bins
-    return Answers(
+    return Estimates(
         name=recording.name,
         start_us=np.array([one.start_us for one in found], np.int64),
         bin_us=estimator.config.window.bin_us,
@@ -121,7 +121,7 @@ class _Fired:
         return rates | {"all": sum(self._spikes.values()) / sum(self._neurons.values())}
 
 
-def judge(answers: Answers, truth: Twists) -> Judged:
+def evaluate(estimates: Estimates, truth: Twists) -> Evaluation:
     """The answers that a truth is known for, each bin beside the mean truth over it.
 
     The first SKIP_S of the recording are left out, and windows that the truth does not cover from end to end.
@@ -129,59 +129,63 @@ def judge(answers: Answers, truth: Twists) -> Judged:
     Raises:
         NoTruth: no window is left.
     """
-    windows, bins = answers.twists.shape[:2]
-    offsets = (np.arange(bins * _SAMPLES) + 0.5) * (answers.bin_us / _SAMPLES)
-    t_us = (answers.start_us[:, None] + offsets).astype(np.int64)
+    windows, bins = estimates.twists.shape[:2]
+    offsets = (np.arange(bins * _SAMPLES) + 0.5) * (estimates.bin_us / _SAMPLES)
+    t_us = (estimates.start_us[:, None] + offsets).astype(np.int64)
     true = truth.at(t_us.ravel()).reshape(windows, bins, _SAMPLES, 6).mean(axis=2)
-    settled = answers.start_us >= (answers.start_us[0] if windows else 0) + SKIP_S * 1e6
+    settled = estimates.start_us >= (estimates.start_us[0] if windows else 0) + SKIP_S * 1e6
     kept = settled & np.isfinite(true).all(axis=(1, 2))
     if not kept.any():
         why = f"of its {windows} windows none lies after the first {SKIP_S:g} s and within the truth"
-        raise NoTruth(f"{answers.name}: {why}", windows=windows)
-    ends = (answers.start_us[:, None] + answers.bin_us * (np.arange(bins) + 1))[kept].ravel()
-    sigma = None if answers.sigma is None else np.repeat(answers.sigma[kept], bins, axis=0)
-    uncertain = None if answers.uncertain is None else np.repeat(answers.uncertain[kept], bins)
-    return Judged(answers, ends, true[kept].reshape(-1, 6), answers.twists[kept].reshape(-1, 6), sigma, uncertain)
+        raise NoTruth(f"{estimates.name}: {why}", windows=windows)
+    ends = (estimates.start_us[:, None] + estimates.bin_us * (np.arange(bins) + 1))[kept].ravel()
+    sigma = None if estimates.sigma is None else np.repeat(estimates.sigma[kept], bins, axis=0)
+    uncertain = None if estimates.uncertain is None else np.repeat(estimates.uncertain[kept], bins)
+    return Evaluation(
+        estimates, ends, true[kept].reshape(-1, 6), estimates.twists[kept].reshape(-1, 6), sigma, uncertain
+    )
 
 
-def report(judged: list[Judged]) -> dict[str, Any]:
+def report(evaluations: list[Evaluation]) -> dict[str, Any]:
     """All figures over some recordings together and over each, beside those of two predictors that see nothing.
 
     `zero` says 0 always; `mean` says the mean of this very truth, so no constant is better.
     """
-    bins = judged[0].answers.twists.shape[1]
-    truth, said = (np.concatenate(parts) for parts in zip(*((one.truth, one.answer) for one in judged), strict=True))
-    latency_ms = np.concatenate([one.answers.latency_ms for one in judged])
-    rates = [one.answers.firing_rate for one in judged]
+    bins = evaluations[0].estimates.twists.shape[1]
+    truth, estimate = (
+        np.concatenate(parts) for parts in zip(*((one.truth, one.estimate) for one in evaluations), strict=True)
+    )
+    latency_ms = np.concatenate([one.estimates.latency_ms for one in evaluations])
+    rates = [one.estimates.firing_rate for one in evaluations]
     every = {layer: float(np.mean([rate[layer] for rate in rates])) for layer in rates[0]}
-    return figures(truth, said, bins) | {
+    return figures(truth, estimate, bins) | {
         "firing_rate": every.pop("all", None),
         "firing_rate_by_layer": every,
         "latency_ms": {f"p{q}": float(np.percentile(latency_ms, q)) for q in (50, 99)},
         "re_floors": {"v_l_m_s": LINEAR_FLOOR_M_S, "v_a_rad_s": ANGULAR_FLOOR_RAD_S},
         "skipped_s": SKIP_S,
-        "scaled": all(one.answers.scaled for one in judged),
+        "scaled": all(one.estimates.scaled for one in evaluations),
         "zero": figures(truth, np.zeros_like(truth), bins),
         "mean": figures(truth, np.broadcast_to(truth.mean(0), truth.shape), bins),
-        "uncertainty": reliability(judged),
+        "uncertainty": reliability(evaluations),
         "recordings": [
-            {"name": one.answers.name} | figures(one.truth, one.answer, bins) | {"uncertainty": reliability([one])}
-            for one in judged
+            {"name": one.estimates.name} | figures(one.truth, one.estimate, bins) | {"uncertainty": reliability([one])}
+            for one in evaluations
         ],
     }
 
 
-def reliability(judged: list[Judged]) -> dict[str, Any] | None:
+def reliability(evaluations: list[Evaluation]) -> dict[str, Any] | None:
     """How often the truth lies within the intervals that the estimates claim; None where some claim nothing.
 
     `coverage` has, by axis, the measured share for each nominal one; `per_axis` the measured share for LEVEL alone, the
     median sigma, and the root mean square of error over sigma: 1 for errors that are normal and of the claimed size.
     """
-    claimed = [one.sigma for one in judged if one.sigma is not None]
-    flagged = [one.uncertain for one in judged if one.uncertain is not None]
-    if len(claimed) < len(judged):
+    claimed = [one.sigma for one in evaluations if one.sigma is not None]
+    flagged = [one.uncertain for one in evaluations if one.uncertain is not None]
+    if len(claimed) < len(evaluations):
         return None
-    sigma, error = np.concatenate(claimed), np.concatenate([one.answer - one.truth for one in judged])
+    sigma, error = np.concatenate(claimed), np.concatenate([one.estimate - one.truth for one in evaluations])
     measured = {level: coverage(error, sigma, level) for level in LEVELS}
     middle, ratio = np.median(sigma, axis=0), np.sqrt(((error / sigma) ** 2).mean(0))
     return {
