@@ -1,1 +1,1 @@
-"""Evaluation of estimates against the truth, and contrast maximisation."""
+"""Evaluation of estimates against the ground truth, and contrast maximisation."""

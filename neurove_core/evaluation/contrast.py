@@ -1,8 +1,9 @@
-"""Classical baselines: how a camera moved, by contrast maximisation, without any training.
+"""Contrast maximisation: a classical baseline that estimates the motion of a camera without training.
 
-Source: Gallego and Scaramuzza 2017 (angular velocity), Gallego, Rebecq and Scaramuzza 2018 (the general case). Events
-of one edge lie on top of each other, and their image is sharp, when each is moved back along the right motion; so the
-motion is sought for which the variance of that image is greatest. Counts of events, whatever their polarity.
+If each event is moved back along the true motion, the events of one edge fall on each other and the image of all events
+is sharp. The search therefore maximises the variance of the image of moved events. Polarity is ignored.
+
+Source: Gallego and Scaramuzza 2017 (angular velocity), Gallego, Rebecq and Scaramuzza 2018 (the general case).
 """
 
 from typing import Final, NamedTuple
@@ -20,38 +21,38 @@ Array = NDArray[np.float64]
 SCALES: Final = ((8, 1.0), (4, 1.0), (2, 1.0), (1, 0.5))
 """Coarse to fine: pixels per cell of the image of moved events, and its smoothing [cells, standard deviation].
 
-The last is what the answer is read from. With more smoothing it leans to where a long window's motion was fastest: on
+The result comes from the last scale. More smoothing biases it towards the fastest motion in a long window: on
 shapes_rotation w_z goes from 1.38 to 1.63 rad/s between 0.5 and 2 px, w_x and w_y by 3 %.
 """
 
 STARTS_PX: Final = 30.0
-"""How far apart in the image, over the events' duration, the motions lie from which the search begins."""
+"""Image motion of the start values of the search, over the duration of the events."""
 
-MARGIN: Final = 0.25  # of the image's side, on each: what the events may move out of the sensor
-_COARSE_EVENTS: Final = 40_000  # over the pixels of a cell: so many are enough to see its blurred image
-_STEPS: Final = 40  # most steps of one search
-_TOLERANCE_PX: Final = 3e-3  # a step below it ends the search
+MARGIN: Final = 0.25  # margin on each side, as a share of the sensor's side: events may move out of the sensor
+_COARSE_EVENTS: Final = 40_000  # divided by the pixels of a cell: a blurred image needs no more events
+_STEPS: Final = 40  # greatest number of steps of one search
+_TOLERANCE_PX: Final = 3e-3  # a smaller step ends the search
 
 
 class AngularMotion(NamedTuple):
-    """A camera's rate of rotation as its events tell it."""
+    """Angular velocity of a camera, estimated from events."""
 
     w_rad_s: Array  # (3,) wx wy wz in the optical frame
     contrast: float  # variance of the image of moved events [events^2 per px]
-    contrast_stationary: float  # the same if it had not turned: the more below `contrast`, the surer
+    contrast_stationary: float  # the same without motion; the further below `contrast`, the more certain the result
 
 
 class PlanarMotion(NamedTuple):
-    """A camera's motion along a fronto-parallel plane as its events tell it."""
+    """Motion of a camera along a fronto-parallel plane, estimated from events."""
 
-    flow_px_s: Array  # (2,) how the image moves, right and down, at the optical centre
-    velocity_per_depth: Array  # (2,) vx and vy of the camera over the plane's depth [1/s]
-    contrast: float  # as in AngularMotion
+    flow_px_s: Array  # (2,) motion of the image, right and down, at the optical centre
+    velocity_per_depth: Array  # (2,) vx and vy of the camera divided by the depth of the plane [1/s]
+    contrast: float  # as in `AngularMotion`
     contrast_stationary: float
 
 
 class _Rays(NamedTuple):
-    """Undistorted events (N,): x/z, y/z and the time since their middle, in units of their duration."""
+    """Undistorted events (N,): x/z, y/z, and the time from the middle of the events in units of their duration."""
 
     x: Array
     y: Array
@@ -59,41 +60,41 @@ class _Rays(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """Where rays fall in the image of moved events."""
+    """The image of moved events: its size and projection."""
 
     focal: float  # [cells]
     width: int
     height: int
-    turning: bool  # motions are rotations, else shifts
-    kernel: Array  # (7,) weights that smooth it
+    turning: bool  # True: motions are rotations; False: they are shifts
+    kernel: Array  # (7,) weights of the smoothing
 
 
 def angular(events: Events, camera: CameraInfo, start: Array | None = None) -> AngularMotion:
-    """The constant rate of rotation that explains the events best, if the camera did nothing but turn.
+    """Estimate the constant angular velocity of a camera that only rotates.
 
     Args:
-        events: of a time so short that the rate is about constant, and of some thousand events at least.
-        camera: whose lens they came through.
-        start: a rate (3,) [rad/s] near which it is sought; by default at rest and a few that move the image.
+        events: at least some thousand, from a time in which the rate is about constant.
+        camera: lens of the sensor.
+        start: rate (3,) [rad/s] to start from; by default zero and six rates that move the image.
 
     Raises:
-        InvalidField: the events are of another sensor, or fewer than two times are among them.
+        InvalidField: an event lies outside the sensor, or all events have the same time.
     """
     rays, duration_s = _rays(events, camera)
-    to_rad = 1 / camera.fx  # a motion is sought in pixels over the duration
+    to_rad = 1 / camera.fx  # the search uses pixels over the duration
     found, contrast, stationary = _search(rays, camera, True, None if start is None else start * duration_s / to_rad)
     return AngularMotion(found * to_rad / duration_s, contrast, stationary)
 
 
 def planar(events: Events, camera: CameraInfo, start: Array | None = None) -> PlanarMotion:
-    """The constant velocity that explains the events best, if the camera slid along a fronto-parallel plane.
+    """Estimate the constant velocity of a camera that translates along a fronto-parallel plane.
 
-    Events tell velocity only over depth: times the plane's depth [m] it is in m/s.
+    Events give the velocity only relative to depth; multiply the result by the depth of the plane [m] to get m/s.
 
     Args:
         events: as `angular`.
         camera: as `angular`.
-        start: a flow (2,) [px/s] near which it is sought; by default at rest and a few that move the image.
+        start: flow (2,) [px/s] to start from; by default zero and four motions of the image.
 
     Raises:
         InvalidField: as `angular`.
@@ -107,9 +108,11 @@ def planar(events: Events, camera: CameraInfo, start: Array | None = None) -> Pl
 
 
 def _rays(events: Events, camera: CameraInfo) -> tuple[_Rays, float]:
-    """The events as rays, without those that the lens can not have seen, and their duration [s]."""
+    """The events as rays, without those outside the lens model, and their duration [s]."""
     if not events.n or events.t[0] == events.t[-1]:
-        raise InvalidField("contrast maximisation", "events", events.n, "events of at least two times are needed")
+        raise InvalidField(
+            "contrast maximisation", "events", events.n, "events with at least two different times are needed"
+        )
     if int(events.x.max()) >= camera.width or int(events.y.max()) >= camera.height:
         raise InvalidField("camera info", "width x height", str(camera.sensor), "an event lies outside this sensor")
     u, v = np.meshgrid(np.arange(camera.width, dtype=np.float64), np.arange(camera.height, dtype=np.float64))
@@ -122,7 +125,7 @@ def _rays(events: Events, camera: CameraInfo) -> tuple[_Rays, float]:
 
 
 def _search(rays: _Rays, camera: CameraInfo, turning: bool, start: Array | None) -> tuple[Array, float, float]:
-    """The motion (3,) [px over the duration] of greatest contrast, that contrast, and the contrast at rest."""
+    """The motion (3,) [px over the duration] of greatest contrast, its contrast, and the contrast without motion."""
     motions = [start] if start is not None else [np.zeros(3), *np.eye(3) * STARTS_PX, *np.eye(3) * -STARTS_PX]
     if start is None and not turning:
         motions = [motion for motion in motions if motion[2] == 0]
@@ -132,34 +135,34 @@ def _search(rays: _Rays, camera: CameraInfo, turning: bool, start: Array | None)
         found = [_ascend(some, grid, motion, camera.fx) for motion in motions]
         found.sort(key=lambda pair: -pair[1])
         best = found[0][0]
-        # the best of a coarse image may not be that of a fine one: the next best goes on too, if it is another
+        # the best motion at a coarse scale may not be the best at a fine one, so a different second best is kept too
         others = [motion for motion, _ in found if np.abs(motion - best).max() > scale]
         motions = [best, *others[:1]]
     return found[0][0], found[0][1], _contrast(rays, grid, np.zeros(3), camera.fx)[0]
 
 
 def _thinned(rays: _Rays, most: int) -> _Rays:
-    """At most this many of the events, evenly chosen."""
+    """At most this many events, evenly selected."""
     stride = -(-rays.x.size // most)
     return _Rays(*(np.ascontiguousarray(column[::stride]) for column in rays))
 
 
 def image_grid(camera: CameraInfo, scale: int, smoothing: float, turning: bool) -> Grid:
-    """An image somewhat larger than the sensor's, with cells of `scale` px and smoothing in cells."""
+    """Create an image somewhat larger than the sensor, with cells of `scale` px and a smoothing in cells."""
     width, height = (int(side * (1 + 2 * MARGIN) / scale) for side in (camera.width, camera.height))
     kernel = np.exp(-0.5 * (np.arange(-3, 4) / smoothing) ** 2)
     return Grid(camera.fx / scale, width, height, turning, kernel / kernel.sum())
 
 
 def _ascend(rays: _Rays, grid: Grid, motion: Array, focal_px: float) -> tuple[Array, float]:
-    """The nearest motion (3,) of locally greatest contrast, and that contrast: BFGS with a halving line search."""
+    """The local maximum of the contrast near a motion (3,), and its contrast; BFGS with a backtracking line search."""
     value, slope = _contrast(rays, grid, motion, focal_px)
     inverse_hessian = (
         np.eye(3) * (focal_px / grid.focal) / max(float(np.linalg.norm(slope)), 1e-12)
     )  # a first step of one cell
     for _ in range(_STEPS):
         step = inverse_hessian @ slope
-        if step @ slope <= 0:  # rounding has spoilt it
+        if step @ slope <= 0:  # rounding has made it a descent direction
             inverse_hessian = np.eye(3) / max(float(np.linalg.norm(slope)), 1e-12)
             step = inverse_hessian @ slope
         while np.abs(step).max() > _TOLERANCE_PX:
@@ -175,7 +178,7 @@ def _ascend(rays: _Rays, grid: Grid, motion: Array, focal_px: float) -> tuple[Ar
 
 
 def _updated_inverse_hessian(inverse_hessian: Array, step: Array, change: Array) -> Array:
-    """The BFGS estimate of the inverse curvature after a step that changed the slope by this."""
+    """The BFGS estimate of the inverse Hessian after a step that changed the slope by `change`."""
     along = float(step @ change)
     if along <= 1e-12 * float(np.linalg.norm(step) * np.linalg.norm(change)):
         return inverse_hessian
@@ -184,20 +187,20 @@ def _updated_inverse_hessian(inverse_hessian: Array, step: Array, change: Array)
 
 
 def _contrast(rays: _Rays, grid: Grid, motion: Array, focal_px: float) -> tuple[float, Array]:
-    """Variance of the smoothed image of moved events, and its slope (3,) by the motion."""
+    """Variance of the smoothed image of moved events, and its gradient (3,) with respect to the motion."""
     rate = motion / focal_px  # [rad or 1/depth, over the duration]
     image = np.zeros((grid.height, grid.width))
     accumulate(rays.x, rays.y, rays.time, rate, grid, image)
     smooth = _smoothed(image, grid.kernel)
     deviation = smooth - smooth.mean()
-    # the slope of the sum of squares by each event's place is that of the image smoothed once more
+    # the gradient of the sum of squares at an event is that of the image smoothed once more
     slope = _slope(rays.x, rays.y, rays.time, rate, grid, _smoothed(deviation, grid.kernel))
     return float((deviation**2).mean()), slope * (2 / image.size / focal_px)
 
 
 @compiled
 def _smoothed(image: Array, kernel: Array) -> Array:  # pragma: no cover (machine code)
-    """The image smoothed along rows and columns, dark beyond its borders."""
+    """Smooth the image along rows and columns, with zeros outside its borders."""
     height, width = image.shape
     rows, out = np.zeros_like(image), np.zeros_like(image)
     for y in range(height):
@@ -217,7 +220,7 @@ def _smoothed(image: Array, kernel: Array) -> Array:  # pragma: no cover (machin
 def _moved(
     x: float, y: float, time: float, rate: Array, turning: bool
 ) -> tuple[float, float, float]:  # pragma: no cover (machine code)
-    """Direction that a ray had at time 0, if the camera's motion is this."""
+    """Direction of a ray at time 0 for this motion of the camera."""
     a, b, c = rate[0] * time, rate[1] * time, rate[2] * time
     if not turning:
         return x + a, y + b, 1.0
@@ -237,7 +240,7 @@ def _moved(
 def accumulate(
     xs: Array, ys: Array, times: Array, rate: Array, grid: Grid, image: Array
 ) -> None:  # pragma: no cover (machine code)
-    """Add each moved event to the four cells around it, in place; those that leave the image are lost."""
+    """Add each moved event to the four cells around it, in place; events outside the image are dropped."""
     for i in range(xs.size):
         x, y, z = _moved(xs[i], ys[i], times[i], rate, grid.turning)
         if z <= 0.1:
@@ -254,7 +257,7 @@ def accumulate(
 
 
 def accumulate_reference(xs: Array, ys: Array, times: Array, rate: Array, grid: Grid, image: Array) -> None:
-    """What accumulate computes, in plain numpy."""
+    """Reference implementation of `accumulate`, in plain numpy."""
     from neurove_core.geometry import rotations
 
     rays = np.stack([xs, ys, np.ones_like(xs)], axis=1)
@@ -275,7 +278,7 @@ def accumulate_reference(xs: Array, ys: Array, times: Array, rate: Array, grid: 
 def _slope(
     xs: Array, ys: Array, times: Array, rate: Array, grid: Grid, image: Array
 ) -> Array:  # pragma: no cover (machine code)
-    """Slope (3,) by the rate of the sum of an image's values, interpolated at the moved events."""
+    """Gradient (3,), by the rate, of the sum of the values of an image at the moved events, interpolated."""
     slope = np.zeros(3)
     for i in range(xs.size):
         t = times[i]
@@ -295,10 +298,10 @@ def _slope(
             slope[0] += by_u
             slope[1] += by_v
             continue
-        # of the direction d at time 0: e = its change, and -d x (J e) per unit of rate; J = 1 + phi/2 + phi^2/6 ...
+        # gradient by the direction d at time 0, turned into one by the rate; J = 1 + phi/2 + phi^2/6 ...
         gx, gy, gz = by_u, by_v, -(by_u * x + by_v * y) / z
         nx, ny, nz = y * gz - z * gy, z * gx - x * gz, x * gy - y * gx
-        # transposed Jacobian: half a turn back along the rotation
+        # the transposed Jacobian: the same series with the rotation reversed
         p, q, r = -rate[0] * t, -rate[1] * t, -rate[2] * t
         mx, my, mz = q * nz - r * ny, r * nx - p * nz, p * ny - q * nx
         kx, ky, kz = q * mz - r * my, r * mx - p * mz, p * my - q * mx

@@ -1,4 +1,4 @@
-"""A model on a recording with truth, exactly as the service would answer it: the driver's packets through Estimator."""
+"""Run a model on a recording as the service does, packet by packet, and compare its estimates with the truth."""
 
 import time
 from dataclasses import dataclass
@@ -18,39 +18,43 @@ from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.velocity import AXES
 
-_SAMPLES = 4  # of the truth in each bin, whose mean is the bin's
+_SAMPLES = 4  # samples of the truth per bin; the bin has their mean
 _STREAM = "evaluate"
 
 
 class NoTruth(NeuroVEError):
-    """What was to be judged lacks the truth to judge it by."""
+    """There is no truth to evaluate the estimates against."""
 
     code = "no_truth"
 
 
 @dataclass(frozen=True)
 class Estimates:
-    """What a model said of one recording."""
+    """The estimates of a model for one recording; W windows of n bins."""
 
     name: str
     start_us: NDArray[np.int64]  # (W,) of the windows
     bin_us: int
     twists: NDArray[np.float64]  # (W, n, 6) [m/s, rad/s]
     events: NDArray[np.int64]  # (W,)
-    low_activity: NDArray[np.bool_]  # (W,) as the service flags it
-    latency_ms: NDArray[np.float64]  # (W,) of the push that completed each
-    firing_rate: dict[str, float]  # share of neurons that fire per step, by layer and of all; or empty
-    scaled: bool  # the linear part is in m/s; else as if the camera were 1 m above the ground
-    sigma: NDArray[np.float64] | None = None  # (W, 6) of each window's twists; None where the model has no uncertainty
-    uncertain: NDArray[np.bool_] | None = None  # (W,) which windows are flagged so
+    low_activity: NDArray[np.bool_]  # (W,) flagged as in the service
+    latency_ms: NDArray[np.float64]  # (W,) duration of the push that completed the window
+    firing_rate: dict[
+        str, float
+    ]  # share of neurons that fire per step, by layer and overall; empty for a network without spikes
+    scaled: bool  # the camera height is known; otherwise the linear part assumes 1 m
+    sigma: NDArray[np.float64] | None = (
+        None  # (W, 6) of the twists of each window; None if the model has no uncertainty
+    )
+    uncertain: NDArray[np.bool_] | None = None  # (W,) windows flagged as uncertain
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Estimates beside the truth, windows of a known truth after the settling time alone."""
+    """Estimates with their truth, bin by bin, for windows with a known truth after the first SKIP_S; N bins."""
 
     estimates: Estimates
-    end_us: NDArray[np.int64]  # (N,) of the bins
+    end_us: NDArray[np.int64]  # (N,) end of each bin
     truth: NDArray[np.float64]  # (N, 6)
     estimate: NDArray[np.float64]  # (N, 6)
     sigma: NDArray[np.float64] | None = None  # (N, 6), or None
@@ -58,21 +62,21 @@ class Evaluation:
 
 
 def estimate_recording(estimator: Estimator, recording: Recording, camera: CameraInfo | None = None) -> Estimates:
-    """Run a model over a recording, packet by packet as a driver sends it.
+    """Run a model on a recording, packet by packet as a driver sends it.
 
     Args:
         estimator: the model.
-        recording: what it sees.
-        camera: its lens, by default what the recording tells of it.
+        recording: its input.
+        camera: lens of the recording; by default the one that the recording gives.
 
     Raises:
-        BrokenRecording: it can not be read to its end. InvalidField: the lens is of another sensor.
+        BrokenRecording: the recording cannot be read to its end. InvalidField: the lens belongs to another sensor.
     """
     camera = camera or recording.camera(_STREAM)
     state = estimator.initial_state(recording.sensor, camera)
     found: list[WindowEstimate] = []
     latencies_ms: list[float] = []
-    fired = _Fired()
+    firing_rate = _FiringRate()
     for piece in slices(recording.chunks()):
         began = time.perf_counter()
         pushed = estimator.push(piece.events, state, piece.t0_us)
@@ -81,7 +85,7 @@ def estimate_recording(estimator: Estimator, recording: Recording, camera: Camer
         found += pushed.estimates
         latencies_ms += [took_ms / max(1, len(pushed.estimates))] * len(pushed.estimates)
         if pushed.estimates and state.age:
-            fired.add(state.network)
+            firing_rate.add(state.network)
     bins = estimator.config.window.bins
     return Estimates(
         name=recording.name,
@@ -91,7 +95,7 @@ def estimate_recording(estimator: Estimator, recording: Recording, camera: Camer
         events=np.array([one.events for one in found], np.int64),
         low_activity=np.array([one.low_activity for one in found], np.bool_),
         latency_ms=np.array(latencies_ms),
-        firing_rate=fired.rates(),
+        firing_rate=firing_rate.rates(),
         scaled=camera is not None and camera.height_m is not None,
         sigma=_sigmas(found),
         uncertain=None if _sigmas(found) is None else np.array([one.uncertain for one in found], np.bool_),
@@ -103,8 +107,8 @@ def _sigmas(found: list[WindowEstimate]) -> NDArray[np.float64] | None:
     return np.sqrt(np.stack([np.diagonal(one) for one in covariances])) if covariances else None
 
 
-class _Fired:
-    """How often neurons fire, as their state tells it."""
+class _FiringRate:
+    """Counts spikes and neurons by layer, from the state of the network."""
 
     def __init__(self) -> None:
         self._spikes, self._neurons = dict[str, int](), dict[str, int]()
@@ -122,9 +126,9 @@ class _Fired:
 
 
 def evaluate(estimates: Estimates, truth: Twists) -> Evaluation:
-    """The answers that a truth is known for, each bin beside the mean truth over it.
+    """Pair each bin of the estimates with the mean truth over the bin.
 
-    The first SKIP_S of the recording are left out, and windows that the truth does not cover from end to end.
+    The first SKIP_S of the recording are left out, and windows that the truth does not cover completely.
 
     Raises:
         NoTruth: no window is left.
@@ -136,7 +140,7 @@ def evaluate(estimates: Estimates, truth: Twists) -> Evaluation:
     settled = estimates.start_us >= (estimates.start_us[0] if windows else 0) + SKIP_S * 1e6
     kept = settled & np.isfinite(true).all(axis=(1, 2))
     if not kept.any():
-        why = f"of its {windows} windows none lies after the first {SKIP_S:g} s and within the truth"
+        why = f"none of its {windows} windows lies after the first {SKIP_S:g} s and within the truth"
         raise NoTruth(f"{estimates.name}: {why}", windows=windows)
     ends = (estimates.start_us[:, None] + estimates.bin_us * (np.arange(bins) + 1))[kept].ravel()
     sigma = None if estimates.sigma is None else np.repeat(estimates.sigma[kept], bins, axis=0)
@@ -147,9 +151,10 @@ def evaluate(estimates: Estimates, truth: Twists) -> Evaluation:
 
 
 def report(evaluations: list[Evaluation]) -> dict[str, Any]:
-    """All figures over some recordings together and over each, beside those of two predictors that see nothing.
+    """Compute all figures over all recordings and over each one, and those of two constant predictors.
 
-    `zero` says 0 always; `mean` says the mean of this very truth, so no constant is better.
+    The predictor `zero` always gives 0. The predictor `mean` gives the mean of the truth of these recordings, which is
+    the best constant.
     """
     bins = evaluations[0].estimates.twists.shape[1]
     truth, estimate = (
@@ -176,10 +181,10 @@ def report(evaluations: list[Evaluation]) -> dict[str, Any]:
 
 
 def reliability(evaluations: list[Evaluation]) -> dict[str, Any] | None:
-    """How often the truth lies within the intervals that the estimates claim; None where some claim nothing.
+    """Compute how often the truth lies within the intervals of the estimates; None if some have no uncertainty.
 
-    `coverage` has, by axis, the measured share for each nominal one; `per_axis` the measured share for LEVEL alone, the
-    median sigma, and the root mean square of error over sigma: 1 for errors that are normal and of the claimed size.
+    `coverage` has the measured share for each nominal share, by axis. `per_axis` has the measured share for LEVEL, the
+    median sigma, and the root mean square of error over sigma, which is 1 if the claimed sigma is correct.
     """
     claimed = [one.sigma for one in evaluations if one.sigma is not None]
     flagged = [one.uncertain for one in evaluations if one.uncertain is not None]

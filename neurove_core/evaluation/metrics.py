@@ -1,6 +1,6 @@
-"""How far estimates lie from the truth: RMSE and RE as the paper defines them, per group of three and per axis.
+"""Error figures of estimates: RMSE and RE as the paper defines them, per group of three and per axis.
 
-Linear velocity in m/s; angular velocity in rad/s, and in deg/s where a name says so.
+Linear velocity is in m/s. Angular velocity is in rad/s, and in deg/s where a name says so.
 """
 
 from typing import Any, Final
@@ -14,17 +14,17 @@ LINEAR, ANGULAR = slice(0, 3), slice(3, 6)
 
 LINEAR_FLOOR_M_S: Final = 0.5
 ANGULAR_FLOOR_RAD_S: Final = 0.02
-"""RE counts where the truth is above these: it divides by the truth, and explodes near standstill."""
+"""RE counts only truths above these floors. It divides by the truth, so it diverges near standstill."""
 
 SKIP_S: Final = 0.5
-"""How much of the beginning of a recording is left out: the state settles."""
+"""Time at the beginning of a recording that is left out, because the state settles."""
 
 Array = NDArray[np.float64]
 Figures = dict[str, float | None]
 
 
 def rmse(error: Array) -> float:
-    """Root of the mean squared length of the errors (N, 3), or (N, 1) for one axis.
+    """Root mean square of the lengths of the errors (N, 3), or (N, 1) for one axis.
 
     Source: NeuroVE, Eq. (11): RMSE(x) = sqrt(1/n sum |x_gt - x|^2).
 
@@ -35,11 +35,11 @@ def rmse(error: Array) -> float:
 
 
 def relative_error(error: Array, truth: Array, floor: float = 0.0) -> float | None:
-    """Mean of the errors' lengths over the truth's, where the truth (N, 3) is longer than `floor`; None if nowhere.
+    """Mean of |error| / |truth| where the truth (N, 3) is longer than `floor`; None if it never is.
 
     Source: NeuroVE, Eq. (11): RE(x) = 1/n sum |x_gt - x| / x_gt.
-    Differs: divides by the length of the vector x_gt, which the paper prints without its bars; counts where that is
-    above a floor. With floor 0 the truths of exactly 0 alone are left out.
+    Differs: divides by the length of the vector x_gt, which the paper prints without its bars, and counts only lengths
+    above a floor. With floor 0 only truths of exactly 0 are left out.
 
     >>> relative_error(np.array([[0.0, 0, 1], [9, 9, 9]]), np.array([[0.0, 0, 4], [0, 0, 0]]))
     0.25
@@ -52,16 +52,16 @@ def relative_error(error: Array, truth: Array, floor: float = 0.0) -> float | No
 
 
 def figures(truth: Array, estimate: Array, bins: int) -> dict[str, Any]:
-    """All figures of some answers.
+    """Compute all figures of some estimates.
 
     Args:
         truth: twists (N, 6) [m/s, rad/s], one per bin; finite.
         estimate: of the same bins.
-        bins: per window: N is a multiple of it.
+        bins: per window; N is a multiple of it.
 
     Returns:
-        the paper's RMSE and RE for v_l and v_a, speed error and direction error apart, medians, the worst window
-        (by the mean length of its errors), R2, and all that is defined for one axis, by axis.
+        RMSE and RE of the paper for v_l and v_a, separate errors of speed and direction, medians, the worst window (by
+        the mean length of its errors), R2, and the figures of each axis.
     """
     error = estimate - truth
     found: dict[str, Any] = {"windows": len(truth) // bins}
@@ -91,13 +91,13 @@ def figures(truth: Array, estimate: Array, bins: int) -> dict[str, Any]:
 
 
 def r2(truth: Array, estimate: Array) -> float | None:
-    """Share of the truth's variance that the answers explain; None where the truth does not vary."""
+    """Share of the variance of the truth that the estimates explain; None if the truth is constant."""
     variance = ((truth - truth.mean(0)) ** 2).sum()
     return float(1 - ((estimate - truth) ** 2).sum() / variance) if variance > 0 else None
 
 
 def direction_error_deg(truth: Array, estimate: Array, floor: float) -> float | None:
-    """Median angle between the vectors [deg], where the truth is above the floor; None if nowhere."""
+    """Median angle between the vectors [deg] where the truth is above the floor; None if it never is."""
     lengths = np.linalg.norm(truth, axis=1), np.linalg.norm(estimate, axis=1)
     counted = (lengths[0] > floor) & (lengths[1] > 0)
     if not counted.any():

@@ -1,4 +1,4 @@
-"""Truth and estimate over time, axis by axis, with the error beside; how reliable the claimed uncertainty is."""
+"""Figures: truth, estimate and error over time for each axis; reliability of the uncertainty."""
 
 from pathlib import Path
 from typing import Any
@@ -10,24 +10,24 @@ from neurove_core.figures import blank_figure, save_figure
 from neurove_core.models.uncertainty import LEVEL, half_width
 from neurove_protocol.velocity import AXES
 
-_GAP_S = 0.2  # lines are broken where windows are missing for so long
+_GAP_S = 0.2  # lines are interrupted where windows are missing for this long
 
 
 def plot(evaluation: Evaluation, folder: Path) -> list[Path]:
-    """Write a recording's figure as PNG and SVG, named after it; returns the files.
+    """Write the figure of a recording as PNG and SVG, named after the recording; return the files.
 
     Raises:
-        MissingExtra: matplotlib is not installed. InvalidField: a file can not be written.
+        MissingExtra: matplotlib is not installed. InvalidField: a file cannot be written.
     """
     figure = blank_figure(14, 10)
     t_s = evaluation.end_us / 1e6
     gaps = np.flatnonzero(np.diff(t_s) > _GAP_S) + 1
     panels = figure.subplots(6, 2, sharex=True, gridspec_kw={"width_ratios": [2, 1]})
-    for i, (axis, (beside, error)) in enumerate(zip(AXES, panels, strict=True)):
+    for i, (axis, (velocity, error)) in enumerate(zip(AXES, panels, strict=True)):
         unit = "m/s" if i < 3 else "rad/s"
         for values, label, panel in (
-            (evaluation.truth[:, i], "truth", beside),
-            (evaluation.estimate[:, i], "estimate", beside),
+            (evaluation.truth[:, i], "truth", velocity),
+            (evaluation.estimate[:, i], "estimate", velocity),
             (evaluation.estimate[:, i] - evaluation.truth[:, i], "error", error),
         ):
             panel.plot(np.insert(t_s, gaps, np.nan), np.insert(values, gaps, np.nan), label=label, linewidth=0.9)
@@ -35,9 +35,9 @@ def plot(evaluation: Evaluation, folder: Path) -> list[Path]:
         if evaluation.sigma is not None:
             wide = half_width(LEVEL) * evaluation.sigma[:, i]
             low, high = evaluation.estimate[:, i] - wide, evaluation.estimate[:, i] + wide
-            gone = (np.insert(t_s, gaps, np.nan), np.insert(low, gaps, np.nan), np.insert(high, gaps, np.nan))
-            beside.fill_between(*gone, alpha=0.2, color="C1", linewidth=0, label=f"{LEVEL:.0%} interval")
-        beside.set_ylabel(f"{axis} [{unit}]")
+            band = (np.insert(t_s, gaps, np.nan), np.insert(low, gaps, np.nan), np.insert(high, gaps, np.nan))
+            velocity.fill_between(*band, alpha=0.2, color="C1", linewidth=0, label=f"{LEVEL:.0%} interval")
+        velocity.set_ylabel(f"{axis} [{unit}]")
         error.axhline(0, color="black", linewidth=0.5)
     panels[0, 0].legend(loc="upper right")
     panels[0, 1].set_title("error")
@@ -49,20 +49,20 @@ def plot(evaluation: Evaluation, folder: Path) -> list[Path]:
     return save_figure(figure, folder / stem)
 
 
-def plot_reliability(told: dict[str, Any], folder: Path) -> list[Path]:
-    """Write `reliability.png` and `.svg`: nominal against measured coverage of each axis; returns the files.
+def plot_reliability(reliability: dict[str, Any], folder: Path) -> list[Path]:
+    """Write `reliability.png` and `.svg`, measured over nominal coverage of each axis; return the files.
 
     Args:
-        told: what `evaluation.reliability` says of all recordings together.
-        folder: where to.
+        reliability: as `evaluate.reliability` returns it for all recordings.
+        folder: for the files.
 
     Raises:
-        MissingExtra: matplotlib is not installed. InvalidField: a file can not be written.
+        MissingExtra: matplotlib is not installed. InvalidField: a file cannot be written.
     """
     figure = blank_figure(6, 6)
     panel = figure.subplots()
     panel.plot([0, 1], [0, 1], color="black", linewidth=0.8, label="as claimed")
-    for axis, measured in told["coverage"].items():
+    for axis, measured in reliability["coverage"].items():
         nominal = [float(level) for level in measured]
         panel.plot(nominal, list(measured.values()), marker="o", markersize=4, linewidth=1, label=axis)
     panel.set(xlim=(0.4, 1.01), ylim=(0.4, 1.01), xlabel="nominal coverage", ylabel="measured coverage", aspect="equal")

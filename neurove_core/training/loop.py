@@ -1,4 +1,7 @@
-"""The loop: segments of many streams, truncated backpropagation through time, Adam (research/velocity.md, recipe L)."""
+"""The training loop: batches of segments, truncated backpropagation through time, Adam.
+
+Source: research/velocity.md, recipe L.
+"""
 
 import json
 import math
@@ -34,19 +37,19 @@ from neurove_core.training.run import TrainingRun
 CHECKPOINT: Final = "checkpoint.safetensors"
 RUN_JSON: Final = "run.json"
 
-_CURVE_STEPS: Final = 100  # the curve has the mean of so many updates, of a short run of a hundredth of all
+_CURVE_STEPS: Final = 100  # updates per point of the curve; in a short run, one hundredth of all updates
 _PROVENANCE_CHARS: Final = 1000
 _GOLDEN_SEQUENCES: Final = 8
 _GOLDEN_BYTES: Final = 200_000
-_NAMES_CHARS: Final = 400  # of the recordings in it
+_NAMES_CHARS: Final = 400  # of the names of recordings in the provenance
 
 
 class Progress(NamedTuple):
-    """How far a run is."""
+    """Progress of a run."""
 
     step: int
     steps: int
-    linear_m_s: float  # mean length of the linear error since the last report
+    linear_m_s: float  # mean length of the linear error since the last point of the curve
     angular_rad_s: float
 
 
@@ -56,10 +59,10 @@ class _Losses(NamedTuple):
 
 
 def learning_rate(step: int, recipe: RecipeConfig) -> float:
-    """Of update `step`, counted from 0: rises in a line to the recipe's, then falls as half a cosine to 0.
+    """Compute the learning rate of update `step`, counted from 0: a linear warm-up, then half a cosine to 0.
 
-    Each further cycle does so again, to half the peak of the one before (warm restarts, Loshchilov 2017). A run of more
-    cycles begins as one of fewer does, so a finished run can go on.
+    Each further cycle repeats this with half the peak of the previous cycle (warm restarts, Loshchilov 2017). The first
+    cycles do not depend on the number of cycles, so a finished run can continue with more.
 
     >>> recipe = RecipeConfig(steps=300, warm_up_steps=100, cycles=2)
     >>> [round(learning_rate(step, recipe), 6) for step in (0, 99, 200, 299, 399, 500, 600)]
@@ -85,32 +88,33 @@ def train(
     device: str = "cpu",
     on_progress: Callable[[Progress], None] = lambda _: None,
 ) -> Path:
-    """Train a model to the end of its recipe.
+    """Train a network on existing sequences, and write its bundle without an uncertainty; see `pipeline.train`.
 
     Args:
         config: of the run.
         out: folder for the checkpoint, run.json, the curve and the bundle.
         data: folder of the sequences, filled by `Cache.fill` and `RecordedSequences.fill`.
         more: files of further sequences, as `data.save` writes them.
-        resume: go on from the checkpoint in `out`, where there is one.
-        start: a model to begin from; a checkpoint that is gone on from knows its own.
-        devices: processes that share each batch, each with its own device.
+        resume: continue from the checkpoint in `out`, if it exists.
+        start: model whose weights the run begins from; ignored if the run continues from a checkpoint.
+        devices: number of processes that share each batch, each with its own device.
         device: `cpu`, `cuda` or `auto`; see `ranks.device_of`.
-        on_progress: told after each segment.
+        on_progress: called after each segment.
 
     Returns:
-        the bundle's path.
+        the path of the bundle.
 
     Raises:
-        BrokenRecording: a sequence is missing or broken. BadModel: the checkpoint can not be gone on from, or the
-            start is of another network.
-        InvalidField: the batch does not split over the devices, or there are not so many. LostRank: one of them ended.
+        BrokenRecording: a sequence is missing or broken.
+        BadModel: the checkpoint does not fit the configuration, or `start` has another network.
+        InvalidField: the batch does not split over the devices, or a device is missing.
+        LostRank: one of the processes ended early.
     """
     out.mkdir(parents=True, exist_ok=True)
     resume = resume and (out / CHECKPOINT).exists()
     sequences = Sequences([*Cache(data, config).paths(), *RecordedSequences(data, config).paths(), *more])
     how = Start(resume, start)
-    begin_run(config, out, sequences, how, Ranks(count=devices))  # so that what is wrong is told by one
+    begin_run(config, out, sequences, how, Ranks(count=devices))  # one process raises the errors of the arguments
     with process_group(devices, device, train_rank, (config, out, sequences.paths, how)) as ranks:
         run = begin_run(config, out, sequences, how, ranks)
         with Scalars(out, run.step) as scalars:
@@ -124,21 +128,21 @@ def train(
 
 
 class Start(NamedTuple):
-    """Where a run's first weights come from: a checkpoint, a model, or the recipe's seed."""
+    """Origin of the first weights of a run: a checkpoint, a model, or the seed of the recipe."""
 
     resume: bool
     start: Bundle | None
 
 
 def begin_run(config: TrainingConfig, out: Path, sequences: Sequences, how: Start, ranks: Ranks) -> TrainingRun:
-    """A rank's run at its first update, or at that of the checkpoint."""
+    """The run of a rank, at its first update or at the update of the checkpoint."""
     if how.resume:
         return TrainingRun.restore(out / CHECKPOINT, config, ranks)
     return TrainingRun.begin(config, sequences, ranks, how.start)
 
 
 def train_rank(config: TrainingConfig, out: Path, paths: list[Path], how: Start, ranks: Ranks) -> None:
-    """What every rank but the first does: learn, and write nothing."""
+    """Main function of every rank except the first: train, and write nothing."""
     sequences = Sequences(paths)
     train_to_end(begin_run(config, out, sequences, how, ranks), sequences, out)
 
@@ -150,7 +154,7 @@ def train_to_end(
     on_progress: Callable[[Progress], None] = lambda _: None,
     on_point: Callable[[dict[str, float]], None] = lambda _: None,
 ) -> None:
-    """Learn to the end of the recipe; the first rank leaves checkpoints and run.json in `out`."""
+    """Train to the end of the recipe; the first rank writes checkpoints and run.json to `out`."""
     recipe, share = run.config.recipe, run.rank_recipe
     spent_s, saved_s, began_s, recent = run.cpu_s, time.monotonic(), time.process_time(), list[_Losses]()
     while run.step < recipe.updates:
@@ -172,7 +176,7 @@ def train_to_end(
 
 
 def train_segment(run: TrainingRun, segment: Segment) -> list[_Losses]:
-    """Follow a segment's streams from rest, chunk by chunk, with an update of the weights after each."""
+    """Run the streams of a segment from the zero state, with an update of the weights after each chunk."""
     recipe, ranks = run.config.recipe, run.ranks
     segment = Segment(*(tensor.to(ranks.device) for tensor in segment))
     state, steps = run.network.initial_state(segment.counts.shape[1]), []
@@ -181,8 +185,8 @@ def train_segment(run: TrainingRun, segment: Segment) -> list[_Losses]:
         for group in run.optimiser.param_groups:
             group["lr"] = learning_rate(run.step, recipe)
         spikes = to_spikes(segment.counts[chunk], run.config.model.network.encoding)
-        answers, state = run.network(spikes, state)
-        linear, angular = (ranks.mean(loss) for loss in losses(run, answers, segment, chunk))
+        outputs, state = run.network(spikes, state)
+        linear, angular = (ranks.mean(loss) for loss in losses(run, outputs, segment, chunk))
         loss, run.balance = scaled_sum(linear, angular, run.balance, recipe.balance_decay)
         run.optimiser.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]  # torch's own
@@ -195,19 +199,24 @@ def train_segment(run: TrainingRun, segment: Segment) -> list[_Losses]:
     return steps
 
 
-def losses(run: TrainingRun, answers: Tensor, segment: Segment, chunk: slice) -> tuple[Tensor, Tensor]:
-    """L_l in m/s and L_a in rad/s of a chunk's answers (T, B, n, 6).
+def losses(run: TrainingRun, outputs: Tensor, segment: Segment, chunk: slice) -> tuple[Tensor, Tensor]:
+    """Compute L_l [m/s] and L_a [rad/s] of the outputs (T, B, n, 6) of the network for a chunk.
 
-    The linear part is learned per metre of camera height, but its error counts in m/s: else streams near the ground,
-    whose numbers are large, would be all that is learned. What the truth does not know is no error.
+    The linear part is trained per metre of camera height, but its error counts in m/s. Otherwise streams near the
+    ground, whose values are large, would dominate the loss. An unknown truth (nan) counts as no error.
     """
     truth = segment.twists[chunk]
-    error = torch.where(truth.isnan(), 0, answers * run.scale + run.offset - truth)
+    error = torch.where(truth.isnan(), 0, outputs * run.scale + run.offset - truth)
     return group_loss(error[..., :3] * segment.height_m[:, None, None]), group_loss(error[..., 3:])
 
 
 def provenance(run: TrainingRun, more: int = 0) -> str:
-    """One line: how this model was made; `more` sequences were learned from beside the configuration's."""
+    """Describe in one line how the model was made.
+
+    Args:
+        run: at its end.
+        more: number of sequences in addition to those of the configuration.
+    """
     recipe, data = run.config.recipe, run.config.data
     names = ", ".join(Path(one.source).name for one in data.recordings)
     also = f" and {more} more" if more else ""
@@ -222,7 +231,7 @@ def provenance(run: TrainingRun, more: int = 0) -> str:
 
 
 def metadata_of(run: TrainingRun) -> Metadata:
-    """How this model was made, as fields, and how far off it was at its last updates."""
+    """Describe how the model was made, as fields, with its errors in the last updates."""
     config = run.config
     made_by = MadeBy(
         program=_program(run),
@@ -245,9 +254,9 @@ def _program(run: TrainingRun) -> str:
 
 
 def golden_windows(sequences: Sequences) -> NDArray[np.uint8]:
-    """Windows (T, 2n, H, W) for the golden test: the busiest ends of the first sequences that fit into a bundle.
+    """Select windows (T, 2n, H, W) for the golden test: the busiest end of the first sequences.
 
-    They are fewer than `golden.WINDOWS` where the grid is large.
+    A large grid gives fewer windows than `golden.WINDOWS`, so that they fit into the bundle.
     """
     ends = []
     for index in range(min(len(sequences), _GOLDEN_SEQUENCES)):
@@ -260,7 +269,7 @@ def golden_windows(sequences: Sequences) -> NDArray[np.uint8]:
 
 
 def commit() -> str | None:
-    """The commit of the source that runs, or None where it is no work tree."""
+    """Return the commit of the running source, or None if it is not in a work tree."""
     command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--exclude=*"]
     try:
         return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip() or None
@@ -283,7 +292,7 @@ def _point(run: TrainingRun, mean: _Losses) -> dict[str, float]:
 
 
 def _write_run(run: TrainingRun, out: Path) -> None:
-    about: dict[str, Any] = {
+    summary: dict[str, Any] = {
         "config": run.config.model_dump(mode="json"),
         "seed": run.config.recipe.seed,
         "commit": commit(),
@@ -295,4 +304,4 @@ def _write_run(run: TrainingRun, out: Path) -> None:
         "cpu_s": round(run.cpu_s, 1),
         "curve": run.curve,
     }
-    write_atomically(out / RUN_JSON, json.dumps(about, indent=1).encode())
+    write_atomically(out / RUN_JSON, json.dumps(summary, indent=1).encode())

@@ -1,4 +1,4 @@
-"""The paper's loss L = L_a + L_l, with dynamic scaling between the angular and the linear part."""
+"""The loss of the paper, L = L_a + L_l, with dynamic scaling between the angular and the linear part."""
 
 from typing import NamedTuple
 
@@ -7,24 +7,24 @@ from torch import Tensor
 
 
 class Balance(NamedTuple):
-    """Running means of the two losses; what the dynamic scaling divides them by."""
+    """Running means of the two losses; the dynamic scaling divides by them."""
 
     linear: Tensor  # scalar, 0 before the first update
     angular: Tensor
 
     @classmethod
     def initial(cls) -> "Balance":
-        """Before the first update."""
+        """The balance before the first update."""
         return cls(torch.zeros(()), torch.zeros(()))
 
 
 def group_loss(error: Tensor) -> Tensor:
-    """L_i: half the length of the error vector, in the mean over all windows and bins.
+    """Compute L_i: half the length of the error vector, averaged over all windows and bins.
 
     Source: NeuroVE, section III-D, Eq. (10): L_i = 1/2 sqrt(e_i^T e_i). Its gradient at e = 0 is taken as 0.
 
     Args:
-        error: (..., 3), truth less answer; of the linear part [m/s] or the angular one [rad/s].
+        error: (..., 3), truth minus estimate, of the linear part [m/s] or the angular part [rad/s].
 
     >>> float(group_loss(torch.tensor([[3.0, 4.0, 0.0], [0.0, 0.0, 0.0]])))
     1.25
@@ -34,19 +34,19 @@ def group_loss(error: Tensor) -> Tensor:
 
 
 def scaled_sum(linear: Tensor, angular: Tensor, balance: Balance, decay: float) -> tuple[Tensor, Balance]:
-    """L = L_l / m_l + L_a / m_a, where m_i is the running mean of L_i: both parts pull alike, whatever their units.
+    """Compute L = L_l / m_l + L_a / m_a, where m_i is the running mean of L_i; the units of the parts cancel.
 
     Source: NeuroVE, section III-D, the dynamic scaling below Eq. (10), for which the paper gives no rule.
-    Differs: this rule is ours. m <- decay m + (1 - decay) L, from the first loss on, without a gradient.
+    Differs: this rule is ours. m <- decay m + (1 - decay) L, from the first loss on; no gradient passes through m.
 
     Args:
         linear: L_l.
         angular: L_a.
-        balance: of the update before.
+        balance: of the previous update.
         decay: of the running means, 0 to below 1.
 
     Returns:
-        the loss to train_to_end, about 2 while nothing is learned, and the balance after this update.
+        the loss to minimise, which stays about 2 while the network does not improve, and the new balance.
     """
     means = [
         torch.where(mean > 0, decay * mean + (1 - decay) * loss.detach(), loss.detach()).clamp_min(1e-12)

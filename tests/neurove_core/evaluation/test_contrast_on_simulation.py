@@ -1,4 +1,4 @@
-"""Contrast maximisation and the simulator, which know nothing of each other, agree on how a camera turned."""
+"""Contrast maximisation and the simulator are independent, and agree on the angular velocity of a camera."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""A model is evaluation by what the service would publish, beside the truth of each bin."""
+"""A model is evaluated on the estimates that the service publishes, against the truth of each bin."""
 
 from dataclasses import replace
 
@@ -33,7 +33,7 @@ def model():
     return bundle.untrained(3, SMALL, "small")
 
 
-def test_the_answers_are_those_that_the_running_service_publishes(recording, model, tmp_path):
+def test_the_estimates_are_those_that_the_service_publishes(recording, model, tmp_path):
     path = tmp_path / "small.safetensors"
     bundle.save(model, path)
     stream = Stream("cam0", ModelSlot(str(path)))
@@ -42,37 +42,37 @@ def test_the_answers_are_those_that_the_running_service_publishes(recording, mod
     for seq, piece in enumerate(slices(recording.chunks())):
         packet = EventPacket("cam0", seq, recording.sensor, piece.t0_us, piece.events)
         published += stream.accept(packet, Arrival(0, 0))
-    said = estimate_recording(Estimator(model), recording)
-    assert said.start_us.tolist() == [one.start_us for one in published]
-    assert said.events.tolist() == [one.events for one in published]
-    np.testing.assert_array_equal(said.twists, np.array([one.twists for one in published]))
-    assert 0 < said.firing_rate["all"] < 1
-    assert set(said.firing_rate) == {"block 1", "block 2", "cell 1", "cell 2", "all"}
+    estimates = estimate_recording(Estimator(model), recording)
+    assert estimates.start_us.tolist() == [one.start_us for one in published]
+    assert estimates.events.tolist() == [one.events for one in published]
+    np.testing.assert_array_equal(estimates.twists, np.array([one.twists for one in published]))
+    assert 0 < estimates.firing_rate["all"] < 1
+    assert set(estimates.firing_rate) == {"block 1", "block 2", "cell 1", "cell 2", "all"}
 
 
-def test_each_bin_stands_beside_the_truth_of_its_own_time(recording, model):
+def test_each_bin_is_paired_with_the_truth_of_its_own_time(recording, model):
     evaluation = evaluate(estimate_recording(Estimator(model), recording), recording.twists())
     assert evaluation.end_us[0] == 510_000  # the first half second is skipped
     middle = recording.trajectory.twist((evaluation.end_us - 5_000) / 1e6)
     np.testing.assert_allclose(evaluation.truth, middle, atol=2e-3)
 
 
-def test_windows_without_truth_are_left_out_and_none_at_all_is_said(recording, model):
-    said, whole = estimate_recording(Estimator(model), recording), recording.twists()
+def test_windows_without_truth_are_left_out_and_an_error_says_if_none_remains(recording, model):
+    estimates, whole = estimate_recording(Estimator(model), recording), recording.twists()
     part = Twists(whole.t[:901], whole.twist[:901])
-    assert evaluate(said, part).end_us[-1] == 900_000
-    with pytest.raises(NoTruth, match="none lies after the first 0.5 s and within the truth"):
-        evaluate(said, Twists(whole.t[:300], whole.twist[:300]))
+    assert evaluate(estimates, part).end_us[-1] == 900_000
+    with pytest.raises(NoTruth, match=r"none of its \d+ windows lies after the first 0.5 s and within the truth"):
+        evaluate(estimates, Twists(whole.t[:300], whole.twist[:300]))
 
 
-def test_a_model_per_metre_of_height_is_told_by_the_cameras_height(recording, model):
+def test_the_estimate_of_a_model_per_metre_is_scaled_by_the_height_of_the_camera(recording, model):
     per_height = estimate_recording(Estimator(replace(model, linear_unit=PER_HEIGHT)), recording)
     plain = estimate_recording(Estimator(model), recording)
     np.testing.assert_allclose(per_height.twists, plain.twists * [2, 2, 2, 1, 1, 1])
     assert per_height.scaled
 
 
-def test_without_a_height_it_is_told_as_for_one_metre(recording, model):
+def test_without_a_height_the_estimate_assumes_one_metre(recording, model):
     estimator = Estimator(replace(model, linear_unit=PER_HEIGHT))
     camera = recording.camera("cam0").model_copy(update={"height_m": None})
     events = next(recording.since(0))
@@ -85,7 +85,7 @@ def test_without_a_height_it_is_told_as_for_one_metre(recording, model):
         np.testing.assert_array_equal(a.twists, b.twists)
 
 
-def test_a_bundle_keeps_its_linear_unit_and_an_old_one_is_in_metres_per_second(model, tmp_path):
+def test_a_bundle_keeps_its_linear_unit_and_an_old_bundle_is_in_metres_per_second(model, tmp_path):
     path = tmp_path / "a.safetensors"
     bundle.save(replace(model, linear_unit=PER_HEIGHT), path)
     assert bundle.load(path).linear_unit == PER_HEIGHT
@@ -94,11 +94,11 @@ def test_a_bundle_keeps_its_linear_unit_and_an_old_one_is_in_metres_per_second(m
     assert bundle.from_bytes(padded.to_bytes(8, "little") + old[8:], "old").linear_unit == "m/s"
 
 
-def test_the_report_has_rows_for_predictors_that_see_nothing(recording, model):
+def test_the_report_has_figures_of_constant_predictors(recording, model):
     evaluation = evaluate(estimate_recording(Estimator(model), recording), recording.twists())
-    told = report([evaluation, evaluation])
-    assert told["zero"]["re_v_l"] == pytest.approx(1)
-    assert told["mean"]["r2_v_l"] == pytest.approx(0, abs=1e-9)
-    assert told["windows"] == 2 * told["recordings"][0]["windows"]
+    figures = report([evaluation, evaluation])
+    assert figures["zero"]["re_v_l"] == pytest.approx(1)
+    assert figures["mean"]["r2_v_l"] == pytest.approx(0, abs=1e-9)
+    assert figures["windows"] == 2 * figures["recordings"][0]["windows"]
     for key in ("rmse_v_l_m_s", "rmse_v_a_deg_s", "re_v_l", "re_v_a", "per_axis", "windows", "firing_rate"):
-        assert key in told
+        assert key in figures

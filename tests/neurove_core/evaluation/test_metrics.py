@@ -1,4 +1,4 @@
-"""RMSE and RE as the paper defines them, and what stands beside them."""
+"""RMSE and RE as the paper defines them, and the other figures."""
 
 import math
 
@@ -15,8 +15,8 @@ def made(windows=8, bins=5, seed=0):
 
 
 def test_rmse_and_re_are_the_papers_equations_written_out():
-    truth, answer = made()
-    error = (answer - truth)[:, :3]
+    truth, estimate = made()
+    error = (estimate - truth)[:, :3]
     squares, ratios = 0.0, 0.0
     for e, t in zip(error, truth[:, :3], strict=True):
         squares += sum(x * x for x in e)
@@ -25,7 +25,7 @@ def test_rmse_and_re_are_the_papers_equations_written_out():
     assert relative_error(error, truth[:, :3]) == pytest.approx(ratios / len(error))
 
 
-def test_re_counts_what_is_above_the_floor_alone():
+def test_re_counts_only_truths_above_the_floor():
     truth = np.array([[0, 0, 0.4], [0, 0, 2.0], [0, 0, 4.0]])
     error = np.array([[0, 0, 9.0], [0, 0, 1.0], [0, 0, 1.0]])
     assert relative_error(error, truth, 0.5) == pytest.approx((1 / 2 + 1 / 4) / 2)
@@ -33,9 +33,9 @@ def test_re_counts_what_is_above_the_floor_alone():
     assert relative_error(error, truth, 5.0) is None
 
 
-def test_degrees_are_radians_in_degrees_and_axes_add_up_to_their_group():
-    truth, answer = made()
-    found = figures(truth, answer, 5)
+def test_degrees_match_radians_and_axes_add_up_to_their_group():
+    truth, estimate = made()
+    found = figures(truth, estimate, 5)
     assert found["rmse_v_a_deg_s"] == pytest.approx(math.degrees(found["rmse_v_a_rad_s"]))
     axes = found["per_axis"]
     assert sum(axes[a]["rmse_m_s"] ** 2 for a in ("vx", "vy", "vz")) == pytest.approx(found["rmse_v_l_m_s"] ** 2)
@@ -43,7 +43,7 @@ def test_degrees_are_radians_in_degrees_and_axes_add_up_to_their_group():
     assert axes["wy"]["rmse_deg_s"] == pytest.approx(math.degrees(axes["wy"]["rmse_rad_s"]))
 
 
-def test_saying_zero_has_a_relative_error_of_one_and_the_mean_an_r2_of_zero():
+def test_the_zero_predictor_has_a_relative_error_of_one_and_the_mean_an_r2_of_zero():
     truth, _ = made()
     zero = figures(truth, np.zeros_like(truth), 5)
     mean = figures(truth, np.broadcast_to(truth.mean(0), truth.shape), 5)
@@ -53,7 +53,7 @@ def test_saying_zero_has_a_relative_error_of_one_and_the_mean_an_r2_of_zero():
     assert mean["per_axis"]["vz"]["correlation"] is None
 
 
-def test_a_perfect_answer_has_no_error_anywhere():
+def test_a_perfect_estimate_has_no_errors():
     truth, _ = made()
     found = figures(truth, truth, 5)
     for name in ("rmse_v_l_m_s", "rmse_v_a_deg_s", "re_v_l", "re_v_a", "worst_window_error_v_l_m_s"):
@@ -62,7 +62,7 @@ def test_a_perfect_answer_has_no_error_anywhere():
     assert found["median_direction_error_v_l_deg"] == pytest.approx(0, abs=1e-5)
 
 
-def test_speed_and_direction_errors_are_told_apart():
+def test_speed_and_direction_errors_are_separate():
     truth = np.tile([0, 0, 4.0], (10, 1))
     turned = np.tile([4.0, 0, 0], (10, 1))
     assert direction_error_deg(truth, 2 * truth, 0.5) == 0
@@ -74,14 +74,14 @@ def test_speed_and_direction_errors_are_told_apart():
 
 def test_the_worst_window_is_found():
     truth, _ = made()
-    answer = truth.copy()
-    answer[30:35, 0] += 3.0
-    found = figures(truth, answer, 5)
+    estimate = truth.copy()
+    estimate[30:35, 0] += 3.0
+    found = figures(truth, estimate, 5)
     assert (found["worst_window_v_l"], found["worst_window_error_v_l_m_s"]) == (6, pytest.approx(3))
     assert found["windows"] == 8
 
 
-def test_a_truth_that_stands_still_has_no_relative_error_and_no_r2():
+def test_a_stationary_truth_has_no_relative_error_and_no_r2():
     found = figures(np.zeros((10, 6)), np.ones((10, 6)), 5)
     assert found["re_v_l"] is found["r2_v_a"] is found["median_direction_error_v_a_deg"] is None
     assert r2(np.zeros((3, 1)), np.ones((3, 1))) is None

@@ -1,4 +1,4 @@
-"""The mean of models: of one network alone, with the mean of their weights, and with nothing that was only one's."""
+"""The average of models: mean weights, only for equal networks, and without data that belongs to one model only."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ def other(seed=3, config=CONFIG):
     return replace(made, name="other", offset=ORIGINAL.offset, scale=ORIGINAL.scale, linear_unit=ORIGINAL.linear_unit)
 
 
-def test_every_weight_is_the_mean_and_the_rest_is_the_last_ones():
+def test_every_weight_is_the_mean_and_everything_else_is_that_of_the_last_model():
     one, two = ORIGINAL, other().with_digest()
     made = average([one, two])
     a, b = one.network.state_dict(), two.network.state_dict()
@@ -32,7 +32,7 @@ def test_every_weight_is_the_mean_and_the_rest_is_the_last_ones():
     assert made.digest not in ("", one.digest, two.digest)
 
 
-def test_a_model_averaged_with_itself_answers_as_it_did_and_has_a_golden_test_of_its_own():
+def test_a_model_averaged_with_itself_gives_the_same_estimates_and_gets_a_new_golden_test():
     counts = np.random.default_rng(0).poisson(0.3, (4, 4, 8, 10)).astype(np.uint8)
     tested = replace(ORIGINAL, golden=self_test.record(Estimator(ORIGINAL), counts)).with_digest()
     made = average([tested, tested])
@@ -44,7 +44,7 @@ def test_a_model_averaged_with_itself_answers_as_it_did_and_has_a_golden_test_of
     ("models", "error", "says"),
     [
         ([ORIGINAL], InvalidField, "models=1"),
-        ([replace(ORIGINAL, scale=2 * ORIGINAL.scale), other()], BadModel, "scaled otherwise"),
+        ([replace(ORIGINAL, scale=2 * ORIGINAL.scale), other()], BadModel, "output scaling differs"),
         (
             [
                 ORIGINAL,
@@ -55,6 +55,6 @@ def test_a_model_averaged_with_itself_answers_as_it_did_and_has_a_golden_test_of
         ),
     ],
 )
-def test_what_has_no_mean_is_refused(models, error, says):
+def test_models_that_cannot_be_averaged_are_refused(models, error, says):
     with pytest.raises(error, match=says):
         average(models)

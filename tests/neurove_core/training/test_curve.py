@@ -1,4 +1,4 @@
-"""The learning curve to be looked at: TensorBoard, a figure, and what is said where a library is missing."""
+"""The learning curve: TensorBoard, the figure, and the warning about a missing library."""
 
 import sys
 import threading
@@ -22,13 +22,13 @@ def scalars(folder, name):
 
 
 def await_the_next_second():
-    """A run goes on in a later one; files of one second are read in the order of their numbers as text, 10 before 9."""
+    """A resumed run starts in a later second; TensorBoard sorts files of one second by number as text, 10 before 9."""
     began = int(time.time())
     while int(time.time()) == began:
         threading.Event().wait(0.01)
 
 
-def test_tensorboard_shows_the_curve_and_of_a_run_that_goes_on_no_point_twice(tmp_path):
+def test_tensorboard_shows_the_curve_and_no_point_of_a_resumed_run_twice(tmp_path):
     with Scalars(tmp_path) as written:
         for point in CURVE[:8]:
             written.add(point)
@@ -39,7 +39,7 @@ def test_tensorboard_shows_the_curve_and_of_a_run_that_goes_on_no_point_twice(tm
     assert scalars(tmp_path, "linear_error_m_s") == [(point["step"], point["linear_error_m_s"]) for point in CURVE]
 
 
-def test_without_tensorboard_it_is_said_once_and_training_goes_on(tmp_path, monkeypatch, caplog):
+def test_without_tensorboard_one_warning_is_logged_and_training_continues(tmp_path, monkeypatch, caplog):
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
     with Scalars(tmp_path) as written:
         for point in CURVE:
@@ -49,13 +49,13 @@ def test_without_tensorboard_it_is_said_once_and_training_goes_on(tmp_path, monk
     assert not list(tmp_path.iterdir())
 
 
-def test_the_curve_is_drawn_the_same_each_time(tmp_path):
+def test_the_figure_of_a_curve_is_reproducible(tmp_path):
     first = [file.read_bytes() for file in draw_curve(CURVE, tmp_path, "model: 1400 updates")]
     assert [file.name for file in sorted(tmp_path.iterdir())] == ["curve.png", "curve.svg"]
     assert first == [file.read_bytes() for file in draw_curve(CURVE, tmp_path, "model: 1400 updates")]
 
 
-def test_without_matplotlib_it_is_said(tmp_path, monkeypatch, caplog):
+def test_without_matplotlib_a_warning_is_logged(tmp_path, monkeypatch, caplog):
     monkeypatch.setitem(sys.modules, "matplotlib.backends.backend_agg", None)
     assert draw_curve(CURVE, tmp_path, "model") == []
     assert "neurove[experiments]" in caplog.text

@@ -1,4 +1,4 @@
-"""The paper's loss and the scaling between its parts."""
+"""The loss of the paper, and the scaling between its parts."""
 
 import pytest
 import torch
@@ -13,7 +13,7 @@ def test_the_loss_of_a_group_is_half_the_mean_length_of_its_errors():
     )
 
 
-def test_no_error_has_a_finite_gradient():
+def test_the_gradient_of_a_zero_error_is_zero():
     error = torch.zeros(2, 3, requires_grad=True)
     group_loss(error).backward()
     assert error.grad is not None
@@ -21,7 +21,7 @@ def test_no_error_has_a_finite_gradient():
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e-3, 1e3])
-def test_the_unit_of_a_part_does_not_matter_to_the_scaled_sum(unit):
+def test_the_scaled_sum_does_not_depend_on_the_unit_of_a_part(unit):
     linear, angular = torch.rand(2, 30, generator=torch.Generator().manual_seed(1))
     one, other = Balance.initial(), Balance.initial()
     for a, b in zip(linear, angular, strict=True):
@@ -30,7 +30,7 @@ def test_the_unit_of_a_part_does_not_matter_to_the_scaled_sum(unit):
         assert float(loss) == pytest.approx(float(same), rel=1e-4)
 
 
-def test_both_parts_pull_alike_whatever_their_size():
+def test_both_parts_have_the_same_weight_at_any_size():
     linear, angular = torch.tensor(3.0, requires_grad=True), torch.tensor(0.02, requires_grad=True)
     loss, balance = scaled_sum(linear, angular, Balance.initial(), 0.99)
     loss.backward()

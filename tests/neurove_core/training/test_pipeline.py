@@ -97,7 +97,7 @@ def test_wrong_arguments_are_refused_before_anything_is_simulated(tmp_path):
     (tmp_path / "tiny.toml").write_text(TOML)
     config = configs.load(str(tmp_path / "tiny.toml"))
     start = replace(bundle.untrained(), linear_unit=bundle.PER_HEIGHT)
-    with pytest.raises(BadModel, match="the configuration says"):
+    with pytest.raises(BadModel, match="the configuration has"):
         pipeline.train(config, tmp_path / "out", start=start)
     with pytest.raises(InvalidField, match="auto, cpu or cuda"):
         pipeline.train(config, tmp_path / "out", device="tpu")

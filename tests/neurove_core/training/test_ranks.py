@@ -1,4 +1,4 @@
-"""Several processes learn one model: the same bits in each, the same step as one; one that dies costs nothing."""
+"""Distributed training: all processes have the same bits, take the step of one process, and survive a lost process."""
 
 import copy
 import json
@@ -30,13 +30,13 @@ CONFIG, RECIPE = TINY, TINY.recipe
 
 @pytest.fixture(autouse=True)
 def _tests_can_be_imported(monkeypatch):
-    """By the processes that are started, which get this one's path: what they run stands in this file."""
+    """Started processes import this file, because it contains their function; they get the path of this process."""
     monkeypatch.syspath_prepend(str(Path(__file__).parents[3]))
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Sequences of noise: what is asked here does not depend on what is learned."""
+    """Sequences of noise: these tests do not depend on the content of the sequences."""
     folder, rng = tmp_path_factory.mktemp("noise"), np.random.default_rng(0)
     cache = data.Cache(folder, CONFIG)
     cache.folder.mkdir(parents=True)
@@ -61,8 +61,8 @@ def part(segment: Segment, first: int, stop: int) -> Segment:
     return Segment(segment.counts[:, first:stop], segment.twists[:, first:stop], segment.height_m[first:stop])
 
 
-def learn_apart(config, paths, out, ranks):
-    """What each rank does in the test below: an update on its half of one batch, then a whole run."""
+def train_as_rank(config, paths, out, ranks):
+    """Main function of each rank in the test below: an update on its half of a batch, then a complete run."""
     sequences = data.Sequences(paths)
     run = TrainingRun.begin(one_update(config), sequences, ranks)
     batch = draw(np.random.default_rng(5), sequences, run.config.recipe)
@@ -76,10 +76,10 @@ def learn_apart(config, paths, out, ranks):
     safetensors.torch.save_file(kept, out / f"rank-{ranks.rank}.safetensors")
 
 
-def test_two_processes_take_the_step_that_one_takes_and_end_with_the_same_bits(sequences, tmp_path):
+def test_two_processes_take_the_same_step_as_one_and_end_with_the_same_bits(sequences, tmp_path):
     arguments = (CONFIG, sequences.paths, tmp_path)
-    with process_group(2, "cpu", learn_apart, arguments) as ranks:
-        learn_apart(*arguments, ranks)
+    with process_group(2, "cpu", train_as_rank, arguments) as ranks:
+        train_as_rank(*arguments, ranks)
     one, other = (safetensors.torch.load_file(tmp_path / f"rank-{rank}.safetensors") for rank in (0, 1))
     assert one.keys() == other.keys()
     assert all(torch.equal(tensor, other[name]) for name, tensor in one.items())
@@ -95,7 +95,7 @@ def test_two_processes_take_the_step_that_one_takes_and_end_with_the_same_bits(s
     assert json.loads((tmp_path / RUN_JSON).read_text())["devices"] == 2
 
 
-def test_a_run_whose_second_process_dies_goes_on_to_where_it_would_have_come(folder, tmp_path):
+def test_a_run_that_lost_a_process_resumes_and_ends_with_the_same_weights(folder, tmp_path):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     at_once = train(CONFIG, whole, folder, devices=2)
 
@@ -116,8 +116,8 @@ def test_a_run_whose_second_process_dies_goes_on_to_where_it_would_have_come(fol
     assert "2 devices" in bundle.load(resumed).provenance
 
 
-def test_one_process_learns_what_the_recipe_says_bit_for_bit(folder, sequences, tmp_path):
-    """The loop written out plainly, without ranks."""
+def test_one_process_follows_the_recipe_bit_for_bit(folder, sequences, tmp_path):
+    """The reference is the plain loop, without ranks."""
     run = TrainingRun.begin(CONFIG, sequences)
     network, optimiser, rng, balance = run.network, run.optimiser, run.rng, run.balance
     for step in range(0, RECIPE.steps, RECIPE.chunks):
@@ -137,7 +137,7 @@ def test_one_process_learns_what_the_recipe_says_bit_for_bit(folder, sequences, 
 
 
 @pytest.mark.parametrize(("norm", "shape"), [(nn.BatchNorm1d(5), (7, 5)), (nn.BatchNorm2d(5), (3, 5, 4, 2))])
-def test_a_shared_norm_is_torchs_own(norm, shape):
+def test_a_shared_norm_computes_what_the_norm_of_torch_does(norm, shape):
     torch.manual_seed(0)
     nn.init.uniform_(norm.weight)
     nn.init.uniform_(norm.bias)
@@ -160,7 +160,7 @@ def test_a_batch_that_does_not_split_is_refused(folder, tmp_path, devices):
         train(CONFIG, tmp_path, folder, devices=devices)
 
 
-def test_a_device_is_what_there_is():
+def test_a_device_must_exist():
     assert device_of("cpu", 1, 2) == torch.device("cpu")
     with pytest.raises(InvalidField, match="auto, cpu or cuda"):
         device_of("tpu")

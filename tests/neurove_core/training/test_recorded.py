@@ -1,4 +1,4 @@
-"""Learning from recordings: the windows of the service, the truth that is known, and what is refused."""
+"""Training on recordings: windows as in the service, unknown truth, and errors."""
 
 import numpy as np
 import pytest
@@ -50,7 +50,7 @@ def test_a_recorded_simulation_gives_the_sequences_of_the_simulation(ours, tmp_p
     assert recorded.missing() == 1
     assert list(recorded.fill()) == ["drive.mcap"]
     learned, simulated = data.Sequences(recorded.paths()), data.sequence_of(open_source(SOURCE), MODEL)
-    assert [len(twists) for twists in learned.twists] == [10, 10]  # of the rest, 5 windows, no segment can be drawn
+    assert [len(twists) for twists in learned.twists] == [10, 10]  # the remaining 5 windows are too few for a segment
     for index in range(2):
         part = slice(10 * index, 10 * index + 10)
         np.testing.assert_array_equal(learned.counts(index, 0, 10), simulated.counts[part])
@@ -58,7 +58,7 @@ def test_a_recorded_simulation_gives_the_sequences_of_the_simulation(ours, tmp_p
         assert learned.height_m[index] == pytest.approx(simulated.height_m)
 
 
-def test_what_was_cut_is_not_cut_again_until_something_of_it_changes(ours, tmp_path):
+def test_a_recording_is_split_again_only_after_a_change(ours, tmp_path):
     assert list(RecordedSequences(tmp_path, learning_from(str(ours))).fill())
     assert not list(RecordedSequences(tmp_path, learning_from(str(ours))).fill())
     assert RecordedSequences(tmp_path, learning_from({"source": str(ours), "height_m": 3.0})).missing() == 1
@@ -69,13 +69,13 @@ def test_what_was_cut_is_not_cut_again_until_something_of_it_changes(ours, tmp_p
 
 
 def test_sequences_simulated_before_there_were_recordings_stay_valid(tmp_path):
-    """Should this fail, whoever has simulated a thousand sequences has to do it again."""
-    beside = TrainingConfig(data=DataConfig.model_validate({"recordings": ["FILE"]}))
-    for config in (configs.load("default"), TrainingConfig(), beside):
+    """If this fails, users must simulate all their sequences again."""
+    with_recordings = TrainingConfig(data=DataConfig.model_validate({"recordings": ["FILE"]}))
+    for config in (configs.load("default"), TrainingConfig(), with_recordings):
         assert data.Cache(tmp_path, config).folder.name == "84f87b804314bf9f"
 
 
-def test_a_model_learns_from_recordings_alone_and_says_so(ours, tmp_path):
+def test_a_model_trained_on_recordings_only_has_them_in_its_provenance(ours, tmp_path):
     config = learning_from(str(ours))
     list(RecordedSequences(tmp_path, config).fill())
     made = bundle.load(train(config, tmp_path / "out", tmp_path))
@@ -83,20 +83,20 @@ def test_a_model_learns_from_recordings_alone_and_says_so(ours, tmp_path):
     assert "1 recordings (drive.mcap)" in made.provenance
 
 
-def test_a_folder_is_the_recordings_in_it(ours, ecd, tmp_path):
-    (tmp_path / "notes.md").write_text("no recording")
+def test_a_folder_stands_for_the_recordings_in_it(ours, ecd, tmp_path):
+    (tmp_path / "notes.md").write_text("not a recording")
     write_mcap(open_source(SOURCE), tmp_path / "a.mcap")
     config = learning_from({"source": str(tmp_path), "height_m": 1.5})
     assert list(RecordedSequences(tmp_path / "data", config).fill()) == ["a.mcap", "slider"]
-    with pytest.raises(InvalidField, match="holds 2 recordings; name each"):
+    with pytest.raises(InvalidField, match="contains 2 recordings; list each"):
         RecordedSequences(tmp_path, learning_from({"source": str(tmp_path), "truth": "poses.txt"}))
     (tmp_path / "empty").mkdir()
-    with pytest.raises(UnknownSource, match="nor a folder that holds some"):
+    with pytest.raises(UnknownSource, match="nor a folder with recordings"):
         RecordedSequences(tmp_path, learning_from(str(tmp_path / "empty")))
 
 
 def test_linear_truth_needs_the_cameras_height(ecd, tmp_path):
-    with pytest.raises(InvalidField, match=r"data.recordings.0.height_m=None: .* how high its camera is"):
+    with pytest.raises(InvalidField, match=r"data.recordings.0.height_m=None: .* the height of its camera"):
         RecordedSequences(tmp_path, learning_from(str(ecd)))
     recorded = RecordedSequences(tmp_path, learning_from({"source": str(ecd), "height_m": 2.0}))
     list(recorded.fill())
@@ -105,35 +105,35 @@ def test_linear_truth_needs_the_cameras_height(ecd, tmp_path):
     assert set(learned.height_m) == {2.0}
 
 
-def test_poses_in_a_file_are_a_truth(ecd, tmp_path):
+def test_a_file_of_poses_serves_as_truth(ecd, tmp_path):
     truth = (ecd / "groundtruth.txt").rename(tmp_path / "poses.txt")
-    with pytest.raises(InvalidField, match=r"data.recordings.0.truth=None: .* holds no truth"):
+    with pytest.raises(InvalidField, match=r"data.recordings.0.truth=None: .* has no truth"):
         RecordedSequences(tmp_path, learning_from({"source": str(ecd), "height_m": 2.0}))
     given = {"source": str(ecd), "height_m": 2.0, "truth": str(truth)}
     assert list(RecordedSequences(tmp_path, learning_from(given)).fill()) == ["slider"]
 
 
-def test_what_can_not_be_learned_from_is_refused_with_its_field(ours, tmp_path):
+def test_unusable_recordings_are_refused_and_the_error_names_the_field(ours, tmp_path):
     with pytest.raises(InvalidField, match="never ends"):
         RecordedSequences(tmp_path, learning_from("sim://street"))
     short = RecordedSequences(tmp_path, learning_from(SOURCE.replace("1.3", "0.3")))
-    with pytest.raises(InvalidField, match=r"data.recordings.0.source=.*at most 5 windows in a row"):
+    with pytest.raises(InvalidField, match=r"data.recordings.0.source=.*at most 5 consecutive windows"):
         list(short.fill())
-    with pytest.raises(ValueError, match="nothing to learn from"):
+    with pytest.raises(ValueError, match="nothing to train on"):
         DataConfig(sequences=0)
     (tmp_path / "run.toml").write_text("[data]\nrecordings = ['a', {source = 'b', height_m = -1}]\n")
     with pytest.raises(InvalidField, match=r"data.recordings.1.height_m=-1"):
         configs.load(str(tmp_path / "run.toml"))
 
 
-def test_a_truth_of_some_axes_is_learned_from_and_the_others_do_not_pull(ours, tmp_path):
+def test_a_truth_of_some_axes_is_used_and_unknown_axes_do_not_count(ours, tmp_path):
     recording, config = open_source(str(ours)), learning_from(str(ours))
     truth = recording.twists()
     only_x = np.full_like(truth.twist, np.nan)
     only_x[:, 3] = truth.twist[:, 3]
     only_x[truth.t > 1_000_000, 3] = np.nan
     some = list(split_recording(recording, Twists(truth.t, only_x), 1.0, config))
-    assert [len(one.twists) for one in some] == [10, 10]  # beyond 1 s nothing is known
+    assert [len(one.twists) for one in some] == [10, 10]  # after 1 s the truth is unknown
     full = list(split_recording(recording, truth, 1.0, config))
     paths = [tmp_path / f"{index}.safetensors" for index in range(4)]
     for path, one in zip(paths, some + full[:2], strict=True):

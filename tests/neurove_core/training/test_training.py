@@ -1,4 +1,4 @@
-"""Training: sequences as the service sees them, augmentations that keep the truth true, runs that go on exactly."""
+"""Training: sequences with the windows of the service, augmentations with correct truth, and exact resumption."""
 
 import json
 from dataclasses import replace
@@ -69,7 +69,7 @@ def longer(steps):
     return TINY.model_copy(update={"recipe": TINY.recipe.model_copy(update={"steps": steps})})
 
 
-def test_a_sequence_has_the_counts_that_the_service_sees_and_the_truth_of_each_bin():
+def test_a_sequence_has_the_counts_of_the_service_and_the_truth_of_each_bin():
     simulation = data.draw_simulation(TINY.data, 0)
     sequence = data.sequence_of(simulation, MODEL)
     assert sequence.counts.shape == (10, 10, 16, 22)
@@ -91,7 +91,7 @@ def test_a_sequence_has_the_counts_that_the_service_sees_and_the_truth_of_each_b
     np.testing.assert_allclose(sequence.twists[3, 2], twist, rtol=1e-3, atol=1e-4)
 
 
-def test_sequences_are_drawn_by_seed_and_number_alone():
+def test_a_sequence_depends_only_on_its_seed_and_number():
     first, again, other = (data.draw_simulation(TINY.data, index) for index in (1, 1, 2))
     assert (first.name, first.pixels, first.lens) == (again.name, again.pixels, again.lens)
     assert first.pixels != other.pixels
@@ -99,14 +99,14 @@ def test_sequences_are_drawn_by_seed_and_number_alone():
     assert 0.3 <= min(heights) < 0.8 < 1.5 < max(heights) <= 2.5
 
 
-def test_what_is_cached_is_not_made_again_and_another_recipe_has_its_own(folder):
+def test_cached_sequences_are_not_simulated_again_and_other_data_settings_have_their_own(folder):
     assert not list(data.Cache(folder, TINY).fill())
     assert len(data.Cache(folder, longer(50)).missing()) == 0
     other = TINY.model_copy(update={"data": TINY.data.model_copy(update={"seed": 5})})
     assert len(data.Cache(folder, other).missing()) == 3
 
 
-def test_a_broken_sequence_is_named(folder, tmp_path):
+def test_the_error_about_a_broken_sequence_names_its_file(folder, tmp_path):
     cache = data.Cache(tmp_path, TINY)
     cache.folder.mkdir(parents=True)
     whole = data.Cache(folder, TINY).path(0).read_bytes()
@@ -116,7 +116,7 @@ def test_a_broken_sequence_is_named(folder, tmp_path):
         cache.open()
 
 
-def test_a_mirror_turns_what_it_turns_and_twice_is_nothing():
+def test_a_mirror_inverts_the_right_axes_and_two_mirrors_cancel():
     counts = np.random.default_rng(0).integers(0, 9, (3, 4, 5, 6)).astype(np.uint8)
     twists = np.arange(1, 37, dtype=np.float32).reshape(3, 2, 6)
     seen, truth = mirrored(counts, twists)
@@ -146,12 +146,12 @@ def test_a_flip_swaps_the_polarities_of_each_bin():
     assert polarity_flipped(counts).ravel().tolist() == [1, 0, 3, 2, 5, 4]
 
 
-def test_twice_the_speed_is_what_a_camera_that_turns_twice_as_fast_sees():
+def test_doubled_speed_looks_like_a_camera_that_turns_twice_as_fast():
     def turning(rate, seconds):
         calm = PixelConfig(leak_hz=0, shot_noise_hz=0, threshold_sigma=0, refractory_us=0)
         camera = named_camera("pinhole:44x32:80")
-        way = Mounted(rotation(0, rate, 0, seconds), camera.height_m, camera.pitch_deg)
-        return data.sequence_of(Simulation("room", named_scene("room"), way, camera, calm, 7, seconds), MODEL)
+        trajectory = Mounted(rotation(0, rate, 0, seconds), camera.height_m, camera.pitch_deg)
+        return data.sequence_of(Simulation("room", named_scene("room"), trajectory, camera, calm, 7, seconds), MODEL)
 
     slow, fast = turning(1.0, 0.4), turning(2.0, 0.2)
     counts, twists = doubled(slow.counts, slow.twists)
@@ -161,7 +161,7 @@ def test_twice_the_speed_is_what_a_camera_that_turns_twice_as_fast_sees():
     assert np.corrcoef(counts.ravel(), fast.counts.ravel())[0, 1] > 0.9
 
 
-def test_backwards_and_back_again_is_what_it_was_and_every_velocity_turns_around():
+def test_reversed_time_inverts_every_velocity_and_twice_is_the_original():
     counts = np.random.default_rng(0).integers(0, 9, (3, 4, 5, 6)).astype(np.uint8)
     twists = np.arange(1, 37, dtype=np.float32).reshape(3, 2, 6)
     seen, truth = backwards(counts, twists)
@@ -171,22 +171,22 @@ def test_backwards_and_back_again_is_what_it_was_and_every_velocity_turns_around
     assert (backwards(seen, truth)[1] == twists).all()
 
 
-def test_a_count_that_is_doubled_does_not_wrap():
+def test_doubled_counts_saturate():
     counts = np.full((2, 2, 1, 1), 200, np.uint8)
     assert (doubled(counts, np.zeros((2, 1, 6), np.float32))[0] == 255).all()
 
 
-@pytest.mark.parametrize("way", ["waved", "turned", "slid", "spun"])
-def test_each_way_of_a_hand_moves_and_turns_as_its_name_says(way):
-    config = DataConfig(seconds=2.0, scenes={"room": 1.0}, hands={way: 1.0})
+@pytest.mark.parametrize("motion", ["waved", "turned", "slid", "spun"])
+def test_each_hand_held_motion_moves_and_turns_as_its_name_says(motion):
+    config = DataConfig(seconds=2.0, scenes={"room": 1.0}, hands={motion: 1.0})
     for index in range(3):
         twist = data.draw_simulation(config, index).trajectory.twist(np.linspace(0, 2, 50))
         speed, rate = np.linalg.norm(twist[:, :3], axis=1).max(), np.linalg.norm(twist[:, 3:], axis=1).max()
-        assert (speed > 1e-3) == (way in ("waved", "slid"))
-        assert (rate > 1e-3) == (way != "slid")
+        assert (speed > 1e-3) == (motion in ("waved", "slid"))
+        assert (rate > 1e-3) == (motion != "slid")
 
 
-def test_gain_and_noise_change_the_mean_as_told_and_never_wrap():
+def test_gain_and_noise_change_the_mean_as_requested_and_saturate():
     rng = np.random.default_rng(0)
     counts = rng.poisson(0.5, (20, 4, 30, 30)).astype(np.uint8)
     for gain in (0.5, 3.0):
@@ -197,7 +197,7 @@ def test_gain_and_noise_change_the_mean_as_told_and_never_wrap():
     assert (with_noise(rng, full, 5.0) == 255).all()
 
 
-def test_a_camera_at_rest_sees_noise_whose_pixels_differ_and_no_motion(sequences):
+def test_a_stationary_camera_sees_noise_that_differs_between_pixels_and_no_motion(sequences):
     rng = np.random.default_rng(3)
     noise = stationary(rng, (40, 10, 16, 22), 0.3)
     assert noise.dtype == np.uint8
@@ -210,7 +210,7 @@ def test_a_camera_at_rest_sees_noise_whose_pixels_differ_and_no_motion(sequences
     assert float(segment.counts.float().mean()) == pytest.approx(0.2, rel=0.2)
 
 
-def test_holes_come_after_something_was_seen_and_the_camera_moves_on_through_them(sequences):
+def test_gaps_come_after_complete_windows_and_the_camera_moves_during_them(sequences):
     recipe = RecipeConfig(segment_windows=48, holes=1.0)
     counts = np.random.default_rng(1).integers(1, 9, (48, 4, 5, 6), np.uint8)
     rng, lengths = np.random.default_rng(0), []
@@ -226,12 +226,12 @@ def test_holes_come_after_something_was_seen_and_the_camera_moves_on_through_the
     assert 15 <= max(lengths) <= 20
     whole = TINY.recipe.model_copy(update={"holes": 1.0, "segment_windows": 10, "doubled": 0.0})
     segment = draw(np.random.default_rng(1), sequences, whole)
-    still = ~segment.counts.flatten(2).any(2).T  # (B, S)
-    assert still.any()
-    assert all(segment.twists[hole, stream].any() for stream, row in enumerate(still) for hole in row.nonzero())
+    empty = ~segment.counts.flatten(2).any(2).T  # (B, S)
+    assert empty.any()
+    assert all(segment.twists[gap, stream].any() for stream, row in enumerate(empty) for gap in row.nonzero())
 
 
-def test_few_events_come_from_some_window_on_and_not_before():
+def test_events_are_removed_only_from_a_random_window_on():
     recipe = RecipeConfig(thinned=1.0, thinned_to=(0.1, 0.1))
     counts = np.full((32, 4, 20, 20), 3, np.uint8)
     for seed in range(10):
@@ -242,7 +242,7 @@ def test_few_events_come_from_some_window_on_and_not_before():
         assert means[first:] == pytest.approx(0.3, rel=0.15)
 
 
-def test_of_one_polarity_there_are_so_many_times_more_and_as_many_together():
+def test_the_ratio_of_polarities_changes_by_the_factor_and_the_geometric_mean_stays():
     counts = np.random.default_rng(0).poisson(2.0, (20, 4, 30, 30)).astype(np.uint8)
     seen = lopsided(np.random.default_rng(1), counts, 4.0)
     assert seen[:, 1::2].mean() == pytest.approx(4.0, rel=0.02)
@@ -266,12 +266,12 @@ def test_hot_pixels_are_few_and_fire_in_every_window():
     ("section", "field", "value"),
     [("data", "spun_axis", [0, 0, 0]), ("data", "spun_rad_s", [0, 1]), ("recipe", "hole_windows", [0, 3])],
 )
-def test_a_span_that_has_no_logarithm_and_an_axis_without_length_are_refused(section, field, value):
+def test_a_log_uniform_span_from_zero_and_an_axis_of_length_zero_are_refused(section, field, value):
     with pytest.raises(ValidationError, match=field):
         TrainingConfig.model_validate({section: {field: value}})
 
 
-def test_a_run_that_goes_on_from_its_checkpoint_ends_as_one_that_was_never_stopped(folder, tmp_path):
+def test_a_resumed_run_ends_with_the_weights_of_an_uninterrupted_run(folder, tmp_path):
     whole, parts = tmp_path / "whole", tmp_path / "parts"
     at_once = train(TINY, whole, folder)
 
@@ -293,7 +293,7 @@ def test_a_run_that_goes_on_from_its_checkpoint_ends_as_one_that_was_never_stopp
     assert [point["linear_error_m_s"] for point in curves[0]] == [point["linear_error_m_s"] for point in curves[1]]
 
 
-def test_a_finished_run_goes_on_for_another_cycle_as_if_it_had_been_planned(folder, tmp_path):
+def test_a_finished_run_continues_for_another_cycle_as_if_planned_from_the_start(folder, tmp_path):
     recipe = TINY.recipe.model_copy(update={"cycles": 2})
     planned = TINY.model_copy(update={"recipe": recipe})
     at_once = bundle.load(train(planned, tmp_path / "planned", folder))
@@ -302,11 +302,11 @@ def test_a_finished_run_goes_on_for_another_cycle_as_if_it_had_been_planned(fold
     assert longer_run.metadata.made_by.updates == 2 * TINY.recipe.steps
     weights = longer_run.network.state_dict()
     assert all(torch.equal(tensor, weights[name]) for name, tensor in at_once.network.state_dict().items())
-    with pytest.raises(BadModel, match="recipe.cycles=2, the configuration says 1"):
+    with pytest.raises(BadModel, match="recipe.cycles=2, the configuration has 1"):
         train(TINY, tmp_path / "longer", folder, resume=True)
 
 
-def test_a_run_begins_from_a_model_where_one_is_given(folder, sequences, tmp_path):
+def test_a_run_begins_from_the_weights_of_a_given_model(folder, sequences, tmp_path):
     first = bundle.load(train(TINY, tmp_path / "first", folder))
     network = MODEL.network.model_copy(update={"precision": "int8", "surrogate": "arctan"})
     config = TINY.model_copy(update={"model": MODEL.model_copy(update={"network": network, "settle_windows": 3})})
@@ -323,7 +323,7 @@ def test_a_run_begins_from_a_model_where_one_is_given(folder, sequences, tmp_pat
     assert resumed.digest == made.digest
 
 
-def test_a_model_with_a_measure_of_its_errors_is_begun_from_without_it(folder, sequences, tmp_path):
+def test_the_uncertainty_of_a_start_model_is_not_copied(folder, sequences, tmp_path):
     first = bundle.load(train(TINY, tmp_path, folder))
     first.network.add_spread()
     assert TrainingRun.begin(TINY, sequences, start=first).network.spread is None
@@ -332,9 +332,9 @@ def test_a_model_with_a_measure_of_its_errors_is_begun_from_without_it(folder, s
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        ({"network": MODEL.network.model_copy(update={"hidden": 8})}, "network.hidden=16, the configuration says 8"),
-        ({"canonical": CanonicalConfig(width=20, height=16)}, "canonical.width=22, the configuration says 20"),
-        ({"kind": "ann"}, "kind=neurove, the configuration says ann"),
+        ({"network": MODEL.network.model_copy(update={"hidden": 8})}, "network.hidden=16, the configuration has 8"),
+        ({"canonical": CanonicalConfig(width=20, height=16)}, "canonical.width=22, the configuration has 20"),
+        ({"kind": "ann"}, "kind=neurove, the configuration has ann"),
     ],
 )
 def test_a_run_does_not_begin_from_a_model_of_another_shape(sequences, change, why):
@@ -343,21 +343,21 @@ def test_a_run_does_not_begin_from_a_model_of_another_shape(sequences, change, w
         TrainingRun.begin(TINY.model_copy(update={"model": MODEL.model_copy(update=change)}), sequences, start=start)
 
 
-def test_a_run_does_not_begin_from_a_model_that_answers_in_another_unit(sequences):
+def test_a_run_does_not_begin_from_a_model_with_another_linear_unit(sequences):
     with pytest.raises(BadModel, match="linear_unit='m/s'"):
         TrainingRun.begin(TINY, sequences, start=bundle.untrained(config=MODEL))
 
 
-def test_a_checkpoint_of_another_recipe_is_refused_with_the_field_that_differs(folder, tmp_path):
+def test_a_checkpoint_of_another_recipe_is_refused_and_the_error_names_the_field(folder, tmp_path):
     train(TINY, tmp_path, folder)
-    with pytest.raises(BadModel, match="recipe.steps=12, the configuration says 16"):
+    with pytest.raises(BadModel, match="recipe.steps=12, the configuration has 16"):
         train(longer(16), tmp_path, folder, resume=True)
     (tmp_path / CHECKPOINT).write_bytes(b"no checkpoint")
-    with pytest.raises(BadModel, match="no checkpoint to go on from"):
+    with pytest.raises(BadModel, match="not a usable checkpoint"):
         train(TINY, tmp_path, folder, resume=True)
 
 
-def test_a_few_updates_learn_something(sequences):
+def test_the_loss_falls_within_a_few_hundred_updates(sequences):
     recipe = TINY.recipe.model_copy(update={"steps": 400, "learning_rate": 0.01})
     run = TrainingRun.begin(TINY.model_copy(update={"recipe": recipe}), sequences)
     losses = [train_segment(run, draw(run.rng, sequences, recipe)) for _ in range(100)]
@@ -365,7 +365,7 @@ def test_a_few_updates_learn_something(sequences):
     assert last < 0.8 * first
 
 
-def test_the_trained_bundle_says_what_it_is(folder, tmp_path):
+def test_the_trained_bundle_has_its_provenance_and_unit(folder, tmp_path):
     made = bundle.load(train(TINY, tmp_path, folder))
     assert made.trained
     assert made.linear_unit == "1/s per m of height"
@@ -373,11 +373,11 @@ def test_the_trained_bundle_says_what_it_is(folder, tmp_path):
     assert json.loads((tmp_path / RUN_JSON).read_text())["config"] == TINY.model_dump(mode="json")
 
 
-def test_the_trained_bundle_tells_how_it_was_made_and_brings_windows_it_was_trained_on(folder, sequences, tmp_path):
+def test_the_trained_bundle_records_its_recipe_and_has_a_golden_test_of_training_windows(folder, sequences, tmp_path):
     made = bundle.load(train(TINY, tmp_path, folder))
-    told = made.metadata.made_by
-    assert (told.program, told.seed, told.updates) == ("neurove train tiny", 0, 12)
-    assert TrainingConfig(name="tiny", model=made.config, data=told.data, recipe=told.recipe) == TINY
+    made_by = made.metadata.made_by
+    assert (made_by.program, made_by.seed, made_by.updates) == ("neurove train tiny", 0, 12)
+    assert TrainingConfig(name="tiny", model=made.config, data=made_by.data, recipe=made_by.recipe) == TINY
     curve = json.loads((tmp_path / RUN_JSON).read_text())["curve"]
     assert made.metadata.figures == {
         f"training_{name}": curve[-1][name] for name in ("linear_error_m_s", "angular_error_rad_s")
@@ -389,7 +389,7 @@ def test_the_trained_bundle_tells_how_it_was_made_and_brings_windows_it_was_trai
 
 
 class Busy:
-    """Sequences whose every cell sees something in every window."""
+    """Sequences with events in every cell of every window."""
 
     def __init__(self, windows, cells):
         self._seen = np.ones((windows, 10, cells, 10), np.uint8)
@@ -404,7 +404,7 @@ class Busy:
 
 
 @pytest.mark.parametrize(("cells", "windows"), [(100, 12), (300, 3), (1_000, 1), (5_000, 1)])
-def test_golden_windows_are_fewer_where_they_would_make_a_bundle_too_large(cells, windows):
+def test_large_grids_have_fewer_golden_windows(cells, windows):
     assert golden_windows(Busy(20, cells)).shape == (windows, 10, cells, 10)
     assert golden_windows(Busy(4, 10)).shape == (4, 10, 10, 10)
 
@@ -418,12 +418,12 @@ def test_the_learning_rate_rises_falls_and_ends_at_zero():
     assert np.all(np.diff(rates[10:]) < 0)
 
 
-def test_the_default_model_learned_by_three_configurations_of_one_network():
+def test_the_configurations_of_the_default_model_share_one_network():
     first, then, last = (configs.load(name) for name in ("default", "longer", "rest"))
     assert {one.name for one in (first, then, last)} == {"default"}
     assert first.model == then.model == last.model
     seeds = [set(range(one.data.seed, one.data.seed + one.data.sequences)) for one in (first, then)]
-    assert not seeds[0] & seeds[1]  # what was learned is not learned again
+    assert not seeds[0] & seeds[1]  # no sequence is used in both
     assert configs.load("int8").data == last.data == then.data
 
 
@@ -434,18 +434,18 @@ def test_the_default_model_learned_by_three_configurations_of_one_network():
         ("[recipe]\nsteps = 0", "recipe.steps=0: Input should be greater than or equal to 1"),
         ("[recipe]\nsegment_windows = 30", "chunks of 8"),
         ("[data]\nseconds = 0.5", "a sequence has 10 windows"),
-        ("[data]\nheight_m = [2.0, 1.0]", "least value comes first"),
+        ("[data]\nheight_m = [2.0, 1.0]", "lower value must come first"),
         ("unknown = 1", "unknown"),
         ("= 1", "not TOML"),
     ],
 )
-def test_a_wrong_configuration_is_refused_with_what_is_wrong(tmp_path, text, why):
+def test_an_invalid_configuration_is_refused_and_the_error_names_the_fault(tmp_path, text, why):
     path = tmp_path / "run.toml"
     path.write_text(text)
     with pytest.raises(InvalidField, match=why):
         configs.load(str(path))
 
 
-def test_a_missing_configuration_tells_which_there_are():
+def test_the_error_about_a_missing_configuration_lists_the_built_in_ones():
     with pytest.raises(InvalidField, match="default"):
         configs.load("nowhere.toml")

@@ -128,7 +128,7 @@ def test_a_wrong_configuration_ends_in_one_line(run, tmp_path):
 def test_a_start_model_of_another_shape_is_refused_before_the_simulation(run, tmp_path):
     code, _, err = run("train", "velocity-quick", "--start", "default", "--out", str(tmp_path / "out"))
     assert code == 2
-    assert err.strip() == "neurove: model default: it has canonical.width=86, the configuration says 22"
+    assert err.strip() == "neurove: model default: it has canonical.width=86, the configuration has 22"
     assert not (tmp_path / "out").exists()
 
 
@@ -149,7 +149,7 @@ def test_training_ends_with_a_calibrated_model_and_calibrate_reports_its_coverag
     assert text.startswith(f"wrote {out}\nshare of the truth in the 90% interval")
     assert bundle.load(out).digest == bundle.load(path).digest
     code, text, _ = run(*arguments, "--calibration-sequences", "16", "--out", str(out), "--json")
-    assert json.loads(text)["groups"]["as it is"]["vz"]["0.9"] > 0.8
+    assert json.loads(text)["groups"]["unchanged"]["vz"]["0.9"] > 0.8
 
 
 def test_evaluate_reports_the_coverage_of_a_calibrated_model_and_draws_its_reliability(trained, run, tmp_path):
