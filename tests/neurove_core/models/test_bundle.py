@@ -133,9 +133,9 @@ def test_a_flipped_bit_of_the_header_is_refused_or_makes_another_model(bit):
         assert_refused_or_another_model(bytes(flipped))
 
 
-@given(where=st.integers(0, len(DATA)), junk=st.binary(max_size=40), cut=st.integers(0, 40))
-def test_inserted_or_overwritten_bytes_are_refused_or_make_another_model(where, junk, cut):
-    data = DATA[:where] + junk + DATA[where + cut :]
+@given(where=st.integers(0, len(DATA)), junk=st.binary(max_size=40), removed=st.integers(0, 40))
+def test_inserted_or_overwritten_bytes_are_refused_or_make_another_model(where, junk, removed):
+    data = DATA[:where] + junk + DATA[where + removed :]
     if data != DATA:
         assert_refused_or_another_model(data)
 

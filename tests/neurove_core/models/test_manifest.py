@@ -133,9 +133,9 @@ def test_a_flipped_bit_of_a_signature_file_is_refused_or_changes_nothing(where, 
     assert_refused_or_the_same(bytes(flipped))
 
 
-@given(where=st.integers(0, len(SIGNATURE)), junk=st.binary(max_size=20), cut=st.integers(0, 20))
-def test_inserted_bytes_in_a_signature_file_are_refused_or_change_nothing(where, junk, cut):
-    assert_refused_or_the_same(SIGNATURE[:where] + junk + SIGNATURE[where + cut :])
+@given(where=st.integers(0, len(SIGNATURE)), junk=st.binary(max_size=20), removed=st.integers(0, 20))
+def test_inserted_bytes_in_a_signature_file_are_refused_or_change_nothing(where, junk, removed):
+    assert_refused_or_the_same(SIGNATURE[:where] + junk + SIGNATURE[where + removed :])
 
 
 def assert_refused_or_the_same(signature):
@@ -214,9 +214,9 @@ def test_a_manifest_that_is_none_is_refused_even_if_it_was_signed(signature, wor
     assert words in refusal("malformed", signature=signature)
 
 
-@pytest.mark.parametrize("lie", [{"name": "other"}, {"config_sha256": "0" * 64}])
-def test_a_manifest_that_names_another_model_than_the_bundle_is_refused(lie):
-    refusal("manifest", signature=manifest_with(**lie))
+@pytest.mark.parametrize("changes", [{"name": "other"}, {"config_sha256": "0" * 64}])
+def test_a_manifest_that_names_another_model_than_the_bundle_is_refused(changes):
+    refusal("manifest", signature=manifest_with(**changes))
 
 
 def test_bytes_that_are_not_a_bundle_are_never_signed_and_never_accepted():
