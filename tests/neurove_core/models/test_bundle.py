@@ -25,10 +25,10 @@ from tests.bundles import (
     CONFIG,
     DATA,
     ORIGINAL,
+    join_header,
     make_bundle,
-    packed,
     refusal,
-    unpacked,
+    split_header,
     with_entries,
     with_fields,
     with_tensors,
@@ -127,7 +127,7 @@ def test_a_flipped_bit_is_refused_or_makes_another_model(where, bit):
 
 @pytest.mark.parametrize("bit", range(8))
 def test_a_flipped_bit_of_the_header_is_refused_or_makes_another_model(bit):
-    for where in range(0, len(DATA) - len(unpacked()[1]), 7):
+    for where in range(0, len(DATA) - len(split_header()[1]), 7):
         flipped = bytearray(DATA)
         flipped[where] ^= 1 << bit
         assert_refused_or_another_model(bytes(flipped))
@@ -143,7 +143,7 @@ def test_inserted_or_overwritten_bytes_are_refused_or_make_another_model(where, 
 @given(st.binary(max_size=300))
 def test_any_bytes_are_refused(data):
     refusal(data)
-    refusal(packed(data))
+    refusal(join_header(data))
 
 
 @pytest.mark.parametrize(
@@ -152,16 +152,16 @@ def test_any_bytes_are_refused(data):
         (b"", "size=0"),
         (b"\x00" * 7, "size=7"),
         (b"# a text file, not a model\n" * 40, "not a safetensors file"),
-        (packed(b"not json"), "cannot be read"),
-        (packed(b""), "cannot be read"),
-        (packed(b"\xff\xfe\xfd"), "cannot be read"),
-        (packed(b"[" * 100_000), "cannot be read"),
-        (packed(b"[]"), "no 'neurove' entry"),
-        (packed(b"{}"), "no 'neurove' entry"),
-        (packed(b'{"__metadata__": 3}'), "no 'neurove' entry"),
-        (packed(b'{"__metadata__": {"neurove": 3}}'), "no 'neurove' entry"),
-        (packed(b'{"__metadata__": {"neurove": "{"}}'), "cannot be read"),
-        (packed(b'{"__metadata__": {"neurove": "[1]"}}'), "bundle_version=None"),
+        (join_header(b"not json"), "cannot be read"),
+        (join_header(b""), "cannot be read"),
+        (join_header(b"\xff\xfe\xfd"), "cannot be read"),
+        (join_header(b"[" * 100_000), "cannot be read"),
+        (join_header(b"[]"), "no 'neurove' entry"),
+        (join_header(b"{}"), "no 'neurove' entry"),
+        (join_header(b'{"__metadata__": 3}'), "no 'neurove' entry"),
+        (join_header(b'{"__metadata__": {"neurove": 3}}'), "no 'neurove' entry"),
+        (join_header(b'{"__metadata__": {"neurove": "{"}}'), "cannot be read"),
+        (join_header(b'{"__metadata__": {"neurove": "[1]"}}'), "bundle_version=None"),
         (safetensors.torch.save({"weight": torch.zeros(3)}), "no 'neurove' entry"),
         (safetensors.torch.save({"weight": torch.zeros(3)}, {"format": "pt"}), "no 'neurove' entry"),
     ],
@@ -180,8 +180,8 @@ def test_a_wrong_header_length_is_refused(length):
 
 def test_a_header_above_its_limit_is_refused_even_if_it_is_complete():
     padding = " " * bundle.MAX_HEADER_BYTES
-    entries, tensors = unpacked()
-    assert str(bundle.MAX_HEADER_BYTES) in refusal(packed((json.dumps(entries) + padding).encode(), tensors))
+    entries, tensors = split_header()
+    assert str(bundle.MAX_HEADER_BYTES) in refusal(join_header((json.dumps(entries) + padding).encode(), tensors))
 
 
 @pytest.mark.parametrize("version", [0, 2, None, "1", [1], {"a": [[[[[[[1]]]]]]]}])
@@ -222,23 +222,23 @@ def test_a_wrong_header_field_is_named_with_its_value_and_bound(edit, words):
 @pytest.mark.parametrize("depth", [100, 900, 5_000])
 @pytest.mark.parametrize("field", ["config", "name", "bundle_version"])
 def test_a_deeply_nested_header_is_refused_with_a_short_message(field, depth):
-    entries, tensors = unpacked()
+    entries, tensors = split_header()
     fields = json.loads(entries["__metadata__"]["neurove"])
     text = json.dumps({**fields, field: "HERE"}).replace('"HERE"', "[" * depth + "]" * depth)
     entries["__metadata__"]["neurove"] = text
-    assert len(refusal(packed(json.dumps(entries).encode(), tensors))) < 500
+    assert len(refusal(join_header(json.dumps(entries).encode(), tensors))) < 500
 
 
 @pytest.mark.parametrize("level", ["tensors", "metadata", "own"])
 def test_a_duplicate_key_is_refused(level):
-    header = DATA[8 : len(DATA) - len(unpacked()[1])].decode()
+    header = DATA[8 : len(DATA) - len(split_header()[1])].decode()
     twice = {
         "tensors": header.replace(',"kappa_logit"', ',"kappa_logit":1,"kappa_logit"', 1),
         "metadata": header.replace('{"neurove":', '{"neurove":"{}","neurove":', 1),
         "own": header.replace('{\\"bundle_version\\":1', '{\\"trained\\":true,\\"bundle_version\\":1', 1),
     }[level]
     assert twice != header
-    assert "twice" in refusal(packed(twice.encode(), unpacked()[1]))
+    assert "twice" in refusal(join_header(twice.encode(), split_header()[1]))
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])

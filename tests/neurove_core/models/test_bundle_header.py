@@ -13,7 +13,7 @@ from neurove_core.models import bundle, golden, manifest
 from neurove_core.models.bundle import Header
 from neurove_core.models.metadata import BundleLimits, MadeBy, Metadata
 from neurove_protocol.errors import BadModel
-from tests.bundles import CONFIG, DATA, ORIGINAL, packed, refusal, unpacked, with_entries, with_fields
+from tests.bundles import CONFIG, DATA, ORIGINAL, join_header, refusal, split_header, with_entries, with_fields
 
 METADATA = Metadata(
     release=7,
@@ -86,7 +86,7 @@ def test_metadata_is_saved_and_loaded_unchanged():
 
 
 def test_a_bundle_without_metadata_has_only_the_required_header_fields():
-    fields = json.loads(unpacked(DATA)[0]["__metadata__"]["neurove"])
+    fields = json.loads(split_header(DATA)[0]["__metadata__"]["neurove"])
     assert list(fields) == [
         "bundle_version",
         "name",
@@ -132,10 +132,10 @@ def test_a_wrong_field_is_named_with_its_value_and_bound(path, value, words):
 
 @pytest.mark.parametrize("depth", [100, 240, 300, 900, 5_000, 100_000])
 def test_a_deeply_nested_recipe_is_accepted_or_refused_with_a_short_message(depth):
-    entries, tensors = unpacked(bytes_with_metadata())
+    entries, tensors = split_header(bytes_with_metadata())
     text = entries["__metadata__"]["neurove"].replace('{"sequences":112}', '{"x":' + "[" * depth + "]" * depth + "}")
     entries["__metadata__"]["neurove"] = text
-    data = packed(json.dumps(entries).encode(), tensors)
+    data = join_header(json.dumps(entries).encode(), tensors)
     if depth < 250:
         assert bundle.from_bytes(data, "x").metadata.made_by is not None
     else:
@@ -155,8 +155,8 @@ def test_any_value_in_any_field_is_accepted_or_refused_with_a_short_message(path
 
 @given(st.dictionaries(st.text(max_size=12), VALUES, max_size=6))
 def test_random_headers_are_refused(fields):
-    refusal(packed(json.dumps({"__metadata__": {"neurove": json.dumps(fields)}}).encode()))
-    refusal(packed(json.dumps(fields).encode()))
+    refusal(join_header(json.dumps({"__metadata__": {"neurove": json.dumps(fields)}}).encode()))
+    refusal(join_header(json.dumps(fields).encode()))
 
 
 def test_two_hundred_thousand_empty_tensors_are_refused_before_any_is_created():

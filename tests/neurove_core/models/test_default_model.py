@@ -1,5 +1,7 @@
 """The default model: small, complete, and better than any predictor that ignores the events."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +27,11 @@ def test_it_is_trained_and_small_and_has_its_provenance():
     file = Path(models.__file__).with_name("default.safetensors")
     assert file.stat().st_size <= 8 << 20
     assert bundle.load(file).digest == found.digest
+
+
+def test_importing_the_package_of_models_does_not_load_torch():
+    program = "import sys, neurove_core.models; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
 
 
 @pytest.mark.parametrize("height_m", [0.5, 2.0])
