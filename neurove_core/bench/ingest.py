@@ -1,4 +1,4 @@
-"""From events to counts, from events to an estimate, from a camera's words to events."""
+"""Benchmarks from events to counts, from events to an estimate, and from the words of a camera to events."""
 
 import tempfile
 from collections.abc import Callable
@@ -27,7 +27,7 @@ BINS, DURATION_US = 10, 50_000
 
 
 def ingest(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool) -> list[Row]:
-    """Events of one window to counts [2n, H, W] of a DAVIS346; the limit is to add to cells that are already known."""
+    """Events of one window to counts (2n, H, W) of a DAVIS346. The limit is adding to cells that are already known."""
     found: list[Row] = []
     for n in (5_000,) if quick else (100_000, 1_000_000):
         events = sweeping_edge(n)
@@ -43,7 +43,7 @@ def ingest(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool
             name: bool(np.array_equal(np.minimum(run(), 255), expected)) for name, run in runs.items() if name != "ours"
         }
         if "tonic" in equal:
-            equal["tonic"] = None  # it cuts the bins at other times, and drops the last events
+            equal["tonic"] = None  # its bins end at other times, and it drops the last events
         times = interleaved({**runs, "limit": _increments(known)}, rounds)
         found += rows(f"ingest {n:.0e} events, 346x260, n=10", times, equal, times["limit"])
     return found
@@ -61,7 +61,7 @@ def _counted(count: Callable[..., int], events: Events) -> Callable[[], NDArray[
 
 
 def _increments(known: NDArray[np.uint32]) -> Callable[[], None]:
-    """To add to cells that are known: what is left of counting when all else costs nothing."""
+    """Adds to known cells: the part of counting that cannot be avoided."""
 
     def run() -> None:
         _increment(known, np.zeros(2 * BINS * SENSOR.height * SENSOR.width, np.uint8))
@@ -70,7 +70,7 @@ def _increments(known: NDArray[np.uint32]) -> Callable[[], None]:
 
 
 def end_to_end(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool) -> list[Row]:
-    """Events of one window to its estimate, 1e5 events of a DAVIS346, from rest."""
+    """Events of one window to its estimate: 1e5 events of a DAVIS346, from the zero state."""
     found: list[Row] = []
     shapes = {"tiny": window.TINY} if quick else {"shipped": window.SHIPPED, "reference, T=1": window.REFERENCE}
     events = sweeping_edge(5_000 if quick else 100_000)
@@ -102,9 +102,7 @@ def end_to_end(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: 
 
 
 def _estimated(estimator: Estimator, events: Events) -> Callable[[], NDArray[Any]]:
-    initial = estimator.initial_state(
-        SENSOR
-    )  # its network state and look-up table, as a stream has them; no window is open
+    initial = estimator.initial_state(SENSOR)  # with the look-up table of the stream; no window is open
 
     def run() -> NDArray[Any]:
         return estimator.push(events, initial, DURATION_US).estimates[0].twists
@@ -113,7 +111,7 @@ def _estimated(estimator: Estimator, events: Events) -> Callable[[], NDArray[Any
 
 
 def _in_steps(counts: Callable[[], NDArray[np.uint8]], network: NeuroVE) -> Callable[[], NDArray[Any]]:
-    """Counts to a network's input to its answer, in plain PyTorch or a peer's neurons, from rest."""
+    """Counts to network input to estimate, in plain PyTorch or with a peer's neurons, from the zero state."""
     initial, encoding = network.initial_state(1), network.config.network.encoding
 
     @torch.inference_mode()
@@ -139,7 +137,7 @@ def _numpy_counts(config: ModelConfig, events: Events) -> Callable[[], NDArray[n
 
 
 def _tonic_counts(tonic: Any, config: ModelConfig, events: Events) -> Callable[[], NDArray[np.uint8]]:
-    """Its frames, of events that are on the network's grid already: scaling is not timed."""
+    """Frames of tonic, from events that are already on the network's grid: the scaling is not timed."""
     grid, bins = config.canonical, config.window.bins
     fields, cell = _structured(events), lookup_table(grid, SENSOR, None)[events.y, events.x]
     fields["x"], fields["y"] = cell % grid.width, cell // grid.width
@@ -173,13 +171,13 @@ def decode(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool
             runs["faery"] = theirs
             equal["faery"] = _same_events(theirs(), ours())
         times = interleaved(runs, rounds)
-        if not equal:  # nobody to compare with: our own figure alone
+        if not equal:  # no peer is installed: compare with the written events
             times["written"], equal["written"] = times["ours"], _same_events([_structured(events)], ours())
         return rows(f"decode EVT3, {events.n:.0e} events", times, equal)
 
 
 def sweeping_edge(n: int, sensor: Sensor = SENSOR) -> Events:
-    """An edge that sweeps over the sensor in one window, with noise: where events are, others are."""
+    """Random events of a noisy edge that sweeps over the sensor in one window; like real events, they cluster."""
     rng = np.random.default_rng(0)
     t = np.sort(rng.integers(0, DURATION_US, n))
     x = (t * sensor.width / DURATION_US + rng.normal(0, sensor.width / 12, n)).astype(np.int64) % sensor.width
@@ -203,7 +201,7 @@ def _tonic_frames(tonic: Any, fields: NDArray[Any]) -> Callable[[], Any]:
 
 
 def _dv(dv: Any, events: Events) -> Callable[[], Any]:
-    """An accumulator for each channel; its store is filled beforehand, for Python fills it event by event."""
+    """One accumulator per channel. The store is filled before timing, because Python fills it event by event."""
     store = dv.EventStore()
     for t, x, y, p in zip(*(column.tolist() for column in events), strict=True):
         store.push_back(t, x, y, bool(p))
@@ -248,7 +246,7 @@ def _increment(where: NDArray[np.uint32], counts: NDArray[np.uint8]) -> None:  #
 
 
 def _evt3(events: Events) -> NDArray[np.uint16]:
-    """Words of single events: TIME_HIGH, TIME_LOW and ADDR_Y only where they change, ADDR_X for each event."""
+    """EVT3 words of single events: TIME_HIGH, TIME_LOW and ADDR_Y only when they change, ADDR_X for each event."""
     t, y = events.t, events.y.astype(np.int64)
     words = np.stack([0x8000 | t >> 12, 0x6000 | t & 0xFFF, y, 0x2000 | events.p.astype(np.int64) << 11 | events.x])
     written = np.ones(words.shape, np.bool_)

@@ -1,4 +1,4 @@
-"""Two processes on two cores against one: how many windows a machine answers when each core has a process."""
+"""Two processes on two cores against one: the windows per second of a machine with one process per core."""
 
 import multiprocessing
 import statistics
@@ -17,22 +17,22 @@ from neurove_core.models import bundle
 from neurove_core.networks.neurove import NetworkState, NeuroVE
 
 PROCESSES: Final = 2
-WINDOWS: Final = 300  # of one process in one run
+WINDOWS: Final = 300  # per process and run
 _TIMEOUT_S: Final = 120.0
 
 
 class _Share(NamedTuple):
-    """What one process did in a run."""
+    """The result of one process in one run."""
 
     cpu_ms: float
-    answer: NDArray[np.float32]  # of the last window
+    twists: NDArray[np.float32]  # of the last window
 
 
 def processes(rounds: int, *, quick: bool) -> list[Row]:
-    """Windows of the shipped network, T = 1, in one process and in two at once.
+    """Windows of the shipped network, T = 1, in one process and in two processes at once.
 
-    By wall time it is what a user gets, other work of the machine included; by CPU time it is what two cores of one's
-    own would give: whether the processes take caches and memory from each other.
+    The wall time is what a user gets, including the effect of other work on the machine. The CPU time shows whether the
+    processes slow each other down through caches and memory, as if the two cores were free of other work.
     """
     windows = 3 if quick else WINDOWS
     spawn = multiprocessing.get_context("spawn")
@@ -42,7 +42,7 @@ def processes(rounds: int, *, quick: bool) -> list[Row]:
         worker.start()
     pipe_ends = [pipe[0] for pipe in pipes]
     for connection in pipe_ends:
-        _receive(connection)  # warm
+        _receive(connection)  # the process has warmed up
     wall: dict[int, list[float]] = {1: [], PROCESSES: []}
     cpu: dict[int, list[float]] = {1: [], PROCESSES: []}
     answers: list[NDArray[np.float32]] = []
@@ -52,7 +52,7 @@ def processes(rounds: int, *, quick: bool) -> list[Row]:
             shares = _run(pipe_ends[:count])
             wall[count].append(1e3 * (time.monotonic() - began) / (count * windows))
             cpu[count].append(statistics.mean(share.cpu_ms for share in shares) / (count * windows))
-            answers += [share.answer for share in shares]
+            answers += [share.twists for share in shares]
     for connection, worker in zip(pipe_ends, workers, strict=True):
         connection.close()
         worker.join(_TIMEOUT_S)

@@ -1,4 +1,4 @@
-"""One window through the network, one training step, and many streams on one core."""
+"""Benchmarks of one window through the network, one training step, and many streams on one core."""
 
 import copy
 from collections.abc import Callable
@@ -20,19 +20,19 @@ REFERENCE = ModelConfig(
     canonical=CanonicalConfig(width=173, height=130),
     network=NetworkConfig(channels=(32, 64, 128, 256), features=256, hidden=256),
 )
-"""The network that research measured its peers with: 1.9 GFLOP a window at T = 8, a DAVIS346 at half its size."""
+"""The network on which the peers were measured: 1.9 GFLOP per window at T = 8, a DAVIS346 at half its size."""
 
 SHIPPED = ModelConfig()
 
 AT_PEAK: Final = "all its products at the matrix peak"
-"""Of this machine, in float32: what a window would take that leaves none out, and does nothing else."""
+"""Label of the limit: the time of all products of a window at the float32 peak of this machine, and nothing else."""
 
 TINY = ModelConfig(canonical=CanonicalConfig(width=24, height=16), network=NetworkConfig(channels=(4, 8), features=16))
-"""For --quick: does it run, and are the answers equal."""
+"""For --quick, which tests that everything runs and that the results are equal."""
 
 
 def window(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool) -> list[Row]:
-    """Latency of a window: the reference network with T = 8, and the shipped one as the service runs it, T = 1."""
+    """Latency of a window: the reference network at T = 8, and the shipped network at T = 1, as the service runs it."""
     shapes = {"tiny, T=3": (TINY, 3)} if quick else {"reference, T=8": (REFERENCE, 8), "shipped, T=1": (SHIPPED, 1)}
     found: list[Row] = []
     for name, (config, steps) in shapes.items():
@@ -51,12 +51,12 @@ def with_precision(config: ModelConfig, precision: str) -> ModelConfig:
 def _windows(
     name: str, config: ModelConfig, steps: int, rounds: int, missing: peers.Missing, *, with_peers: bool
 ) -> list[Row]:
-    """Where ours runs in int8 the peers run in float32, as their users do, and ours is compared to itself alone."""
+    """Rows of one network. If ours runs in int8, the peers run in float32, and only our own results are compared."""
     network = _network(config)
     quantised = config.network.precision == "int8"
     in_float32 = _network(with_precision(config, "float32")) if quantised else network
     spikes, initial = random_input(config, steps), network.initial_state(1)
-    given = quantisation.codes(spikes).contiguous() if quantised else spikes  # as the encoding lays them
+    given = quantisation.codes(spikes).contiguous() if quantised else spikes  # in the memory layout of the encoding
     engine = Engine(network)
     others = peers.networks(in_float32, missing) if with_peers else {}
     runs: dict[str, Callable[[], object]] = {"ours": lambda: engine(given, initial)}
@@ -73,14 +73,14 @@ def _windows(
             wide = Engine(in_float32)
             runs["ours, float32"], equal["ours, float32"] = lambda: wide(spikes, initial), None
         times = interleaved({**runs, "peak": machine.peak()}, rounds)
-    if not quantised:  # no limit: where few fire most products are left out
+    if not quantised:  # int8 has no such limit: it skips most products when few neurons fire
         times[AT_PEAK] = times["peak"] * steps * machine.flops(config) / machine.PEAK_FLOPS
         equal[AT_PEAK] = None
     return rows(f"window {name}", times, equal)
 
 
 def train(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool) -> list[Row]:
-    """A training step, forward, backward and Adam: the reference network, T = 8, batch 4; the shipped one, T = 16."""
+    """A training step at batch 4, forward, backward and Adam: the reference network at T = 8, the shipped at T = 16."""
     shapes = {"tiny, T=3": (TINY, 3)} if quick else {"reference, T=8": (REFERENCE, 8), "shipped, T=16": (SHIPPED, 16)}
     found: list[Row] = []
     for name, (config, steps) in shapes.items():
@@ -107,7 +107,7 @@ def train(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool)
 
 
 def streams(rounds: int, *, quick: bool) -> list[Row]:
-    """Streams on one core, milliseconds per window: eight in turn beside one alone, several at once beside in turn."""
+    """Time per window of streams on one core [ms]: eight in turn against one alone, and batches against in turn."""
     config = TINY if quick else SHIPPED
     network = _network(config)
     engine = Engine(network)
@@ -144,7 +144,7 @@ def streams(rounds: int, *, quick: bool) -> list[Row]:
 
 
 def random_input(config: ModelConfig, steps: int, batch: int = 1, seed: int = 1) -> Tensor:
-    """Input (T, B, 2n, H, W) as counts of a window are encoded, channels last as the encoding lays it."""
+    """Random network input (T, B, 2n, H, W), encoded from counts, in the channels-last layout of the encoding."""
     shape = (steps, batch, 2 * config.window.bins, config.canonical.height, config.canonical.width)
     counts = torch.poisson(torch.full(shape, 0.3), generator=torch.Generator().manual_seed(seed))
     return counts.log1p().movedim(2, -1).contiguous().movedim(-1, 2)
@@ -171,7 +171,7 @@ def _inside_plain(run: Callable[[], object]) -> Callable[[], object]:
 
 
 def _agree(engine: Engine, network: NeuroVE, spikes: Tensor, initial: NetworkState) -> bool:
-    """Whether the engine fires as its plain form, bit for bit, and the network answers alike in the first window."""
+    """Whether the spikes equal the reference implementation bit for bit, and the twists of the first window agree."""
     fired = engine.features(spikes, initial)[0]
     with plain():
         same = torch.equal(engine.features(spikes, initial)[0], fired)
@@ -188,7 +188,7 @@ class _TrainingStep:
         self._optimizer = torch.optim.Adam(self._network.parameters(), lr=1e-4, fused=True)  # for peers too
 
     def loss(self) -> float:
-        """Before the step."""
+        """The loss before the step."""
         with torch.no_grad():
             return float(self._error())
 

@@ -1,6 +1,7 @@
-"""What a model makes of real events that nobody tuned it on: one check after the other, each with the figure asked for.
+"""Checks of a model on real events that it was not tuned on: each compares one figure with a bound.
 
-The recordings are third parties' and do not come with the project; a check whose recording is not there says so.
+The recordings belong to third parties and are not part of the project. A check whose recording is missing is skipped
+with that reason.
 """
 
 import json
@@ -29,26 +30,28 @@ Array = NDArray[np.float64]
 
 STATIONARY_M_S: Final = 0.1
 STATIONARY_RAD_S: Final = 0.05
-"""At most so much is called rest; the speed for a camera 1 m above the ground, for none of these tells its height."""
+"""Largest estimates for a stationary camera. The speed assumes a height of 1 m: no recording gives its height."""
 
-_STATIONARY_S: Final = (
-    0.1,
-    0.6,
-)  # after the first window, when shapes_rotation_1.43s rests: until 0.65 s; the first two windows settle
-_MIN_EVENTS: Final = 500  # of a window from which contrast maximisation tells a rate; with fewer it is at rest
+_STATIONARY_S: Final = (0.1, 0.6)
+"""When the camera of shapes_rotation_1.43s is stationary [s] after the first window.
+
+It is stationary until 0.65 s; the estimator settles during the first two windows.
+"""
+
+_MIN_EVENTS: Final = 500  # per window for contrast maximisation; with fewer the camera counts as stationary
 
 
 class Measurement(NamedTuple):
-    """What came out of a check, and what it was made of."""
+    """The figure of a check, and the values it was computed from."""
 
     value: float
     made_of: dict[str, Any]
 
 
 class Check(NamedTuple):
-    """One thing that is asked of a model on one recording."""
+    """One requirement on a model for one recording."""
 
-    recording: str  # its place in the folder of recordings
+    recording: str  # its path in the folder of recordings
     what: str
     least: float
     most: float
@@ -56,28 +59,28 @@ class Check(NamedTuple):
 
     @property
     def asked(self) -> str:
-        """The bound, for people."""
+        """The bound as text."""
         if math.isinf(self.most):
             return "above 0" if self.least < 1e-3 else f"at least {self.least:g}"
         return f"at most {self.most:g}" if math.isinf(self.least) else f"{self.least:g} to {self.most:g}"
 
 
 def run(estimator: Estimator, folder: Path) -> Iterator[dict[str, Any]]:
-    """Judge a model, check by check.
+    """Run all checks of a model.
 
     Args:
-        estimator: the model.
-        folder: where the recordings lie.
+        estimator: runs the model.
+        folder: holds the recordings.
 
     Yields:
-        per check a row: recording, what, asked, value, met, made_of, skipped; where `skipped` says why it was not made,
-        value and met are None.
+        one row per check: recording, what, asked, value, met, made_of, skipped. `skipped` is the reason why a check was
+        not run, and then value and met are None.
     """
     for check in CHECKS:
         row: dict[str, Any] = {"recording": check.recording, "what": check.what, "asked": check.asked}
         empty: dict[str, Any] = {"value": None, "met": None, "made_of": {}}
         if not (folder / check.recording).exists():
-            yield row | empty | {"skipped": "the recording is not there"}
+            yield row | empty | {"skipped": "the recording is missing"}
             continue
         try:
             found = check.measure(estimator, folder)
@@ -106,22 +109,22 @@ def markdown(rows: list[dict[str, Any]], model: str) -> str:
 
 
 def save(rows: list[dict[str, Any]], about: dict[str, Any], out: Path) -> list[Path]:
-    """Write real.json and real.md into a folder; returns both.
+    """Write real.json and real.md into a folder and return their paths.
 
     Args:
-        rows: of `run`.
-        about: the model, as its ModelInfo, and how this was made.
-        out: folder, made where it is missing.
+        rows: rows of `run`.
+        about: the ModelInfo of the model as `model`, the command and the commit.
+        out: folder, created if missing.
 
     Raises:
-        InvalidField: a file can not be written.
+        InvalidField: a file cannot be written.
     """
     text = json.dumps(about | {"checks": rows}, indent=1) + "\n"
     return [save_text(text, out / "real.json"), save_text(markdown(rows, title(about)), out / "real.md")]
 
 
 def title(about: dict[str, Any]) -> str:
-    """The model's name and the beginning of its digest, as a table names it."""
+    """The name of the model and the start of its digest, for the title of the table."""
     return f"model `{about['model']['name']}` ({about['model']['digest'][:12]})"
 
 
@@ -133,12 +136,12 @@ def _shown(value: float | list[float]) -> str:
 
 
 class _EstimateSeries(NamedTuple):
-    """A model's answers to a recording, window by window."""
+    """The estimates of a model for the W complete windows of a recording."""
 
     recording: Recording
     camera: CameraInfo
-    start_us: NDArray[np.int64]  # (W,) of the windows, all that lie wholly within the recording
-    since_s: Array  # (W,) of the windows' starts, from the first on
+    start_us: NDArray[np.int64]  # (W,) starts of the windows
+    since_s: Array  # (W,) starts of the windows, relative to the first
     twist: Array  # (W, 6) mean over a window's bins
     events: NDArray[np.int64]  # (W,)
     low_activity: NDArray[np.bool_]  # (W,)
@@ -146,18 +149,19 @@ class _EstimateSeries(NamedTuple):
 
     @property
     def end_us(self) -> int:
-        """Of the last window."""
+        """End of the last window."""
         return int(self.start_us[-1]) + self.window_us
 
     def later(self, start_s: float, stop_s: float = math.inf) -> NDArray[np.bool_]:
-        """Which windows begin in this span, from the first window on."""
+        """Mask (W,) of the windows that start in this span, relative to the first window."""
         return (self.since_s >= start_s) & (self.since_s < stop_s)
 
 
 def _estimate_series(estimator: Estimator, path: Path) -> _EstimateSeries:
-    """Answers to a recording; where it tells no lens, that of a DAVIS of its size is assumed.
+    """Estimate all complete windows of a recording; without a known lens, assume that of a DAVIS.
 
-    That of shapes_rotation_1.43s is the very one. A DVXplorer is taken for a DAVIS240C with larger pixels: it rests.
+    For shapes_rotation_1.43s the assumed lens is the right one. A DVXplorer gets the lens of a DAVIS240C, scaled to its
+    sensor; that camera is stationary.
     """
     recording = open_source(str(path))
     camera = recording.camera("real") or CAMERAS["davis346" if "davis346" in path.name else "davis240c"]
@@ -169,13 +173,13 @@ def _estimate_series(estimator: Estimator, path: Path) -> _EstimateSeries:
     answers = estimate_recording(estimator, recording, camera)
     window_us = answers.bin_us * answers.twists.shape[1]
     first_us, last_us = int(next(recording.chunks()).t[0]), _last_us(recording)
-    whole = (answers.start_us >= first_us) & (answers.start_us + window_us <= last_us)
-    if not whole.any():
-        raise NoTruth(f"{path.name}: it has no whole window of {window_us / 1e3:g} ms")
-    start_us = answers.start_us[whole]
-    twist, low = answers.twists.mean(axis=1)[whole], answers.low_activity[whole]
+    complete = (answers.start_us >= first_us) & (answers.start_us + window_us <= last_us)
+    if not complete.any():
+        raise NoTruth(f"{path.name}: it has no complete window of {window_us / 1e3:g} ms")
+    start_us = answers.start_us[complete]
+    twist, low = answers.twists.mean(axis=1)[complete], answers.low_activity[complete]
     return _EstimateSeries(
-        recording, camera, start_us, (start_us - start_us[0]) / 1e6, twist, answers.events[whole], low, window_us
+        recording, camera, start_us, (start_us - start_us[0]) / 1e6, twist, answers.events[complete], low, window_us
     )
 
 
@@ -190,7 +194,7 @@ def _pitch(name: str, estimator: Estimator, folder: Path) -> Measurement:
     series = _estimate_series(estimator, folder / name)
     truth = series.recording.twists()
     if truth is None:
-        raise NoTruth("its ground-truth_3Dcam.txt is not beside it")
+        raise NoTruth("its ground-truth_3Dcam.txt is missing from the folder")
     true, found = float(np.nanmean(truth.twist[:, 3])), float(series.twist[series.later(SKIP_S), 3].mean())
     return Measurement(found / true, {"estimate [rad/s]": found, "truth [rad/s]": true})
 
@@ -199,7 +203,7 @@ def _direction(name: str, estimator: Estimator, folder: Path) -> Measurement:
     series = _estimate_series(estimator, folder / name)
     truth = series.recording.twists()
     if truth is None:
-        raise NoTruth("its groundtruth.txt is not beside it")
+        raise NoTruth("its groundtruth.txt is missing from the folder")
     true = truth.at(series.start_us + series.window_us // 2)
     known = np.isfinite(true).all(axis=1)
     a, b = series.twist[known, :3].mean(0), true[known, :3].mean(0)
@@ -246,7 +250,7 @@ def _gyro_sign(name: str, estimator: Estimator, folder: Path) -> Measurement:
 
 
 def _yaw_rates(name: str, estimator: Estimator, folder: Path) -> tuple[Array, Array]:
-    """Yaw rate by the gyro and by the model, (W,) each [rad/s]."""
+    """Yaw rates of the gyro and of the model, (W,) each [rad/s]."""
     series = _estimate_series(estimator, folder / name)
     samples = list(series.recording.imu())
     t, yaw = np.concatenate([one.t for one in samples]), np.concatenate([one.gyro_rad_s[:, 1] for one in samples])
@@ -268,7 +272,7 @@ def _low_activity(name: str, estimator: Estimator, folder: Path) -> Measurement:
 
 
 def _correlation(found: Array, true: Array) -> Measurement:
-    """Correlation, beside the slope of the one over the other."""
+    """The correlation of two series (W,), and the slope of the estimate over the truth."""
     spread = float(found.std() * true.std())
     covariance = float(((found - found.mean()) * (true - true.mean())).mean())
     return Measurement(

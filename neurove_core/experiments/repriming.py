@@ -1,10 +1,13 @@
-"""How settled a model's first estimates are after a change of model: cold, with the old state, primed with N windows.
+"""Error of the first estimates after a model swap, for several start states of the new model.
 
-Not of the paper. What a change costs is measured against a run of the new model that was never swapped, on streets that
-the default model has not seen, in standard deviations of that run's own estimates, per axis. The old model of the
-carried state is the new one with every weight moved by 2 %: about as far as two trainings of one model lie apart
-at their end. The error of the first estimate after N windows from rest is all that N decides (decision 29). Beside it
-stands the error against the truth, which is what a robot feels.
+The start state is cold (the zero state), carried (the state of the old model), or primed (N windows replayed from the
+zero state). N affects only the error of the first estimate after these N windows (decision 29). This experiment is not
+in the paper.
+
+The reference is a run of the new model that was never swapped, on streets that the default model has not seen. Errors
+against it are given in standard deviations of the estimates of that run, per axis. The old model is the new one with
+every weight shifted by 2 %, which is about the difference between two trainings of one model. The errors against the
+ground truth are given too, because they are what a robot experiences.
 """
 
 import json
@@ -33,37 +36,37 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PRIMED = (8, 16, 32, 64)
-SETTLED = 0.02  # of the standard deviation of the estimates
-SHIFT = 0.02  # of each weight, between the old model and the new one
-FIRST_SEED = 5000  # the default model has seen no street of these seeds
-AFTER = 48  # windows after the change that are looked at
+SETTLED = 0.02  # largest error of a settled estimate [standard deviations]
+SHIFT = 0.02  # relative shift of each weight between the old and the new model
+FIRST_SEED = 5000  # the default model was trained on no street of these seeds
+AFTER = 48  # evaluated windows after a swap
 CAMERA = "davis346-half"
 SWAPS = 4  # per street
-SWAP_INTERVAL = 12  # windows between them
+SWAP_INTERVAL = 12  # windows between swaps
 NEVER = "never swapped"
 
 Array = NDArray[np.float64]
 
 
 class Results(NamedTuple):
-    """What one run measured: by start of changing, the error of the first windows after it, in standard deviations."""
+    """Errors of the windows after a swap, by start state; in standard deviations, except `off_truth`."""
 
     model: str
     digest: str
     streets: int
     swaps: int
     seconds: float
-    errors: dict[str, list[float]]  # RMS over axes, bins and swaps, of each window after the change
-    worst: dict[str, list[float]]  # of the worst axis, RMS over bins and swaps
-    off_truth: dict[str, dict[str, list[float]]]  # "m/s" and "deg/s": by start, NEVER among them, RMSE of each window
-    least_primed: int | None  # least N whose first estimate is within SETTLED; None where none is
+    errors: dict[str, list[float]]  # RMS over axes, bins and swaps, for each window after the swap
+    worst: dict[str, list[float]]  # the same for the worst axis, RMS over bins and swaps
+    off_truth: dict[str, dict[str, list[float]]]  # by "m/s" and "deg/s", then start state or NEVER: RMSE per window
+    least_primed: int | None  # least N whose first estimate is within SETTLED; None if there is none
 
 
 class _StreetEstimates(NamedTuple):
-    """What was estimate on one street."""
+    """The estimates on one street."""
 
-    variance: Array  # (6) of the run that was never swapped
-    by_start: dict[str, list[Array]]  # by start of changing, for each change the answers (AFTER, n, 6) after it
+    variance: Array  # (6) of the estimates of the run that was never swapped
+    by_start: dict[str, list[Array]]  # by start state or NEVER: twists (AFTER, n, 6) after each swap
 
 
 def run(
@@ -72,16 +75,16 @@ def run(
     primed: Iterable[int] = PRIMED,
     progress: Callable[[str], None] = lambda _: None,
 ) -> Results:
-    """Change to a model on some streets, in every start, and look at its first estimates.
+    """Swap to a model on some streets from every start state and measure the errors of its estimates.
 
     Args:
-        model: name of a built-in model, or a bundle's file.
-        streets: held-out ones, of seeds FIRST_SEED and up.
+        model: name of a built-in model, or the file of a bundle.
+        streets: number of held-out streets, with seeds from FIRST_SEED.
         primed: numbers of windows to replay.
-        progress: told the name of each street as it is done.
+        progress: is called with the name of each finished street.
 
     Raises:
-        InvalidField: no street, or no number of windows. BadModel: the model can not be loaded.
+        InvalidField: there is no street or no number of windows. BadModel: the model cannot be loaded.
     """
     replayed = sorted(set(primed))
     require(streets >= 1, "reprime", "streets", streets, "must be at least 1")
@@ -97,7 +100,7 @@ def run(
         simulation = simulation_of(f"sim://street?seed={FIRST_SEED + street}&camera={CAMERA}&seconds={seconds + 0.1:g}")
         estimates = _estimates_on_street(new, old, windows_of(simulation, new)[:windows], swaps_at, replayed)
         truth = true_twists(simulation.trajectory, windows, new.config)
-        units = np.array([simulation.lens.height_m] * 3 + [1.0] * 3)  # it answers for a camera at 1 m
+        units = np.array([simulation.lens.height_m] * 3 + [1.0] * 3)  # the estimates are for a camera height of 1 m
         for start, runs in estimates.by_start.items():
             for at, estimate, never in zip(swaps_at, runs, estimates.by_start[NEVER], strict=True):
                 swap_errors.setdefault(start, []).append(((estimate - never) ** 2).mean(axis=1) / estimates.variance)
@@ -126,7 +129,7 @@ def run(
 
 
 def _lengths(truth_errors: dict[str, list[Array]], axes: slice, unit: float) -> dict[str, list[float]]:
-    """Root of the mean squared length of a group of axes, by start and window, in another unit."""
+    """RMS length of the error over some axes, by start state and window, times a unit factor."""
     return {
         start: (unit * np.sqrt(np.mean(one, axis=0)[:, axes].sum(axis=1))).tolist()
         for start, one in truth_errors.items()
@@ -134,7 +137,7 @@ def _lengths(truth_errors: dict[str, list[Array]], axes: slice, unit: float) -> 
 
 
 def shifted(bundle: Bundle, share: float = SHIFT) -> Bundle:
-    """A model beside another: every weight is moved by a normal draw of so much of itself."""
+    """A copy of a model with every weight shifted by a normal random share of itself, of this standard deviation."""
     draw = torch.Generator().manual_seed(0)
     moved = from_bytes(bundle.to_bytes(), bundle.name)
     with torch.no_grad():
@@ -144,7 +147,7 @@ def shifted(bundle: Bundle, share: float = SHIFT) -> Bundle:
 
 
 def windows_of(simulation: Simulation, estimator: Estimator) -> list[Window]:
-    """The windows of a simulation as the service cuts them for a model."""
+    """The windows of a simulation, split as the service splits them for a model."""
     state, windows = estimator.initial_state(simulation.sensor, simulation.lens.info), []
     window_state = WindowsState()
     for step in simulation.steps():
@@ -158,7 +161,7 @@ def windows_of(simulation: Simulation, estimator: Estimator) -> list[Window]:
 def _estimates_on_street(
     new: Estimator, old: Estimator, windows: list[Window], swaps_at: list[int], primed: list[int]
 ) -> _StreetEstimates:
-    """Follow one street in every start of changing."""
+    """Run one street from every start state at every swap."""
     never, _ = _estimates(new, windows, _zero_state(new))
     variance = never.reshape(-1, 6).var(axis=0)
     carried = _zero_state(old)
@@ -176,7 +179,7 @@ def _estimates_on_street(
 
 
 def _estimates(estimator: Estimator, windows: list[Window], state: StreamState) -> tuple[Array, StreamState]:
-    """Answers (W, n, 6) to windows, and the state after them."""
+    """Twists (W, n, 6) for W windows, and the state after them."""
     estimates, state = estimator.follow(windows, state)
     return np.array([one.twists for one in estimates]), state
 
@@ -191,7 +194,7 @@ def _name(primed: int) -> str:
 
 
 def to_json(results: Results) -> str:
-    """The results for machines."""
+    """The results as JSON."""
     about: dict[str, Any] = results._asdict()
     about |= {"errors": _rounded(results.errors), "worst": _rounded(results.worst)}
     about["off_truth"] = {unit: _rounded(by_start) for unit, by_start in results.off_truth.items()}
@@ -203,11 +206,11 @@ def _rounded(by_start: dict[str, list[float]]) -> dict[str, list[float]]:
 
 
 def to_markdown(results: Results) -> str:
-    """The results as a table: windows after the change in the columns."""
+    """The results as Markdown tables, with the windows after the swap in the columns."""
     shown = [0, 1, 4, 8, 16, 32]
     lines = [
-        f"Model {results.model} ({results.digest[:12]}), {results.swaps} changes on {results.streets} held-out "
-        "streets. Error of the estimates after a change against a run that was never swapped, RMS in standard "
+        f"Model {results.model} ({results.digest[:12]}), {results.swaps} swaps on {results.streets} held-out "
+        "streets. Error of the estimates after a swap against a run that was never swapped, RMS in standard "
         "deviations.",
         "",
         "| start | "
@@ -232,7 +235,7 @@ def to_markdown(results: Results) -> str:
 
 
 def draw(results: Results) -> "Figure":
-    """The error of the windows after a change, by start of changing.
+    """Plot the error of the windows after a swap, by start state.
 
     Raises:
         MissingExtra: matplotlib is not installed.
@@ -242,7 +245,7 @@ def draw(results: Results) -> "Figure":
     for start, errors in results.errors.items():
         axes.semilogy(np.arange(len(errors)), np.maximum(errors, 1e-7), label=start, lw=1.5)
     axes.axhline(SETTLED, color="black", lw=0.8, ls="--", label=f"{100 * SETTLED:g} %")
-    axes.set_xlabel("windows after the change of model")
+    axes.set_xlabel("windows after the model swap")
     axes.set_ylabel("error [standard deviations]")
     axes.legend(ncols=2, fontsize=8)
     axes.grid(visible=True, alpha=0.3)

@@ -140,8 +140,8 @@ def _between(
     gap = t[np.minimum(first + 1, t.size - 1)] - t[first]
     on = t_us - t[first]
     fraction = np.divide(on, gap, out=np.where(on == 0, 0.0, np.nan), where=gap > 0)
-    whole = (on >= 0) & (on <= gap) & ((gap <= max_gap_us) | (on == 0) | (on == gap))
-    return first, np.where(whole, fraction, np.nan)
+    known = (on >= 0) & (on <= gap) & ((gap <= max_gap_us) | (on == 0) | (on == gap))
+    return first, np.where(known, fraction, np.nan)
 
 
 def _fits(poses: Poses, filter_s: float | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -1,7 +1,7 @@
-"""Model bundle: one safetensors file; its header holds config, scaling, provenance; its digest names it.
+"""Model bundle: one safetensors file. Its header holds configuration, units and provenance; its sha256 is its digest.
 
-Nothing is unpickled. What a file claims is checked before it is used: size, header, names, shapes and types of all
-tensors for the architecture that the header declares, finite values.
+Nothing is unpickled. A file is checked before it is used: its size, its header, the names, shapes and types of all
+tensors for the architecture that the header declares, and that all values are finite.
 """
 
 import hashlib
@@ -45,32 +45,34 @@ _OFFSET, _SCALE, _CORRELATION = "output.offset", "output.scale", "output.correla
 
 
 class UncertaintyHeader(Config):
-    """That a bundle has a spread (tensors spread.weight, spread.bias, output.correlation), and how it came to it."""
+    """Present if a bundle has a spread (tensors spread.weight, spread.bias, output.correlation): its calibration."""
 
-    uncertain_above: float = Field(gt=0, description="Linear sigma over speed from which an estimate is uncertain.")
-    provenance: str = Field(max_length=1000, description="One line: how it was calibrated.")
+    uncertain_above: float = Field(gt=0, description="An estimate is uncertain above this linear sigma / speed.")
+    provenance: str = Field(max_length=1000, description="One line: how the model was calibrated.")
 
 
 class Header(Metadata):
-    """What a bundle says about itself, as JSON in the file's safetensors header."""
+    """The header of a bundle: JSON in the metadata of the safetensors file."""
 
     bundle_version: int = BUNDLE_VERSION
     name: str = Field(min_length=1, max_length=64, pattern="^[A-Za-z0-9_][A-Za-z0-9_.-]*$")
     trained: bool
-    provenance: str = Field(max_length=1000, description="One line: how this model was made.")
+    provenance: str = Field(max_length=1000, description="One line: how the model was made.")
     config: ModelConfig
     linear_unit: LinearUnit = Field(
-        METRIC, description="Of the linear part: m/s, or to be multiplied by the camera's height above the ground [m]."
+        METRIC, description="Unit of the linear part: m/s, or per metre of the camera's height above the ground."
     )
-    golden_tolerance: float | None = Field(None, gt=0, le=1, description="Of the golden test, where there is one.")
-    uncertainty: UncertaintyHeader | None = Field(None, description="How far off its answers may be, where it knows.")
+    golden_tolerance: float | None = Field(
+        None, gt=0, le=1, description="Tolerance of the golden test, if there is one."
+    )
+    uncertainty: UncertaintyHeader | None = Field(None, description="Calibration of the uncertainty, if there is one.")
 
     @field_validator("uncertainty")
     @classmethod
     def _of_a_neurove(cls, value: UncertaintyHeader | None, info: ValidationInfo) -> UncertaintyHeader | None:
         config = info.data.get("config")
         if value is not None and config is not None and config.kind != "neurove":
-            raise ValueError(f"a network of kind={config.kind!r} has none")
+            raise ValueError(f"a network of kind={config.kind!r} has no uncertainty")
         return value
 
 
@@ -87,13 +89,13 @@ class Bundle:
     scale: Tensor  # (6)
     linear_unit: LinearUnit = METRIC
     metadata: Metadata = field(default_factory=Metadata)
-    golden: Golden | None = None  # none: the model can not be tested on another machine, and passes unseen
-    uncertainty: Uncertainty | None = None  # where there is one, the network has a spread
+    golden: Golden | None = None  # None: the self-test has nothing to compare and passes
+    uncertainty: Uncertainty | None = None  # if present, the network has a spread
     digest: str = ""  # sha256 of the bundle's bytes, hex
 
     @property
     def info(self) -> ModelInfo:
-        """What a node tells about this model."""
+        """What a node reports about this model."""
         parameters = sum(parameter.numel() for parameter in self.network.parameters())
         return ModelInfo(
             name=self.name,
@@ -107,18 +109,18 @@ class Bundle:
 
     @property
     def release(self) -> int:
-        """Counter of this model's releases."""
+        """Release counter of this model."""
         return self.metadata.release
 
     @property
     def prime_windows(self) -> int:
-        """How many recent windows a stream replays so that this model's estimates are settled."""
+        """Number of recent windows that a stream replays until the estimates of this model are settled."""
         windows = self.metadata.prime_windows
         return self.config.settle_windows if windows is None else windows
 
     @property
     def limits(self) -> BundleLimits:
-        """By how much it may differ from the model that it takes over from."""
+        """Largest allowed differences from the model it replaces."""
         return self.metadata.limits or BundleLimits()
 
     def to_bytes(self) -> bytes:
@@ -136,24 +138,25 @@ class Bundle:
             ),
             **dict(self.metadata),
         )
-        without = {"golden_tolerance": self.golden is None, "uncertainty": self.uncertainty is None}
-        untold = Metadata.model_fields.keys() - self.metadata.non_default_fields() | {
-            name for name, left_out in without.items() if left_out
-        }
+        omitted = Metadata.model_fields.keys() - self.metadata.non_default_fields()
+        if self.golden is None:
+            omitted |= {"golden_tolerance"}
+        if self.uncertainty is None:
+            omitted |= {"uncertainty"}
         tensors = {**_stored(self.network), _OFFSET: self.offset, _SCALE: self.scale}
         if self.golden:
             tensors |= golden.to_tensors(self.golden)
         if self.uncertainty is not None:
             tensors[_CORRELATION] = self.uncertainty.correlation
-        return safetensors.torch.save(tensors, {_KEY: header.model_dump_json(exclude=untold)})
+        return safetensors.torch.save(tensors, {_KEY: header.model_dump_json(exclude=omitted)})
 
     def with_digest(self) -> Self:
-        """This bundle, its digest computed."""
+        """This bundle with its digest computed."""
         return replace(self, digest=hashlib.sha256(self.to_bytes()).hexdigest())
 
 
 def save(bundle: Bundle, path: Path) -> None:
-    """Write a bundle's file; it is whole or it is not there, and what was there before stays until it is."""
+    """Write a bundle's file atomically: an existing file stays until the new one is complete."""
     write_atomically(path, bundle.to_bytes())
 
 
@@ -161,7 +164,7 @@ def load(path: Path) -> Bundle:
     """Read and check a bundle's file.
 
     Raises:
-        BadModel: it is missing, foreign, broken, or not what its header declares; the sentence says why.
+        BadModel: the file is missing, damaged, of another format, or does not match its header; the message says why.
     """
     try:
         size = path.stat().st_size
@@ -174,19 +177,23 @@ def load(path: Path) -> Bundle:
 
 
 def from_bytes(data: bytes, name: str) -> Bundle:
-    """The bundle that these bytes hold; `name` says in errors whose bytes they are.
+    """Check and load a bundle from its bytes.
+
+    Args:
+        data: the bytes of the file.
+        name: of the file, for errors.
 
     Raises:
-        BadModel: as load.
+        BadModel: as `load`.
     """
     header = read_header(data, name)
     try:
         tensors = safetensors.torch.load(data)
     except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:
-        # the last two: a tensor without elements may claim sides that torch has no integer for
-        raise BadModel(name, f"not a whole safetensors file: {error}") from None
+        # the last two types: a tensor without elements may declare sizes that exceed torch's integers
+        raise BadModel(name, f"not a complete safetensors file: {error}") from None
     test = golden.from_tensors(tensors, header.config, header.golden_tolerance, name)
-    with torch.device("meta"):  # shapes alone: a header of a few bytes may declare terabytes of weights
+    with torch.device("meta"):  # shapes without memory: a small header may declare terabytes of weights
         wanted = {**_stored(_network(header)), _OFFSET: torch.zeros(6), _SCALE: torch.ones(6)}
         if header.uncertainty is not None:
             wanted[_CORRELATION] = torch.eye(6)
@@ -204,7 +211,7 @@ def from_bytes(data: bytes, name: str) -> Bundle:
         offset=offset,
         scale=scale,
         linear_unit=header.linear_unit,
-        metadata=Metadata(**{told: getattr(header, told) for told in Metadata.model_fields}),
+        metadata=Metadata(**{name: getattr(header, name) for name in Metadata.model_fields}),
         golden=test,
         uncertainty=uncertainty,
         digest=hashlib.sha256(data).hexdigest(),
@@ -212,10 +219,14 @@ def from_bytes(data: bytes, name: str) -> Bundle:
 
 
 def read_header(data: bytes, name: str) -> Header:
-    """The header of a bundle's bytes, checked.
+    """Read and check the header in a bundle's bytes.
+
+    Args:
+        data: the bytes of the file.
+        name: of the file, for errors.
 
     Raises:
-        BadModel: as load.
+        BadModel: as `load`.
     """
     if len(data) < 8:
         raise BadModel(name, f"size={len(data)}: not a safetensors file")
@@ -233,7 +244,7 @@ def read_header(data: bytes, name: str) -> Header:
             name, "a safetensors file, but not a NeuroVE bundle: its header has no 'neurove' entry"
         ) from None
     except (ValueError, RecursionError) as error:
-        raise BadModel(name, f"its header can not be read: {error}") from None
+        raise BadModel(name, f"its header cannot be read: {error}") from None
     if len(entries) > MAX_TENSORS + 1:
         raise BadModel(name, f"{len(entries) - 1} tensors: at most {MAX_TENSORS}")
     version = fields.get("bundle_version") if isinstance(fields, dict) else None
@@ -247,10 +258,15 @@ def read_header(data: bytes, name: str) -> Header:
 
 
 def untrained(seed: int = 0, config: ModelConfig | None = None, name: str = "untrained") -> Bundle:
-    """A model with random weights drawn from a seed: it runs as a trained one would, its numbers mean nothing.
+    """A model with random weights: it runs like a trained one, but its estimates mean nothing.
 
-    The norms' statistics are those of random input, so that neurons fire. The same seed gives the same model on one
+    The norms have the statistics of random input, so that neurons fire. The same seed gives the same model on one
     machine and torch version.
+
+    Args:
+        seed: of the weights.
+        config: of the model; the default is ModelConfig().
+        name: of the model.
     """
     config = config or ModelConfig()
     with torch.random.fork_rng(devices=[]):
@@ -274,7 +290,7 @@ def _take_statistics(network: Network, spikes: Tensor) -> None:
         layer: layer.momentum for layer in network.modules() if isinstance(layer, nn.BatchNorm1d | nn.BatchNorm2d)
     }
     for norm in momenta:
-        norm.momentum = 1.0  # a running mean over few batches keeps most of its start, and then nothing fires
+        norm.momentum = 1.0  # with less, few batches hardly move the running mean, and nothing fires
     with torch.no_grad():
         network.train()(spikes, network.initial_state(spikes.shape[1]))
     for norm, momentum in momenta.items():
@@ -318,8 +334,12 @@ def _check_tensors(tensors: dict[str, Tensor], wanted: dict[str, Tensor], name: 
 
 
 def object_without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Hook of `json.loads`: a key that stands twice is a ValueError, for readers differ on which one counts."""
+    """Hook of `json.loads` that refuses duplicate keys, because JSON readers differ on which one counts.
+
+    Raises:
+        ValueError: a key occurs twice in one object.
+    """
     fields = dict(pairs)
     if len(fields) != len(pairs):
-        raise ValueError("a key stands twice in one object")
+        raise ValueError("a key occurs twice in one object")
     return fields

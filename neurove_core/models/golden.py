@@ -1,7 +1,7 @@
-"""Golden test of a model: windows that travel in its bundle, and what its maker's machine answered to them.
+"""The stored golden test of a model: windows in its bundle, and the twists that its maker's machine computed for them.
 
-The digest of a bundle shows that the bytes are those that were sent. Whether this machine, this torch and this version
-of the program compute with them what their maker's did is another question, and this is its answer.
+The digest of a bundle proves that the bytes are unchanged. The golden test shows that this machine, this torch and this
+version of the program compute the same twists as the maker's. `neurove_core.self_test` records and runs it.
 """
 
 from typing import Final, NamedTuple
@@ -15,30 +15,30 @@ from neurove_core.config import ModelConfig
 from neurove_protocol.errors import BadModel
 
 WINDOWS: Final = 12
-"""T of a golden test where nothing else is asked for."""
+"""Default number of windows T of a golden test."""
 
 TOLERANCE: Final = 0.02
-"""Of an answer, as a share of the model's output scale; see `Golden`."""
+"""Default tolerance of a twist, as a fraction of the model's output scale; see `Golden`."""
 
 MAX_CELLS: Final = 1 << 26
-"""Cap of T * 2n * H * W: so many bytes are the counts of a golden test in memory."""
+"""Largest T * 2n * H * W: the bytes that the counts of a golden test take in memory."""
 
 _SEEN, _COUNTS, _TWISTS = "golden.seen", "golden.counts", "golden.twists"
 
 
 class Golden(NamedTuple):
-    """Windows and the answers to them, from a state at rest."""
+    """Windows and their expected twists, from the zero state."""
 
     counts: NDArray[np.uint8]  # (T, 2n, H, W)
-    twists: NDArray[np.float32]  # (T, n, 6) in the bundle's linear unit and rad/s
-    tolerance: float = TOLERANCE  # an axis may be off by this times the bundle's scale of that axis
+    twists: NDArray[np.float32]  # (T, n, 6) expected, in the bundle's linear unit and rad/s
+    tolerance: float = TOLERANCE  # largest error of an axis, as a fraction of the bundle's scale of that axis
 
 
 def to_tensors(golden: Golden) -> dict[str, Tensor]:
-    """A golden test as the tensors of a bundle: most cells see nothing, and cost a bit each.
+    """Store a golden test as tensors of a bundle. Most cells have no events and take one bit each.
 
-    `golden.seen` has a bit for each cell of (T, 2n, H, W), the first one highest, 1 where there were events;
-    `golden.counts` the counts of these cells, in their order; `golden.twists` the answers (T, n, 6).
+    `golden.seen` has one bit per cell of (T, 2n, H, W), most significant bit first; it is 1 where there were events.
+    `golden.counts` holds the counts of these cells in order, `golden.twists` the expected twists (T, n, 6).
     """
     flat = golden.counts.reshape(-1)
     return {
@@ -49,21 +49,21 @@ def to_tensors(golden: Golden) -> dict[str, Tensor]:
 
 
 def stored_bytes(counts: NDArray[np.uint8]) -> int:
-    """By how much windows (T, 2n, H, W) make a bundle's file larger, without their answers."""
+    """Bytes that the windows (T, 2n, H, W) add to the file of a bundle, without their twists."""
     return (counts.size + 7) // 8 + int(np.count_nonzero(counts))
 
 
 def from_tensors(tensors: dict[str, Tensor], config: ModelConfig, tolerance: float | None, name: str) -> Golden | None:
-    """Take the golden test out of a bundle's tensors; none where it has none.
+    """Take the golden test out of a bundle's tensors; None if it has no golden test.
 
     Args:
-        tensors: of the bundle; those of the golden test are removed.
-        config: of the model.
-        tolerance: that the bundle's header says.
-        name: whose tensors these are, for errors.
+        tensors: tensors of the bundle; those of the golden test are removed.
+        config: configuration of the model.
+        tolerance: `golden_tolerance` of the bundle's header.
+        name: of the bundle, for errors.
 
     Raises:
-        BadModel: a part is missing, of a wrong shape or type, or parts do not go together.
+        BadModel: a tensor or the tolerance is missing, a tensor has a wrong shape or type, or the parts do not match.
     """
     found = {key: tensors.pop(key) for key in (_SEEN, _COUNTS, _TWISTS) if key in tensors}
     if not found and tolerance is None:
@@ -72,12 +72,12 @@ def from_tensors(tensors: dict[str, Tensor], config: ModelConfig, tolerance: flo
         if key not in found:
             raise BadModel(name, f"tensor {key!r} is missing: a golden test has three tensors and a tolerance")
     if tolerance is None:
-        raise BadModel(name, "header field golden_tolerance=missing: it holds the tensors of a golden test")
+        raise BadModel(name, "header field golden_tolerance=missing: the bundle has the tensors of a golden test")
     twists, grid = found[_TWISTS], (2 * config.window.bins, config.canonical.height, config.canonical.width)
     windows = len(twists) if twists.dim() else 0
     cells = windows * int(np.prod(grid))
     if not 0 < cells <= MAX_CELLS:
-        raise BadModel(name, f"golden test of {windows} windows: {cells} cells, it may have 1 to {MAX_CELLS}")
+        raise BadModel(name, f"golden test of {windows} windows: {cells} cells, allowed are 1 to {MAX_CELLS}")
     _require(found, _TWISTS, torch.float32, (windows, config.window.bins, 6), name)
     if not bool(torch.isfinite(twists).all()):
         raise BadModel(name, f"tensor {_TWISTS!r} holds values that are not finite")
@@ -86,7 +86,7 @@ def from_tensors(tensors: dict[str, Tensor], config: ModelConfig, tolerance: flo
     _require(found, _COUNTS, torch.uint8, (int(seen.sum()),), name)
     counts = found[_COUNTS].numpy()
     if seen[cells:].any() or not counts.all():
-        raise BadModel(name, "golden test: a count of 0, or a bit behind the last cell")
+        raise BadModel(name, "golden test: a count is 0, or a bit after the last cell is set")
     flat = np.zeros(cells, np.uint8)
     flat[seen[:cells] != 0] = counts
     return Golden(flat.reshape(windows, *grid), twists.numpy(), tolerance)

@@ -1,8 +1,8 @@
-"""Signed manifest of a bundle: who vouches for exactly these bytes, and as which release.
+"""Signed manifest of a bundle: the holder of a key vouches for exactly these bytes as one release.
 
-The manifest is JSON: keys sorted, no spaces, UTF-8. The signature (Ed25519) is over the manifest's bytes, which are
-kept as they are in the signature file, as a string: nobody has to write JSON as someone else did to check it. A
-signature file lies beside its bundle, `NAME.safetensors.sig`. Everything here is bytes in and values out.
+The manifest is JSON with sorted keys, without spaces, in UTF-8. The Ed25519 signature covers the bytes of the manifest.
+The signature file stores the manifest as a string, so a verifier does not have to produce the same JSON. The signature
+file of a bundle is `NAME.safetensors.sig` in the same folder. This module turns bytes into values and does no I/O.
 """
 
 import base64
@@ -25,7 +25,7 @@ from neurove_protocol.errors import Downgrade, InvalidField, Untrusted, shown
 from neurove_protocol.fields import WrongField
 
 SUFFIX: Final = ".sig"
-"""Added to the bundle's whole file name."""
+"""Appended to the full file name of the bundle."""
 
 MAX_SIGNATURE_BYTES: Final = 16 << 10
 
@@ -38,21 +38,21 @@ class _Strict(Config):
 
 
 class Signed(_Strict):
-    """What the holder of a key says about one bundle: the manifest."""
+    """The manifest: what the holder of a key states about one bundle."""
 
-    kind: Literal["neurove model 1"] = "neurove model 1"  # a signature over anything else is none of ours
+    kind: Literal["neurove model 1"] = "neurove model 1"  # a signature of anything else has another kind
     name: str = Field(min_length=1, max_length=64)
     sha256: _Sha256  # of the bundle's bytes
     size: int = Field(ge=0, le=MAX_BYTES)  # [bytes]
     config_sha256: _Sha256  # of the model's configuration as canonical JSON
     release: int = Field(ge=0, le=MAX_RELEASE)
-    allow_downgrade: bool  # it may take the place of a higher release
+    allow_downgrade: bool  # nodes may accept it after a higher release
     key_id: KeyId
     created: str = Field(max_length=40)  # UTC, ISO 8601; for people
 
 
 class _File(_Strict):
-    manifest: str = Field(max_length=MAX_SIGNATURE_BYTES)  # the very text that is signed
+    manifest: str = Field(max_length=MAX_SIGNATURE_BYTES)  # the signed text
     signature: str = Field(max_length=88)  # base64 of 64 bytes
     key_id: KeyId
 
@@ -66,18 +66,18 @@ def sign(
     created: datetime | None = None,
     name: str = "bundle",
 ) -> bytes:
-    """The signature file of a bundle.
+    """Sign a bundle: the bytes of its signature file.
 
     Args:
         data: the bundle's bytes.
-        key: that signs.
-        release: counter; where not given, the one in the bundle's header.
-        allow_downgrade: let nodes take this model after a higher release, for an operator who must go back.
-        created: for people; now, where not given.
-        name: says in errors whose bytes these are.
+        key: signs the manifest.
+        release: release counter; the default is the one in the bundle's header.
+        allow_downgrade: nodes may accept this model after a higher release, so that an operator can go back.
+        created: time of signing, for information; the default is now.
+        name: of the bundle, for errors.
 
     Raises:
-        BadModel: the bytes are no bundle. InvalidField: the release is out of bounds.
+        BadModel: the bytes are not a bundle. InvalidField: the release is out of bounds.
     """
     header = read_header(data, name)
     release = header.release if release is None else release
@@ -99,18 +99,20 @@ def sign(
 
 
 def verify(data: bytes, signature: bytes, trusted: Iterable[Ed25519PublicKey], name: str = "bundle") -> Signed:
-    """What a trusted key says about a bundle; nothing of the bundle is read before that is known to hold.
+    """Verify a bundle's signature: the manifest that a trusted key signed.
+
+    The bundle's content is parsed only after the signature, size and digest have been verified.
 
     Args:
         data: the bundle's bytes.
         signature: the bytes of its signature file.
-        trusted: keys of those who may make models.
-        name: says in errors whose bytes these are.
+        trusted: public keys of the accepted signers.
+        name: of the bundle, for errors.
 
     Raises:
         Untrusted: with the reason `too_large`, `malformed`, `unknown_key`, `bad_signature`, `size`, `digest` or
             `manifest`.
-        BadModel: the signed bytes are no bundle.
+        BadModel: the signed bytes are not a bundle.
     """
     file = _file(signature, name)
     text = file.manifest.encode()
@@ -120,22 +122,22 @@ def verify(data: bytes, signature: bytes, trusted: Iterable[Ed25519PublicKey], n
         known = ", ".join(map(key_id, keys)) or "none"
         raise Untrusted(name, "unknown_key", f"signed by key {file.key_id}, which is not trusted; trusted: {known}")
     if not any(_signed_by(key, file, text, name) for key in candidates):
-        raise Untrusted(name, "bad_signature", f"its signature is not one of key {file.key_id} over this manifest")
+        raise Untrusted(name, "bad_signature", f"key {file.key_id} did not sign this manifest")
     signed = _manifest(file, name)
     if signed.size != len(data):
         raise Untrusted(name, "size", f"it has {len(data)} bytes, the signed file has {signed.size}")
     digest = hashlib.sha256(data).hexdigest()
     if signed.sha256 != digest:
-        why = f"its sha256 is {digest[:16]}..., the signed file's {signed.sha256[:16]}...: another file, or changed"
+        why = f"its sha256 is {digest[:16]}..., the signed file has {signed.sha256[:16]}...: another or changed file"
         raise Untrusted(name, "digest", why)
     header = read_header(data, name)
     if (signed.name, signed.config_sha256) != (header.name, _config_sha256(header)):
-        raise Untrusted(name, "manifest", "its manifest names another model or configuration than its header does")
+        raise Untrusted(name, "manifest", "its manifest names another model or configuration than its header")
     return signed
 
 
 def read(signature: bytes, name: str = "bundle") -> Signed:
-    """What a signature file claims, not verified: to be shown, never to be trusted.
+    """Read the manifest in a signature file without verifying it: for display only, never to trust.
 
     Raises:
         Untrusted: with the reason `too_large` or `malformed`.
@@ -144,9 +146,9 @@ def read(signature: bytes, name: str = "bundle") -> Signed:
 
 
 def allowed(release: int, highest_seen: int | None, allow_downgrade: bool) -> bool:
-    """Whether a model of this release may be taken by who has had models up to `highest_seen` (None: not one yet).
+    """Whether a node may accept a model of this release after releases up to `highest_seen` (None: no release yet).
 
-    The same release may come again; a lower one only where its signature says so.
+    An equal release is allowed; a lower one only if its signature allows the downgrade.
 
     >>> allowed(3, 4, allow_downgrade=False), allowed(3, 4, allow_downgrade=True), allowed(4, 4, allow_downgrade=False)
     (False, True, True)
@@ -155,17 +157,17 @@ def allowed(release: int, highest_seen: int | None, allow_downgrade: bool) -> bo
 
 
 def check_release(signed: Signed, highest_seen: int | None) -> None:
-    """As `allowed`.
+    """Check that the downgrade rule of `allowed` holds.
 
     Raises:
-        Downgrade: it is not.
+        Downgrade: the release is lower than `highest_seen` and its signature does not allow that.
     """
     if highest_seen is not None and not allowed(signed.release, highest_seen, signed.allow_downgrade):
         raise Downgrade(signed.name, signed.release, highest_seen)
 
 
 def canonical(value: Any) -> str:
-    """JSON in one form: keys sorted, no spaces, nothing but finite numbers.
+    """Canonical JSON: sorted keys, no spaces, finite numbers only.
 
     >>> canonical({"b": [1, 2], "a": "x"})
     '{"a":"x","b":[1,2]}'
@@ -179,7 +181,7 @@ def _config_sha256(header: Header) -> str:
 
 def _file(signature: bytes, name: str) -> _File:
     if len(signature) > MAX_SIGNATURE_BYTES:
-        why = f"a signature file of {len(signature)} bytes: at most {MAX_SIGNATURE_BYTES}"
+        why = f"a signature file of {len(signature)} bytes: at most {MAX_SIGNATURE_BYTES} are allowed"
         raise Untrusted(name, "too_large", why)
     return _parsed(_File, signature, "signature file", name)
 
@@ -187,7 +189,7 @@ def _file(signature: bytes, name: str) -> _File:
 def _manifest(file: _File, name: str) -> Signed:
     signed = _parsed(Signed, file.manifest, "manifest", name)
     if signed.key_id != file.key_id:
-        raise Untrusted(name, "malformed", "its signature file and the manifest in it name different keys")
+        raise Untrusted(name, "malformed", "the signature file and its manifest name different keys")
     return signed
 
 
@@ -210,9 +212,9 @@ def _parsed(kind: type[_T], text: str | bytes, what: str, name: str) -> _T:
             text if isinstance(text, str) else text.decode(), object_pairs_hook=object_without_duplicates
         )
         if not isinstance(fields, dict):
-            raise Untrusted(name, "malformed", f"{what}: an object is expected, not {shown(fields)}")
+            raise Untrusted(name, "malformed", f"{what}: expected an object, not {shown(fields)}")
         return kind.model_validate(fields)
     except ValidationError as error:
         raise Untrusted(name, "malformed", f"{what}: {WrongField.of(error).sentence}") from None
     except (ValueError, RecursionError) as error:
-        raise Untrusted(name, "malformed", f"{what}: not JSON that can be read: {error}") from None
+        raise Untrusted(name, "malformed", f"{what}: not readable as JSON: {error}") from None

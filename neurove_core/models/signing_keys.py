@@ -1,4 +1,4 @@
-"""Ed25519 keys that sign models: made, written and read in the formats of OpenSSL."""
+"""Ed25519 keys that sign models: generate, write and read them in the formats of OpenSSL."""
 
 import hashlib
 
@@ -15,17 +15,17 @@ _WHAT = "signing key"
 
 
 def new() -> Ed25519PrivateKey:
-    """A key that nobody had before."""
+    """Generate a key."""
     return Ed25519PrivateKey.generate()
 
 
 def key_id(key: Ed25519PublicKey) -> str:
-    """What people and files call a key: the first 16 hexadecimal digits of the sha256 of its 32 bytes."""
+    """Short name of a key: the first 16 hexadecimal digits of the sha256 of its 32 bytes."""
     return hashlib.sha256(key.public_bytes(*_RAW)).hexdigest()[:16]
 
 
 def private_pem(key: Ed25519PrivateKey) -> bytes:
-    """The key as PKCS #8 in PEM, without a pass phrase: what guards it is the file's mode."""
+    """The key as PKCS #8 in PEM without a pass phrase: the mode of its file must protect it."""
     return key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
@@ -37,42 +37,50 @@ def public_pem(key: Ed25519PublicKey) -> bytes:
 
 
 def read_private(data: bytes, name: str) -> Ed25519PrivateKey:
-    """The private key of a PEM file.
+    """Read the private key of a PEM file.
+
+    Args:
+        data: the bytes of the file.
+        name: of the file, for errors.
 
     Raises:
-        InvalidField: it is none, is locked by a pass phrase, or is of another algorithm; `name` says whose bytes.
+        InvalidField: it is not a private key, has a pass phrase, or is of another algorithm.
     """
     _check_size(data, name)
     if b"PUBLIC KEY" in data:
-        raise InvalidField(_WHAT, "file", name, "it is a public key; to sign takes the private one")
+        raise InvalidField(_WHAT, "file", name, "it is a public key; signing needs the private key")
     try:
         key = serialization.load_pem_private_key(data, password=None)
     except TypeError:
-        why = "it is locked by a pass phrase; unlock a copy with `openssl pkey -in FILE -out COPY`"
+        why = "it has a pass phrase; make a copy without it: `openssl pkey -in FILE -out COPY`"
         raise InvalidField(_WHAT, "file", name, why) from None
     except (ValueError, UnsupportedAlgorithm):
-        raise InvalidField(_WHAT, "file", name, "not a private key in PEM, as `neurove bundle keygen` makes") from None
+        raise InvalidField(_WHAT, "file", name, "not a private key in PEM; `neurove bundle keygen` makes one") from None
     if not isinstance(key, Ed25519PrivateKey):
-        raise InvalidField(_WHAT, "file", name, "a private key, but not an Ed25519 one")
+        raise InvalidField(_WHAT, "file", name, "a private key, but not an Ed25519 key")
     return key
 
 
 def read_public(data: bytes, name: str) -> Ed25519PublicKey:
-    """The public key of a PEM file.
+    """Read the public key of a PEM file.
+
+    Args:
+        data: the bytes of the file.
+        name: of the file, for errors.
 
     Raises:
-        InvalidField: it is none, or of another algorithm; `name` says whose bytes.
+        InvalidField: it is not a public key, or is of another algorithm.
     """
     _check_size(data, name)
     if b"PRIVATE KEY" in data:
-        why = "it is a private key: keep it where models are signed, and trust the .pub beside it"
+        why = "it is a private key: keep it on the signing machine, and trust the matching .pub file"
         raise InvalidField(_WHAT, "file", name, why)
     try:
         key = serialization.load_pem_public_key(data)
     except (ValueError, UnsupportedAlgorithm):
-        raise InvalidField(_WHAT, "file", name, "not a public key in PEM, as `neurove bundle keygen` makes") from None
+        raise InvalidField(_WHAT, "file", name, "not a public key in PEM; `neurove bundle keygen` makes one") from None
     if not isinstance(key, Ed25519PublicKey):
-        raise InvalidField(_WHAT, "file", name, "a public key, but not an Ed25519 one")
+        raise InvalidField(_WHAT, "file", name, "a public key, but not an Ed25519 key")
     return key
 
 

@@ -128,7 +128,7 @@ REASONS = {
     "wrong-shape": ("bad_model", "needs torch.float32 ("),
     "wrong-dtype": ("bad_model", "torch.float64"),
     "nan": ("bad_model", "not finite"),
-    "duplicate-keys": ("bad_model", "stands twice"),
+    "duplicate-keys": ("bad_model", "occurs twice"),
     "foreign": ("bad_model", "not a safetensors file"),
     "empty": ("bad_model", "size=0"),
     "bad-signature": ("untrusted", "not trusted"),

@@ -1,1 +1,1 @@
-"""The paper's Tables I and II: regression and forecast of sine waves."""
+"""The sine experiment, the paper's Tables I and II: regression and forecast of sine waves."""

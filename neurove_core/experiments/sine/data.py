@@ -1,7 +1,8 @@
 """The paper's nonlinear regression and forecasting experiment (section IV-B): data, recipe, network, evaluation.
 
-100 sine waves sin((i + d) / 20), i = 0 to 999, with random integer offsets d; 97 train, 3 validate. A network reads one
-sample per step and answers the next one (regression). Then it runs on its own answers for 1000 more steps (forecast).
+The data are 100 sine waves sin((i + d) / 20), i = 0 to 999, with random integer offsets d; 97 train, 3 validate. A
+network reads one sample per step and predicts the next one (regression). Then it runs on its own predictions for 1000
+more steps (forecast).
 """
 
 import math
@@ -18,10 +19,10 @@ from neurove_core.spiking.fused.recurrence import Array, LayerWeights, State, We
 LENGTH = 1000
 VALIDATION = 3
 SKIP = 100
-"""Steps left out of the comparable regression figure: from a zero state the first answer can not know the direction."""
+"""Steps that the comparable regression figure omits: from the zero state, the phase is unknown at first."""
 
 _WAVES, _PERIOD = 100, 20
-_NO_ANSWER = 1e3  # error of an answer that is not finite
+_NO_ANSWER = 1e3  # error of a prediction that is not finite
 
 KINDS = {
     "aslstm": recurrence.ASLSTM,
@@ -32,24 +33,26 @@ KINDS = {
 
 
 class Recipe(Config):
-    """How one model is built and trained; the budget rule is the same for all."""
+    """How one model is built and trained. The training budget follows one rule for all models."""
 
     model: Literal["aslstm", "aslstm-wo", "slstm", "ltc"]
     hidden: int = Field(51, ge=1, le=1024)
-    v_th: float = Field(1.0, gt=0, description="Firing threshold of most units, or its start where it is learned.")
+    v_th: float = Field(1.0, gt=0, description="Firing threshold of most units, or its initial value if learned.")
     low_v_th: float | None = Field(None, gt=0, description="Threshold of the first `low_units` of each layer.")
     low_units: int = Field(0, ge=0)
     learn_v_th: bool = Field(False, description="Whether thresholds are learned, one per unit.")
     alpha: float = Field(0.5, ge=0, le=1)
-    width: float = Field(0.25, gt=0, description="Of the rectangular surrogate.")
-    damping: float = Field(1.0, gt=0, le=1, description="Of the surrogate gradient.")
-    diffusion: float = Field(0.5, description="Start of D in time and across layers.")
+    width: float = Field(0.25, gt=0, description="Width of the rectangular surrogate.")
+    damping: float = Field(1.0, gt=0, le=1, description="Factor on the surrogate gradient.")
+    diffusion: float = Field(0.5, description="Initial D in time and across layers.")
     batch: int = Field(16, ge=1)
     chunk: int = Field(100, ge=1, description="Steps of truncated backpropagation.")
     updates: int = Field(2500, ge=1, description="Teacher-forced updates.")
     lr: float = Field(1e-2, gt=0)
     lr_end: float = Field(2e-5, gt=0)
-    fine_updates: int = Field(1000, ge=0, description="Updates of the second stage, 40 % of them in a closed loop.")
+    fine_updates: int = Field(
+        1000, ge=0, description="Updates of the second stage, by default 40 % of them in a closed loop."
+    )
     fine_lr: float = Field(4e-4, gt=0)
     fine_lr_end: float = Field(2e-6, gt=0)
     closed_share: float = Field(0.4, ge=0, le=1)
@@ -58,37 +61,37 @@ class Recipe(Config):
         0.4,
         ge=0,
         le=1,
-        description="Share of the fine updates, the last, of whose weights the best are kept; 0: the last.",
+        description="Final share of the fine updates from which the best weights are kept; 0: keep the last weights.",
     )
-    rate: float = Field(0.0, ge=0, lt=1, description="Spike rate that each layer is held to; 0 for none.")
-    rate_weight: float = Field(1.0, ge=0, description="Of a missing rate, relative to the error.")
-    clip: float = Field(0.5, gt=0, description="Norm of the gradient.")
+    rate: float = Field(0.0, ge=0, lt=1, description="Target spike rate of each layer; 0 for none.")
+    rate_weight: float = Field(1.0, ge=0, description="Weight of a spike rate below the target, relative to the error.")
+    clip: float = Field(0.5, gt=0, description="Largest norm of the gradient.")
 
 
 class Evaluation(NamedTuple):
-    """What a trained network reached; one number per validation wave."""
+    """Errors and spike rates of a network; the lists have one number per validation wave, except `spike_rate`."""
 
     regression_rmse_x1000: list[float]  # all steps
     regression_rmse_x1000_from_100: list[float]
     forecast_rmse: list[float]
-    spike_rate: list[float]  # of the two layers, over regression and forecast
+    spike_rate: list[float]  # per layer, over regression and forecast
 
 
 def waves(seed: int = 2) -> NDArray[np.float32]:
-    """The 100 sine waves (100, 1000); the first VALIDATION rows validate.
+    """The 100 sine waves (100, 1000); the first VALIDATION rows are for validation.
 
-    The set-up is that of PyTorch's time_sequence_prediction example, which the paper's numbers match.
+    The set-up is that of PyTorch's time_sequence_prediction example, which matches the paper's numbers.
     """
     offsets = np.random.default_rng(seed).integers(-4 * _PERIOD, 4 * _PERIOD, _WAVES)
     return np.sin((np.arange(LENGTH) + offsets[:, None]) / _PERIOD).astype(np.float32)
 
 
 class Network:
-    """Weights of a network as views into one vector, so that the optimiser is one line.
+    """A network whose weights are views into one vector, so that the optimiser works on one array.
 
     Args:
-        recipe: what is built.
-        rng: draws the weights.
+        recipe: defines the network.
+        rng: draws the initial weights.
         dtype: float32 or float64.
     """
 
@@ -114,7 +117,7 @@ class Network:
                 layer.v_th[: recipe.low_units] = recipe.low_v_th
             learned.v_th[:] = recipe.learn_v_th
             layer.s_weight[:], learned.s_weight[:] = 1.0, False
-        if recipe.model == "slstm":  # its readout sees potentials
+        if recipe.model == "slstm":  # its readout reads potentials
             self.weights.second.s_weight[:] = 0.0
             self.weights.second.d_space[:] = 1.0
         self.weights.kappa[:] = math.log(0.2 / 0.8)  # the vector holds its logit
@@ -123,13 +126,13 @@ class Network:
         return self.weights._replace(kappa=1 / (1 + np.exp(-self.weights.kappa)))
 
     def run(self, x: Array, state: State, free_from: int) -> recurrence.Tape:
-        """The network over x (T, B) from a state."""
+        """Run the network over x (T, B) from a state; from step `free_from` on it runs on its own predictions."""
         return recurrence.forward(self.kind, self._real(), self.constants, x, state, free_from)
 
     def gradient(
         self, tape: recurrence.Tape, grad_y: Array, free_from: int, grad_s: tuple[float, float] = (0.0, 0.0)
     ) -> Array:
-        """Gradient of the loss by theta, (parameters)."""
+        """Gradient of the loss with respect to theta, of the same shape."""
         real = self._real()
         grads = recurrence.backward(self.kind, real, self.constants, tape, grad_y, free_from, grad_s)
         own = (*self._grads.first, *self._grads.second)
@@ -141,12 +144,12 @@ class Network:
         return gradient
 
     def initial_state(self, batch: int) -> State:
-        """Everything at rest."""
+        """The zero state."""
         return recurrence.initial_state(batch, self.weights.w_out.size, self.theta.dtype)
 
 
 def _shapes(kind: int, hidden: int) -> list[tuple[int, ...]]:
-    """Of all arrays of Weights, in order."""
+    """The shapes of all arrays of Weights, in order."""
     gates = {recurrence.ASLSTM: 5 * hidden, recurrence.SLSTM: 4 * hidden, recurrence.LTC: hidden}[kind]
     ltc = kind == recurrence.LTC
 
@@ -173,7 +176,7 @@ def _allocated(kind: int, hidden: int, dtype: Any) -> tuple[Array, Weights]:
 
 
 def _views(vector: Array, shapes: list[tuple[int, ...]]) -> Weights:
-    """Weights that are views of a vector."""
+    """Weights as views into a vector."""
     arrays: list[Array] = []
     start = 0
     for shape in shapes:
@@ -187,11 +190,11 @@ def evaluate(network: Network, data: NDArray[np.float32] | None = None) -> tuple
     """Regression over 999 teacher-forced steps, then 1000 steps of closed-loop forecast.
 
     Args:
-        network: trained or not.
-        data: (rows, 1000) waves; the validation rows by default.
+        network: trained or untrained.
+        data: (rows, 1000) waves; the default is the validation rows.
 
     Returns:
-        figures per row, and the answers (1999, rows).
+        the errors per row, and the predictions (1999, rows).
     """
     rows = waves()[:VALIDATION] if data is None else data
     truth = continued(rows)
@@ -213,7 +216,7 @@ def evaluate(network: Network, data: NDArray[np.float32] | None = None) -> tuple
 
 
 def continued(rows: NDArray[np.float32]) -> NDArray[np.float64]:
-    """The waves over 2000 steps, (2000, rows): their phase is read off the rows."""
+    """The waves (rows, 1000) continued to 2000 steps, (2000, rows), with the phase fitted to the rows."""
     i = np.arange(LENGTH) / _PERIOD
     basis = np.stack([np.sin(i), np.cos(i)], axis=1)
     weights, *_ = np.linalg.lstsq(basis, rows.T.astype(np.float64), rcond=None)

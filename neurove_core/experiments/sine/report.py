@@ -33,10 +33,10 @@ RECIPES = {
     "slstm": Recipe(model="slstm", v_th=0.1),
     "ltc": Recipe(model="ltc", v_th=0.1, width=0.5),
 }
-"""One budget for the paper's four: updates, batches and learning rates of Recipe.
+"""The recipes. The paper's four models share one budget: the updates, batches and learning rates of Recipe.
 
-Threshold, surrogate and the share of closed loops are each model's own best. `aslstm-spiking`, which is
-ours, takes twice as many updates.
+Threshold, surrogate and the share of closed loops are the best found for each model. `aslstm-spiking` is our own
+variant and takes twice as many updates.
 """
 
 PAPER_REGRESSION_X1000 = {
@@ -62,13 +62,13 @@ Progress = Callable[[str, int, int, int, float], None]
 
 
 class SineRun(NamedTuple):
-    """One model trained from one seed."""
+    """One model, trained from one seed and evaluated."""
 
     model: str
     seed: int
     recipe: Recipe
     trained: Trained
-    answers: Array  # (1999, VALIDATION)
+    answers: Array  # predictions (1999, VALIDATION)
     figures: dict[str, Any]
 
 
@@ -80,14 +80,17 @@ def reproduce(
     quick: bool = False,
     progress: Progress | None = None,
 ) -> Iterator[SineRun]:
-    """Train and evaluate every model from every seed, one after the other.
+    """Train and evaluate every model from every seed, one after another.
 
     Args:
         models: keys of RECIPES.
         seeds: of weights and batches.
-        changes: fields of Recipe that are to be otherwise than in RECIPES, as texts: a trial.
-        quick: a few updates only, to see that everything runs.
-        progress: called after each update.
+        changes: fields of Recipe to change from RECIPES, as texts, for a trial.
+        quick: train for a few updates only, to test that everything runs.
+        progress: is called after each update.
+
+    Yields:
+        the runs, all seeds of the first model first.
 
     Raises:
         InvalidField: a model, or a field of `changes` or its value, is unknown. MissingExtra: scipy is not installed.
@@ -110,7 +113,7 @@ def changed(recipe: Recipe, changes: Mapping[str, str]) -> Recipe:
     0.5
 
     Raises:
-        InvalidField: a field is unknown, or its text is not what it must be.
+        InvalidField: a field is unknown, or its value is invalid.
     """
     try:
         return Recipe.model_validate(recipe.model_dump() | dict(changes))
@@ -147,16 +150,16 @@ def _run(model: str, seed: int, recipe: Recipe, progress: Progress | None) -> Si
 
 
 def save_run(runs: list[SineRun], out: Path, *, command: str, commit: str) -> list[Path]:
-    """Write the newest run's network and the figures of all so far, so that a stopped command loses nothing.
+    """Write the network of the last run and the figures of all runs, so that an interrupted command loses nothing.
 
     Args:
-        runs: done so far.
-        out: folder, made where it is missing.
-        command: that made them.
+        runs: the finished runs.
+        out: folder, created if missing.
+        command: that made the runs.
         commit: of the code.
 
     Raises:
-        InvalidField: a file can not be written.
+        InvalidField: a file cannot be written.
     """
     rows = [run.figures | {"command": command, "commit": commit} for run in runs]
     figures = save_text(json.dumps(rows, indent=1) + "\n", out / "sine.json")
@@ -171,11 +174,11 @@ def save(runs: list[SineRun], out: Path) -> list[Path]:
     """Write the two tables and the pictures.
 
     Args:
-        runs: all of them.
-        out: folder, made where it is missing.
+        runs: all runs.
+        out: folder, created if missing.
 
     Raises:
-        InvalidField: a file can not be written. MissingExtra: matplotlib is not installed.
+        InvalidField: a file cannot be written. MissingExtra: matplotlib is not installed.
     """
     files = []
     for number, rows in tables([run.figures for run in runs]).items():
@@ -186,7 +189,7 @@ def save(runs: list[SineRun], out: Path) -> list[Path]:
 
 
 def tables(figures: list[dict[str, Any]]) -> dict[int, list[dict[str, Any]]]:
-    """Rows of Table I and Table II, from the figures of some runs."""
+    """The rows of Table I and Table II, from the figures of some runs."""
     return {
         1: table(figures, "regression_rmse_x1000_from_100", PAPER_REGRESSION_X1000),
         2: table(figures, "forecast_rmse", PAPER_FORECAST),
@@ -194,7 +197,7 @@ def tables(figures: list[dict[str, Any]]) -> dict[int, list[dict[str, Any]]]:
 
 
 def table(figures: list[dict[str, Any]], key: str, paper: dict[str, Any]) -> list[dict[str, Any]]:
-    """One row per model: the median over seeds of each sequence's figure, beside the paper's."""
+    """One row per model: the median over the seeds for each sequence, with the figures of the paper."""
     rows = []
     for model in dict.fromkeys(one["model"] for one in figures):
         own = [one for one in figures if one["model"] == model]
@@ -217,7 +220,7 @@ def table(figures: list[dict[str, Any]], key: str, paper: dict[str, Any]) -> lis
 
 
 def markdown(rows: list[dict[str, Any]], number: int) -> str:
-    """A table as Markdown."""
+    """A table in Markdown."""
     what = f"Table {'I' * number}: " + (
         f"regression, RMSE x 1000, steps {SKIP} to 998 (in brackets: all steps)" if number == 1 else "forecast, RMSE"
     )
@@ -244,7 +247,7 @@ def _joined(values: Sequence[float]) -> str:
 
 
 def draw_regression(runs: list[SineRun]) -> "Figure":
-    """Truth and answers of the first validation wave over 2000 steps, and their error, one row per model."""
+    """Plot truth and prediction of the first validation wave over 2000 steps, with their errors, one row per model."""
     firsts = list({run.model: run for run in reversed(runs)}.values())[::-1]
     figure = blank_figure(10, 1.9 * len(firsts) + 0.4)
     axes = figure.subplots(len(firsts), 1, sharex=True, squeeze=False)[:, 0]
@@ -259,12 +262,12 @@ def draw_regression(runs: list[SineRun]) -> "Figure":
         forecast = run.figures["forecast_rmse"][0]
         regression = run.figures["regression_rmse_x1000_from_100"][0]
         axis.set_title(f"regression RMSE x 1000: {regression:.2g}      forecast RMSE: {forecast:.2g}", fontsize=9)
-    axes[-1].set_xlabel(f"step; from {LENGTH} on the network runs on its own answers")
+    axes[-1].set_xlabel(f"step; from {LENGTH} on the network runs on its own predictions")
     return figure
 
 
 def _truth() -> Array:
-    """The first validation wave, continued; (1999)."""
+    """The first validation wave, continued (1999,)."""
     row = waves()[0].astype(np.float64)
     phase = math.atan2(row[0], (row[1] - row[0] * math.cos(0.05)) / math.sin(0.05))
     truth: Array = np.sin(np.arange(1, 2 * LENGTH) / 20 + phase)
@@ -272,7 +275,7 @@ def _truth() -> Array:
 
 
 def draw_spikes(runs: list[SineRun]) -> "Figure":
-    """Spikes of both layers over the first validation wave, one column per model."""
+    """Plot the spikes of both layers over the first validation wave, one column per model."""
     firsts = list({run.model: run for run in reversed(runs)}.values())[::-1]
     figure = blank_figure(2.6 * len(firsts) + 1, 4.6)
     axes = figure.subplots(2, len(firsts), sharex=True, squeeze=False)

@@ -1,4 +1,4 @@
-"""How a network of the sine experiment is trained: chunks, closed loops, Adam, and the weights that are kept."""
+"""Training of a network of the sine experiment: chunks, closed loops, Adam, and selection of the best weights."""
 
 import math
 import time
@@ -13,16 +13,16 @@ from neurove_core.spiking.fused.recurrence import Array, State
 
 _BETAS, _EPSILON = (0.9, 0.99), 1e-8
 _LOG_FLOOR = 1e-9
-_LEAST_V_TH = 0.02  # of a learned threshold
-_CHECK_EVERY = 20  # fine updates from one look at the closed loop to the next
-_CHECK_FROM, _CHECK_WAVES = 300, 16  # and how: on its own answers from this step on, over so many training waves
+_LEAST_V_TH = 0.02  # lower bound of learned thresholds
+_CHECK_EVERY = 20  # fine updates between two checks of the closed loop
+_CHECK_FROM, _CHECK_WAVES = 300, 16  # a check closes the loop at this step, on this number of training waves
 
 
 class Adam:
-    """Adam on one vector, its gradient clipped by norm; an update that is not finite is left out.
+    """Adam on one vector, with the gradient clipped by norm. Gradients that are not finite are skipped.
 
     Args:
-        network: whose theta it changes.
+        network: its theta is updated.
         clip: largest norm of a gradient.
     """
 
@@ -32,7 +32,7 @@ class Adam:
         self.skipped = 0
 
     def step(self, grad: Array, lr: float) -> None:
-        """Change theta by one gradient."""
+        """Update theta with one gradient."""
         norm = float(np.sqrt((grad.astype(np.float64) ** 2).sum()))
         if not math.isfinite(norm):
             self.skipped += 1
@@ -50,7 +50,7 @@ class Adam:
 
 
 class Trained(NamedTuple):
-    """A training run."""
+    """A trained network and the cost of its training."""
 
     network: Network
     updates: int
@@ -61,14 +61,15 @@ class Trained(NamedTuple):
 def train(recipe: Recipe, seed: int, progress: Callable[[int, float], None] = lambda update, mse: None) -> Trained:
     """Train a network on the 97 training waves, in two stages.
 
-    First teacher-forced, truncated backpropagation over chunks with carried state; then the same mixed with
-    closed-loop windows, whose gradient goes through the fed-back answers, under log(mse), which puts the tiny one-step
-    and the large closed-loop errors on one scale. Of the last weights, those are kept that do best on training waves.
+    The first stage is teacher-forced: truncated backpropagation over chunks with carried state. The second stage mixes
+    such chunks with closed-loop windows, whose gradient flows through the fed-back predictions. Its loss is log(mse),
+    which puts the small one-step errors and the large closed-loop errors on one scale. Among the last weights, those
+    with the smallest errors on training waves are kept.
 
     Args:
-        recipe: what and how.
+        recipe: defines network and training.
         seed: of weights and batches.
-        progress: called after each update with its number and mean square error.
+        progress: is called after each update with its number and mean square error.
     """
     rng = np.random.default_rng(seed)
     data = waves()[VALIDATION:].T.copy()  # (1000, 97)
@@ -105,10 +106,10 @@ def train(recipe: Recipe, seed: int, progress: Callable[[int, float], None] = la
 
 
 class _Best:
-    """The weights that did best on some training waves: in a closed loop one update more may be much better or worse.
+    """The best weights so far on some training waves. One update may change the closed-loop error a lot.
 
     Args:
-        network: whose weights are watched.
+        network: its weights are compared and restored.
         data: (1000, rows) training waves.
     """
 
@@ -117,18 +118,18 @@ class _Best:
         self._score, self._theta = math.inf, network.theta.copy()
 
     def update(self) -> None:
-        """Compare the weights of now: the product of both errors, over _CHECK_FROM steps and from there on alone."""
+        """Compare the current weights by the product of the teacher-forced and the closed-loop error."""
         x, target = self._data[:-1], self._data[1:]
         tape = self._network.run(x, self._network.initial_state(x.shape[1]), _CHECK_FROM)
         error = tape.y[1:] - target
-        with np.errstate(over="ignore", invalid="ignore"):  # a network that diverges is not the best
+        with np.errstate(over="ignore", invalid="ignore"):  # the error of a diverging network overflows
             regression = float(np.mean(error[SKIP:_CHECK_FROM].astype(np.float64) ** 2))
             forecast = float(np.mean(error[_CHECK_FROM:].astype(np.float64) ** 2))
         if regression * forecast < self._score:
             self._score, self._theta = regression * forecast, self._network.theta.copy()
 
     def restore(self) -> None:
-        """Go back to them, if any were looked at."""
+        """Restore the best weights, if any were compared."""
         if self._score < math.inf:
             self._network.theta[:] = self._theta
 
@@ -145,7 +146,7 @@ def _rate(update: int, updates: int, high: float, low: float, warm_up: int) -> f
 
 
 def _rate_gradient(recipe: Recipe, tape: recurrence.Tape, scale: float) -> tuple[float, float]:
-    """Gradient by one spike of scale * rate_weight * (how much of the rate is missing)^2, for each layer."""
+    """Gradient per spike of scale * rate_weight * (missing share of the target rate)^2, for each layer."""
     gradient = []
     for layer in tape[:2]:
         missing = max(0.0, 1 - float(layer.s[1:].mean()) / recipe.rate)
@@ -163,11 +164,11 @@ def _loss(
     grad_s = _rate_gradient(recipe, tape, 0.1 if log else mse) if recipe.rate else (0.0, 0.0)
     last = recurrence.state_after(tape, len(x))
     grad = network.gradient(tape, (error * np.float32(scale)).astype(x.dtype), free_from, grad_s)
-    return mse, grad, tape._replace(first=last.first, second=last.second)  # type: ignore[arg-type]  # only the end is used
+    return mse, grad, tape._replace(first=last.first, second=last.second)  # type: ignore[arg-type]  # only the last state is used
 
 
 class _BatchStream:
-    """A batch of waves that is walked through in chunks, its state carried; at the end others are drawn."""
+    """A batch of random waves, read in chunks with carried state; at the end of the waves a new batch is drawn."""
 
     def __init__(self, data: Array, recipe: Recipe, network: Network, rng: np.random.Generator) -> None:
         self._data, self._recipe, self._network, self._rng = data, recipe, network, rng
@@ -180,13 +181,13 @@ class _BatchStream:
         self._visited = [(self._position, self._state)]
 
     def chunk(self) -> tuple[Array, Array, State]:
-        """The next inputs, targets, and the state before them."""
+        """The inputs and targets of the next chunk, and the state before it."""
         if self._position >= LENGTH - 1:
             self._begin()
         return self._slice(self._position, self._recipe.chunk, self._state)
 
     def window(self, steps: int) -> tuple[Array, Array, State]:
-        """So many steps from the newest place passed that leaves room for them, without going on."""
+        """A window of this many steps from the latest chunk boundary that allows it; the position stays."""
         position, state = next(place for place in reversed(self._visited) if place[0] + steps < LENGTH)
         return self._slice(position, steps, state)
 
@@ -195,8 +196,8 @@ class _BatchStream:
         return self._batch[position:end], self._batch[position + 1 : end + 1], state
 
     def advance(self, tape: recurrence.Tape) -> None:
-        """Go on to the end of the chunk that gave this tape."""
+        """Move to the end of the chunk that gave this tape."""
         first, second = tape.first, tape.second
         self._position += len(tape.y) - 1
-        self._state = State(first, second, tape.y[-1].copy())  # type: ignore[arg-type]  # layers are states by now
+        self._state = State(first, second, tape.y[-1].copy())  # type: ignore[arg-type]  # the layers of the tape are states here
         self._visited.append((self._position, self._state))

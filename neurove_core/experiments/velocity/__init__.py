@@ -1,1 +1,1 @@
-"""The paper's Tables III and IV: velocity by all methods."""
+"""The velocity experiment, the paper's Tables III and IV: velocity estimates of all methods."""

@@ -1,4 +1,4 @@
-"""The pictures of the velocity experiment: truth and estimate over time, errors by method, learning curves."""
+"""The plots of the velocity experiment: truth and estimate over time, errors by method, learning curves."""
 
 import statistics
 from pathlib import Path
@@ -16,15 +16,15 @@ _GROUPS: Final = ("mvsec", "driving", "hand-held")
 
 
 def save(results: dict[str, Any], tracks: dict[str, list[Track]], out: Path) -> list[Path]:
-    """Write all pictures as PNG and SVG.
+    """Write all plots as PNG and SVG, and return their paths.
 
     Args:
-        results: the results.
+        results: of the experiment.
         tracks: of the first seed, by method.
-        out: folder.
+        out: folder, created if missing.
 
     Raises:
-        MissingExtra: matplotlib is not installed. InvalidField: a file can not be written.
+        MissingExtra: matplotlib is not installed. InvalidField: a file cannot be written.
     """
     out.mkdir(parents=True, exist_ok=True)
     stem = "velocity-quick" if results["quick"] else "velocity"
@@ -33,7 +33,7 @@ def save(results: dict[str, Any], tracks: dict[str, list[Track]], out: Path) -> 
 
 
 def draw_tracks(tracks: dict[str, list[Track]]) -> "Figure":
-    """Truth and estimate of each method over the first item of some groups."""
+    """Plot truth and estimates of each method on the first scenario of some groups."""
     some = next(iter(tracks.values()))
     firsts = [next((n for n, one in enumerate(some) if one.group == group), None) for group in _GROUPS]
     chosen = [number for number in firsts if number is not None]
@@ -54,7 +54,7 @@ def draw_tracks(tracks: dict[str, list[Track]]) -> "Figure":
 
 
 def draw_errors(results: dict[str, Any]) -> "Figure":
-    """RMSE of each method on each group, with the spread between seeds."""
+    """Plot the RMSE of each method on each group, with the spread between seeds."""
     methods, groups = methods_of(results), list(results["groups"])
     figure = blank_figure(12, 6)
     panels = figure.subplots(2, 1, sharex=True)
@@ -77,7 +77,7 @@ def draw_errors(results: dict[str, Any]) -> "Figure":
 
 
 def draw_curves(results: dict[str, Any]) -> "Figure":
-    """Mean error of the training batches over the updates, a line for each seed."""
+    """Plot the mean error of the training batches over the updates, one line per seed."""
     figure = blank_figure(12, 4)
     panels = figure.subplots(1, 2)
     methods = list(dict.fromkeys(run["method"] for run in results["runs"]))

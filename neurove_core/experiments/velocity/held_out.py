@@ -1,6 +1,7 @@
-"""What the velocity experiment judges on, and the real drives that it also learns from: all of it simulated once, kept.
+"""Held-out scenarios and training drives of the velocity experiment, simulated once and cached in a folder.
 
-No scene and no way of it is one that a configuration of ours trains on: those have seeds from 1,000,000 on.
+No scene and no trajectory here is used for training by our configurations, whose seeds start at 1,000,000. The training
+drives along MVSEC's trajectories are the exception: the methods of this experiment train on them.
 """
 
 import hashlib
@@ -28,25 +29,25 @@ CAMERA: Final = "davis346-half"
 
 HEIGHT_M: Final = 1.5
 DAY1, DAY2 = "mvsec/outdoor_day1_odom.h5", "mvsec/outdoor_day2_odom.h5"
-"""MVSEC's poses in a folder of recordings."""
+"""Files of MVSEC's poses in a folder of recordings."""
 
 DAY1_TRAINED_S: Final = 150.0
-"""How much of day 1 is learned from; the rest of its 257 s, some seconds later, is judged on."""
+"""Training uses this much of day 1. Evaluation uses the rest of its 257 s, from some seconds later."""
 
-_DAY1_TESTED_S: Final = range(154, 245, 10)  # where each begins
+_DAY1_TESTED_S: Final = range(154, 245, 10)  # start of each evaluated drive
 _DAY2_S: Final = 600.0
-_TRAIN_DRIVES: Final = 48  # of them 38 along day 2
+_TRAIN_DRIVES: Final = 48  # 38 of them along day 2
 _HAND_SLOWED: Final = 4.0
 _DRIVE_SLOWED: Final = (1.0, 2.0)
 _QUICK_CAMERA: Final = "pinhole:24x18:75"
 _QUICK_S: Final = 1.0
 _WINDOW_US: Final = 50_000  # of contrast maximisation
-_CONTRAST_INSTANTS: Final = 5  # per recording
-_KEY_POINTS: Final = 16  # of a trajectory, by which its file is known again
+_CONTRAST_INSTANTS: Final = 5  # per scenario
+_KEY_POINTS: Final = 16  # positions of a trajectory that enter the key of its file
 
 
 class Scenario(NamedTuple):
-    """One recording to judge on, or to learn from."""
+    """One simulated recording to evaluate on or to train on."""
 
     group: str
     name: str
@@ -64,10 +65,10 @@ GROUPS: Final = {
     "town 2": "24 s through another",
     "mvsec": "the unused part of MVSEC's outdoor_day1, its real way through unseen streets",
 }
-"""What is judged on, by name."""
+"""The groups of held-out scenarios and their descriptions."""
 
 CONTRAST_GROUPS: Final = ("driving", "hand-held", "town 1", "town 2", "mvsec")
-"""Where contrast maximisation is asked too."""
+"""Groups on which contrast maximisation is evaluated too."""
 
 _CAMERAS: Final = ("pinhole:86x65:75", "pinhole:128x96:90", "pinhole:172x130:55", "davis240c", "pinhole:320x240:62")
 _PIXELS: Final = {
@@ -78,11 +79,11 @@ _PIXELS: Final = {
 
 
 def held_out_scenarios(recordings: Path | None = None, *, quick: bool = False) -> list[Scenario]:
-    """All that is judged on, group by group.
+    """All held-out scenarios, group by group.
 
     Args:
-        recordings: where MVSEC's poses lie; without them its group is missing.
-        quick: the first of each group alone, a second long, through a tiny camera.
+        recordings: folder with MVSEC's poses; without them the group `mvsec` is missing.
+        quick: only the first scenario of each group, one second long, with a tiny camera.
     """
     found = [
         *(_street_scenario("driving", f"seed {seed}", seed, 8.0) for seed in range(6000, 6006)),
@@ -116,15 +117,15 @@ def held_out_scenarios(recordings: Path | None = None, *, quick: bool = False) -
 def training_drives(
     recordings: Path | None, seconds: float, motion_px: float, *, quick: bool = False
 ) -> list[Scenario]:
-    """What is learned from beside a configuration's sequences: MVSEC's day 2, and the first part of day 1.
+    """Simulated drives to train on besides the sequences of a configuration: MVSEC's day 2 and the first part of day 1.
 
-    Source: NeuroVE, section IV-A: trained on outdoor_day2 and a subset of outdoor_day1, judged on the rest of it.
+    Source: NeuroVE, section IV-A: trained on outdoor_day2 and a subset of outdoor_day1, evaluated on the rest of it.
 
     Args:
-        recordings: where the poses lie; without them, nothing.
-        seconds: length of each.
+        recordings: folder with the poses; without them the list is empty.
+        seconds: length of each drive.
         motion_px: of the simulation, see `Simulation`.
-        quick: two of them, through a tiny camera.
+        quick: only two drives, with a tiny camera.
     """
     if recordings is None or not all((recordings / day).exists() for day in (DAY1, DAY2)):
         return []
@@ -143,12 +144,12 @@ def training_drives(
 
 
 def _slowed_hand(seed: int, seconds: float) -> Trajectory:
-    """A wild hand's trajectory at a quarter of its speed: some 87 deg/s in the root mean square."""
+    """A fast hand-held trajectory at a quarter of its speed: about 87 deg/s RMS."""
     return Part(hand_held(seed, seconds), 0.0, _HAND_SLOWED, seconds)
 
 
 def _turning_drive(seed: int, seconds: float) -> Trajectory:
-    """Of three parts of a drive the one that turns most, up to twice as slow: most of any drive goes straight on."""
+    """The part with the most rotation out of three parts of a drive, slowed by up to 2: most driving is straight."""
     rng = np.random.default_rng((seed, 204))
     slowed = log_uniform(rng, _DRIVE_SLOWED)
     return turning_part(rng, driving(seed, DRIVE_S + seconds), slowed, seconds)
@@ -185,33 +186,33 @@ def _scenario(
 
 
 class HeldOutCache:
-    """Simulated items in a folder; what is missing is made.
+    """Simulated scenarios in a folder; missing ones are simulated.
 
     Args:
-        folder: of all items, whatever the model.
-        config: how its windows are cut and what it sees.
+        folder: holds the scenarios of all model configurations.
+        config: defines the windows and the canonical grid of the model.
     """
 
     def __init__(self, folder: Path, config: ModelConfig) -> None:
         self._folder, self._config = folder / "held-out", config
 
     def path(self, scenario: Scenario) -> Path:
-        """The file of an scenario, as `training.data.save` writes it."""
+        """The sequence file of a scenario, as `training.data.save` writes it."""
         return self._folder / f"{self._key(scenario)}.safetensors"
 
     def contrast_path(self, scenario: Scenario) -> Path:
-        """The file of what contrast maximisation says of an scenario."""
+        """The file with the estimates of contrast maximisation for a scenario."""
         return self._folder / f"{self._key(scenario)}.turning.json"
 
     def fill(self, wanted: list[Scenario]) -> Iterator[Scenario]:
-        """Make all that is missing; yields each scenario once it is there."""
+        """Simulate the missing scenarios, and yield each scenario when its files exist."""
         self._folder.mkdir(parents=True, exist_ok=True)
         for scenario in wanted:
             if not self.path(scenario).exists():
                 save(sequence_of(scenario.simulation, self._config), self.path(scenario))
             if scenario.group in CONTRAST_GROUPS and not self.contrast_path(scenario).exists():
-                told = list(_contrast_rates(scenario.simulation))
-                write_atomically(self.contrast_path(scenario), json.dumps(told).encode())
+                instants = list(_contrast_rates(scenario.simulation))
+                write_atomically(self.contrast_path(scenario), json.dumps(instants).encode())
             yield scenario
 
     def _key(self, scenario: Scenario) -> str:
@@ -228,12 +229,12 @@ class HeldOutCache:
         kind += [simulation.lens.info.model_dump(), simulation.lens.pitch_deg, simulation.pixels.model_dump()]
         kind += [self._config.window.model_dump(), self._config.canonical.model_dump()]
         position_m, _ = simulation.trajectory.pose(np.linspace(0, simulation.duration_s, _KEY_POINTS))
-        kind += position_m.round(6).tolist()  # names do not tell how a trajectory was made
+        kind += position_m.round(6).tolist()  # the name of a trajectory does not define it
         return hashlib.sha256(json.dumps(kind, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def _contrast_rates(simulation: Simulation) -> Iterator[dict[str, Any]]:
-    """What contrast maximisation says at some instants: `truth` and `answer` [rad/s], mean over a window."""
+    """Contrast maximisation at some instants: `truth` and its `answer` [rad/s], means over a window."""
     last_s = simulation.duration_s - _WINDOW_US / 1e6
     count = _CONTRAST_INSTANTS if simulation.duration_s > _QUICK_S else 1
     for start_s in np.linspace(0.5, last_s - 0.02, count).round(2).tolist():
@@ -248,6 +249,6 @@ def _contrast_rates(simulation: Simulation) -> Iterator[dict[str, Any]]:
         truth = simulation.trajectory.twist(t_s)[:, 3:].mean(axis=0)
         try:
             answer = angular(events, simulation.lens.info).w_rad_s
-        except InvalidField:  # next to no events: it stood still
+        except InvalidField:  # almost no events: the camera is stationary
             answer = np.zeros(3)
         yield {"t_s": start_s, "truth": truth.tolist(), "answer": answer.tolist()}

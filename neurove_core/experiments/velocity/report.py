@@ -1,4 +1,4 @@
-"""The tables of the velocity experiment, from its results alone: Table III's and Table IV's stand-ins, and the rest."""
+"""The tables of the velocity experiment, from its results: the stand-ins of Tables III and IV, and further tables."""
 
 import json
 import statistics
@@ -29,7 +29,7 @@ PAPER_TABLE_4: Final[dict[str, PaperFigures]] = {
         "nve": (3.37, 1.01, 0.35, 0.31),
     },
 }
-"""As printed: RMSE* of v_a (deg/s, magnified by 100, says the paper), RE of v_a, RMSE* of v_l [m/s], RE of v_l."""
+"""As printed: RMSE* of v_a (deg/s, according to the paper times 100), RE of v_a, RMSE* of v_l [m/s], RE of v_l."""
 
 SIMULATED: Final = (
     "The events are simulated, ours and not the paper's: its figures stand beside ours and are not of the same data."
@@ -52,7 +52,7 @@ Results = dict[str, Any]
 
 
 def markdown(results: Results) -> str:
-    """All tables of some results, as Markdown."""
+    """All tables of some results in Markdown."""
     drives, seeds = results["drives"], sorted({run["seed"] for run in results["runs"]})
     updates, recipe = results["runs"][0]["updates"], results["config"]["recipe"]
     parts = [
@@ -80,10 +80,10 @@ def markdown(results: Results) -> str:
 
 
 def save(results: Results, out: Path) -> list[Path]:
-    """Write velocity.json and velocity.md into a folder; returns both.
+    """Write velocity.json and velocity.md into a folder and return their paths.
 
     Raises:
-        InvalidField: a file can not be written.
+        InvalidField: a file cannot be written.
     """
     stem = "velocity-quick" if results["quick"] else "velocity"
     text = json.dumps(results, indent=1) + "\n"
@@ -91,13 +91,13 @@ def save(results: Results, out: Path) -> list[Path]:
 
 
 def methods_of(results: Results) -> list[str]:
-    """The learned methods, in the tables' order, and then the predictors that learn nothing."""
+    """The learned methods in the order of the tables, then the predictors that are not learned."""
     learned = {run["method"] for run in results["runs"]} | ({"shipped"} if results["shipped"] else set())
     return [name for name in _NAMES if name in learned or name in results["blind"]]
 
 
 def over_seeds(results: Results, method: str, group: str, figure: str) -> list[float]:
-    """A figure of a method on a group, seed by seed; empty where there is none."""
+    """A figure of a method on a group, one value per seed; empty if there is none."""
     rows = [run["groups"] for run in results["runs"] if run["method"] == method]
     rows += [results["blind"][method]] if method in results["blind"] else []
     rows += [results["shipped"]["groups"]] if method == "shipped" and results["shipped"] else []
@@ -119,7 +119,7 @@ def _table(columns: list[str], rows: list[list[str]]) -> str:
 
 
 def _paper_rows(results: Results, group: str, paper: PaperFigures) -> list[list[str]]:
-    """Rows of a table of the paper: method, the four figures, the unfloored RE, and the paper's four."""
+    """Rows of a table of the paper: the method, our four figures with the unfloored RE, and the paper's four."""
     rows = []
     for method in methods_of(results):
         cells = [_cell(results, method, group, figure) for figure in _COLUMNS]
@@ -188,7 +188,7 @@ def _by_group(results: Results) -> str:
 
 
 def _ratios(results: Results) -> str:
-    """NeuroVE over each learned baseline, on unseen drives, seed by seed."""
+    """Ratios of NeuroVE to each learned baseline on unseen drives, seed by seed."""
     rows = []
     for method in _LEARNED[1:]:
         cells = []
@@ -206,7 +206,7 @@ def _ratios(results: Results) -> str:
 
 
 def _gehrig(results: Results) -> str:
-    """The two figures of Gehrig 2020, whose `RMSE` is no root of a mean square."""
+    """The two figures of Gehrig 2020, whose `RMSE` is not a root mean square."""
     groups = [group for group in ("driving", "hand-held", "mvsec") if group in results["groups"]]
     rows = []
     for method in methods_of(results):

@@ -1,4 +1,4 @@
-"""What a model says of an scenario, beside the truth, and the figures of it."""
+"""Estimates of a model on a scenario with the ground truth, and figures from them."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -20,9 +20,9 @@ from neurove_core.training.data import Sequences
 Array = NDArray[np.float64]
 
 MIN_RATE_DEG_S: Final = 1.0
-"""Gehrig 2020 counts relative errors of truths above this."""
+"""Gehrig 2020 computes relative errors only for true rates above this."""
 
-_CHUNK: Final = 16  # windows that are followed at once
+_CHUNK: Final = 16  # windows per call of the network
 
 _FIGURES: Final = (
     "windows",
@@ -40,7 +40,7 @@ _FIGURES: Final = (
 
 
 class Track(NamedTuple):
-    """Answers to one scenario beside the truth, bin by bin; the first SKIP_S are left out."""
+    """Estimates and ground truth of one scenario, bin by bin, without the first SKIP_S."""
 
     group: str
     name: str
@@ -52,16 +52,15 @@ class Track(NamedTuple):
 
 @torch.inference_mode()
 def follow(model: Bundle, path: Path, scenario: Scenario) -> tuple[Track, tuple[int, int]]:
-    """Run a model over an scenario's windows from rest, as the service would.
+    """Run a model over the windows of a scenario from the zero state, as the service would.
 
     Args:
-        model: any kind.
-        path: of the scenario's sequence.
-        scenario: whose it is.
+        model: of any kind.
+        path: the sequence file of the scenario.
+        scenario: the simulated scenario.
 
     Returns:
-        its track, and how many neurons fired and how many there were, as its state at the end of every 16 windows
-        tells it.
+        its track, and the numbers of spikes and of neurons, summed over the states after every 16 windows.
     """
     found = Sequences([path])
     twists, height_m = found.twists[0].astype(np.float64), found.height_m[0]
@@ -88,16 +87,16 @@ def follow(model: Bundle, path: Path, scenario: Scenario) -> tuple[Track, tuple[
 
 
 def summaries(tracks: list[Track]) -> dict[str, dict[str, Any]]:
-    """The figures of each group, over all its items together."""
+    """The figures of each group, over all its scenarios together."""
     groups = dict.fromkeys(track.group for track in tracks)
     return {group: summary([track for track in tracks if track.group == group]) for group in groups}
 
 
 def summary(tracks: list[Track]) -> dict[str, Any]:
-    """The figures that the tables need, over some tracks together; `gehrig_*` are the two of Gehrig 2020.
+    """The figures for the tables, over some tracks together.
 
-    Those are the mean length of the angular error, which that paper calls RMSE, and the median of its ratio to a truth
-    of more than MIN_RATE_DEG_S.
+    `gehrig_*` are the two figures of Gehrig 2020. One is the mean length of the angular error, which that paper calls
+    RMSE. The other is the median ratio of that length to the true rate, for true rates above MIN_RATE_DEG_S.
     """
     truth, estimate = (
         np.concatenate(parts) for parts in zip(*((one.truth, one.estimate) for one in tracks), strict=True)
@@ -115,7 +114,7 @@ def summary(tracks: list[Track]) -> dict[str, Any]:
 
 
 def blind_predictors(tracks: list[Track]) -> dict[str, dict[str, dict[str, Any]]]:
-    """The figures, group by group, of two predictors that see nothing: `zero`, and `mean` of the group's own truth."""
+    """The figures by group of two predictors that ignore the events: `zero`, and the `mean` truth of the group."""
     groups = {group: [one for one in tracks if one.group == group] for group in dict.fromkeys(t.group for t in tracks)}
     means = {group: np.concatenate([one.truth for one in own]).mean(axis=0) for group, own in groups.items()}
     estimate: dict[str, dict[str, Array]] = {"zero": {group: np.zeros(6) for group in groups}, "mean": means}

@@ -1,4 +1,4 @@
-"""The firing experiment: rates near the preparing study's, repeatable, and written as told."""
+"""The firing experiment: rates close to the preliminary study, repeatable, written as tables and figures."""
 
 import json
 import sys
@@ -21,7 +21,7 @@ def results():
     ("neuron", "kind", "rate"),
     [(neuron, kind, rate) for neuron, of_kind in firing.STUDY.items() for kind, rate in of_kind.items()],
 )
-def test_rates_are_those_of_the_preparing_study_within_15_per_cent(results, neuron, kind, rate):
+def test_rates_are_within_15_percent_of_the_preliminary_study(results, neuron, kind, rate):
     assert results.rates[neuron][kind].mean == pytest.approx(rate, rel=0.15, abs=0.003)
 
 
@@ -34,17 +34,17 @@ def test_alif_fires_more_than_lif_and_more_with_more_diffusion(results, kind):
         assert means[0] < means[1]
 
 
-def test_the_literal_equation_6_is_alif_whose_leak_and_diffusion_make_one(results):
+def test_the_literal_equation_6_is_alif_whose_leak_and_diffusion_add_up_to_one(results):
     assert results.rates["Eq. (6a) literal, no leak, D = 0"] == results.rates["ALIF own v after reset, D = 0.5"]
 
 
-def test_the_same_seed_gives_the_same_numbers_and_another_one_others(results):
+def test_the_same_seed_gives_the_same_rates_and_another_seed_other_currents(results):
     assert firing.run(0) == results
     for kind in firing.CURRENTS:
         assert not torch.equal(firing.random_current(kind, 0), firing.random_current(kind, 1))
 
 
-def test_lif_of_the_experiment_is_the_module_under_each_current(results):
+def test_the_lif_rate_is_that_of_the_lif_module(results):
     neurons = LIF(1).double()
     current = torch.stack([firing.random_current("ou", seed) for seed in range(firing.SEEDS)], dim=1)[..., None]
     steps, _ = neurons(current, neurons.initial_state(firing.SEEDS))
@@ -52,7 +52,7 @@ def test_lif_of_the_experiment_is_the_module_under_each_current(results):
 
 
 @pytest.mark.parametrize(("kind", "mean", "sd"), [("ou", 0.34, 0.28), ("normal", 0.33, 0.28), ("uniform", 0.5, 0.289)])
-def test_a_random_current_has_the_law_it_says(kind, mean, sd):
+def test_a_random_current_has_its_documented_distribution(kind, mean, sd):
     current = firing.random_current(kind, seed=3, steps=100_000)
     assert current.mean().item() == pytest.approx(mean, abs=0.02)
     assert current.std().item() == pytest.approx(sd, abs=0.02)
@@ -60,13 +60,13 @@ def test_a_random_current_has_the_law_it_says(kind, mean, sd):
     assert correlation == pytest.approx(0.9 if kind == "ou" else 0.0, abs=0.02)
 
 
-def test_the_report_is_written_as_table_numbers_and_figure(results, tmp_path):
+def test_the_results_are_written_as_table_json_and_figure(results, tmp_path):
     pytest.importorskip("matplotlib")
     files = firing.save(results, tmp_path / "new" / "folder")
     assert [file.name for file in files] == ["firing.json", "firing.md", "firing.png", "firing.svg"]
-    told = json.loads(files[0].read_text())
-    assert told["rates"]["LIF"]["ou"]["mean"] == results.rates["LIF"]["ou"].mean
-    assert told["command"] == "neurove reproduce firing --seed 0"
+    written = json.loads(files[0].read_text())
+    assert written["rates"]["LIF"]["ou"]["mean"] == results.rates["LIF"]["ou"].mean
+    assert written["command"] == "neurove reproduce firing --seed 0"
     assert "| LIF | 0.098" in files[1].read_text()
     assert files[2].read_bytes().startswith(b"\x89PNG")
     assert b"<svg" in files[3].read_bytes()
@@ -80,7 +80,7 @@ def test_without_matplotlib_the_error_names_the_extra_and_nothing_is_written(res
     assert not (tmp_path / "out").exists()
 
 
-def test_wrong_values_are_named(results, tmp_path):
+def test_errors_name_the_wrong_value(results, tmp_path):
     with pytest.raises(InvalidField, match="seed=-1: must be at least 0"):
         firing.run(-1)
     with pytest.raises(InvalidField, match="kind='pink': must be one of ou, normal, uniform"):

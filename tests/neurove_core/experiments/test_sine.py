@@ -1,4 +1,4 @@
-"""The regression experiment: its data, its figures, and that a seed gives the same run."""
+"""The sine experiment: its data, its figures, and that a seed determines the run."""
 
 import json
 from pathlib import Path
@@ -17,7 +17,7 @@ QUICK = Path(data.__file__).parents[1] / "results" / "sine-quick.json"
 TINY = Recipe(model="aslstm", hidden=8, updates=12, fine_updates=6)
 
 
-def test_waves_go_on_as_the_same_sine():
+def test_waves_continue_as_the_same_sine():
     rows = waves()
     assert rows.shape == (100, LENGTH)
     truth = data.continued(rows)
@@ -26,7 +26,7 @@ def test_waves_go_on_as_the_same_sine():
 
 
 @pytest.mark.parametrize("model", list(data.KINDS))
-def test_training_lowers_the_error_and_keeps_what_is_not_learned(model):
+def test_training_lowers_the_error_and_keeps_frozen_weights(model):
     recipe = Recipe(model=model, hidden=16, v_th=0.2, updates=80, fine_updates=0)
     before = Network(recipe, np.random.default_rng(0))
     trained = train(recipe, seed=0)
@@ -38,20 +38,20 @@ def test_training_lowers_the_error_and_keeps_what_is_not_learned(model):
     assert diffuses == (model == "aslstm")
 
 
-def test_a_seed_is_the_run():
+def test_the_seed_determines_the_run():
     first, again, other = (train(TINY, seed).network.theta for seed in (3, 3, 4))
     assert np.array_equal(first, again)
     assert not np.allclose(first, other)
 
 
-def test_learned_thresholds_move_and_stay_above_their_bound():
+def test_learned_thresholds_change_and_stay_above_their_bound():
     recipe = Recipe(model="aslstm", hidden=8, v_th=0.05, learn_v_th=True, updates=30, fine_updates=0, lr=0.05)
     thresholds = np.concatenate([layer.v_th for layer in train(recipe, 0).network.weights[:2]])
     assert len(np.unique(thresholds)) > 4
     assert (thresholds >= 0.02 - 1e-6).all()
 
 
-def test_a_network_that_diverges_is_reported_as_a_number():
+def test_a_diverging_network_has_finite_errors():
     network = Network(TINY, np.random.default_rng(0))
     network.weights.first.d_time[:] = 50.0
     result, _ = evaluate(network)
@@ -59,7 +59,7 @@ def test_a_network_that_diverges_is_reported_as_a_number():
     assert min(result.forecast_rmse) > 1
 
 
-def test_a_rate_in_the_loss_makes_layers_fire_more():
+def test_a_target_rate_in_the_loss_makes_layers_fire_more():
     free, held = (Recipe(model="aslstm", v_th=0.5, hidden=16, rate=r, updates=150, fine_updates=0) for r in (0, 0.3))
     fewer, more = (evaluate(train(recipe, 0).network)[0].spike_rate for recipe in (free, held))
     assert all(b > a + 0.05 for a, b in zip(fewer, more, strict=True))
@@ -74,7 +74,7 @@ def test_a_rate_in_the_loss_makes_layers_fire_more():
         ({"rate": "1"}, r"rate='1': .*less than 1"),
     ],
 )
-def test_a_wrong_trial_is_named(changes, message):
+def test_errors_name_a_wrong_change(changes, message):
     with pytest.raises(InvalidField, match=message):
         next(report.reproduce(["aslstm"], [0], changes=changes))
 
@@ -92,7 +92,7 @@ def test_quick_reproduces_the_committed_figures(tmp_path):
         report.save_run(runs, tmp_path, command="a test", commit="none")
     for run, wanted in zip(runs, committed, strict=True):
         figures = run.figures
-        rtol = 0.1 if run.model == "aslstm" else 0.5  # spikes amplify the last bits in which machines differ
+        rtol = 0.1 if run.model == "aslstm" else 0.5  # spikes amplify rounding differences between machines
         for key in ("regression_rmse_x1000_from_100", "regression_rmse_x1000"):
             np.testing.assert_allclose(figures[key], wanted[key], rtol=rtol, err_msg=run.model)
         assert (figures["updates"], figures["parameters"]) == (wanted["updates"], wanted["parameters"])
@@ -101,13 +101,13 @@ def test_quick_reproduces_the_committed_figures(tmp_path):
     assert written >= {"table1.md", "table2.json", "regression.png", "spikes.svg", "aslstm-0.safetensors"}
     table = (tmp_path / "table1.md").read_text()
     assert "| ltc |" in table
-    assert "3.16 / 3.67 / 3.92" in table  # the paper's, beside ours
+    assert "3.16 / 3.67 / 3.92" in table  # the figures of the paper
     again = json.loads((tmp_path / "sine.json").read_text())
     assert [run["model"] for run in again] == list(report.RECIPES)
     assert all({"v_th", "spike_rate", "cpu_s", "command", "commit"} <= run.keys() for run in again)
 
 
-def test_the_pages_tables_are_those_of_the_committed_results():
+def test_the_tables_of_the_page_match_the_committed_results():
     figures = json.loads((QUICK.parent / "sine.json").read_text())
     page = (QUICK.parents[1] / "README.md").read_text()
     for number, rows in report.tables(figures).items():

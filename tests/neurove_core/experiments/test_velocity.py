@@ -1,4 +1,4 @@
-"""The velocity experiment: one recipe for all methods, held-out sets that nobody learns from, tables of the results."""
+"""The velocity experiment: one recipe for all methods, held-out scenarios, tables of the results."""
 
 import json
 from pathlib import Path
@@ -35,14 +35,14 @@ def quiet(what: str, done: int, of: int, about: str) -> None:
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
-    """Everything, once: sequences, two methods, results."""
+    """A finished quick experiment: sequences, two methods, results."""
     folder = tmp_path_factory.mktemp("velocity")
     experiment = run.Experiment(QUICK, ("nve", "ann"), range(1), None, quick=True)
     found = list(run.reproduce(experiment, folder / "data", folder, quiet))
     return folder, experiment, found, run.results(experiment, folder / "data", found)
 
 
-def test_methods_differ_from_one_another_in_what_they_are_and_in_nothing_else():
+def test_methods_differ_only_in_their_model():
     base = run.base_config()
     assert base == configs.load("driving")
     made = {method: run.method_config(base, method, 0) for method in run.METHODS}
@@ -63,7 +63,7 @@ def test_methods_differ_from_one_another_in_what_they_are_and_in_nothing_else():
     assert run.method_config(base, "nve", 3).recipe.seed == base.recipe.seed + 3
 
 
-def test_what_is_judged_on_is_no_scene_and_no_way_that_is_learned_from():
+def test_held_out_scenes_and_trajectories_are_not_used_for_training():
     wanted = held_out_scenarios()
     assert {scenario.group for scenario in wanted} == set(GROUPS) - {"mvsec"}
     learned_from = min(configs.load(name).data.seed for name in ("default", "driving"))
@@ -73,7 +73,7 @@ def test_what_is_judged_on_is_no_scene_and_no_way_that_is_learned_from():
     assert len({scenario.simulation.lens.name for scenario in wanted if scenario.group == "cameras"}) == 5
 
 
-def test_of_day_1_nothing_is_judged_on_that_is_learned_from():
+def test_training_and_evaluation_use_different_parts_of_day_1():
     for day in ("1", "2"):
         shared(f"mvsec/outdoor_day{day}_odom.h5")
     learned = training_drives(SHARED, 6.0, 1.5)
@@ -83,41 +83,41 @@ def test_of_day_1_nothing_is_judged_on_that_is_learned_from():
     assert 5 < len(on_day1) < 15
     assert max(on_day1) + 6.0 <= DAY1_TRAINED_S < min(float(scenario.name.split()[1]) for scenario in tested)
     assert {scenario.simulation.lens.info.lens for scenario in (*learned, *tested)} == {"equidistant"}
-    ways = [scenario.simulation.trajectory.twist(np.linspace(0, 5, 20)) for scenario in tested]
-    assert np.abs(ways).max() < 20
-    assert np.mean([way[:, 2].mean() for way in ways]) > 2  # it drives forward
+    twists = [scenario.simulation.trajectory.twist(np.linspace(0, 5, 20)) for scenario in tested]
+    assert np.abs(twists).max() < 20
+    assert np.mean([twist[:, 2].mean() for twist in twists]) > 2  # it drives forward
 
 
 def test_without_the_poses_there_are_no_drives_and_the_table_says_so(finished):
     assert training_drives(None, 6.0, 1.5) == []
     assert training_drives(Path("nowhere"), 6.0, 1.5) == []
-    _, _, _, told = finished
-    assert "mvsec" not in told["groups"]
-    assert "Left out: MVSEC's poses are missing" in report.markdown(told)
+    _, _, _, results = finished
+    assert "mvsec" not in results["groups"]
+    assert "Left out: MVSEC's poses are missing" in report.markdown(results)
 
 
-def test_a_track_is_what_the_estimator_says_of_the_same_recording(finished):
+def test_a_track_has_the_estimates_of_the_estimator_on_the_same_recording(finished):
     folder, experiment, found, _ = finished
     model = bundle.load(folder / "nve-0" / "nve-0.safetensors")
     scenario = next(scenario for scenario in held_out_scenarios(quick=True) if scenario.group == "driving")
     track, _ = follow(model, HeldOutCache(folder / "data", experiment.config.model).path(scenario), scenario)
     evaluated = evaluate(estimate_recording(Estimator(model), scenario.simulation), scenario.simulation.twists())
     bins = len(evaluated.truth)
-    assert len(track.truth) - bins in (0, 5)  # a recording's last window is closed by an event after it
+    assert len(track.truth) - bins in (0, 5)  # an event after the last window of a recording closes it
     np.testing.assert_allclose(track.estimate[:bins], evaluated.estimate, atol=1e-4)
     np.testing.assert_allclose(track.truth[:bins], evaluated.truth, atol=2e-3)
     np.testing.assert_allclose(track.t_s[:bins] * 1e6, evaluated.end_us - 5_000)
-    told = found[0].row["recordings"][f"driving: {scenario.name}"]
-    assert told["rmse_v_l_m_s"] == pytest.approx(summary([track])["rmse_v_l_m_s"])
+    results = found[0].row["recordings"][f"driving: {scenario.name}"]
+    assert results["rmse_v_l_m_s"] == pytest.approx(summary([track])["rmse_v_l_m_s"])
 
 
-def test_a_finished_method_is_not_trained_again_and_what_is_simulated_stays(finished):
-    folder, experiment, found, told = finished
+def test_finished_methods_and_sequences_are_reused(finished):
+    folder, experiment, found, results = finished
     before = {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
     again = list(run.reproduce(experiment, folder / "data", folder, quiet))
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()} == before
     assert [one.row for one in again] == [one.row for one in found]
-    assert run.results(experiment, folder / "data", again) == told
+    assert run.results(experiment, folder / "data", again) == results
 
 
 def test_a_folder_of_another_recipe_is_refused(finished):
@@ -127,7 +127,7 @@ def test_a_folder_of_another_recipe_is_refused(finished):
         list(run.reproduce(other, folder / "data", folder, quiet))
 
 
-def test_real_drives_are_learned_from_beside_the_sequences_in_a_folder_of_their_own(finished, tmp_path):
+def test_a_method_trained_on_real_drives_too_has_a_folder_of_its_own(finished, tmp_path):
     folder, experiment, _, _ = finished
     held_out = HeldOutCache(folder / "data", experiment.config.model)
     more = [held_out.path(scenario) for scenario in held_out_scenarios(quick=True)[:2]]
@@ -140,13 +140,13 @@ def test_real_drives_are_learned_from_beside_the_sequences_in_a_folder_of_their_
     )
 
 
-def test_predictors_that_see_nothing_are_zero_and_the_best_constant():
+def test_the_blind_predictors_are_zero_and_the_best_constant():
     rng = np.random.default_rng(0)
     truth = rng.normal(1.0, 1.0, (200, 6))
     track = Track("driving", "one", np.arange(200) / 100, truth, truth, 5)
-    told = blind_predictors([track, track._replace(name="two", truth=truth + 1)])
-    assert told["zero"]["driving"]["re_v_l"] == pytest.approx(1)
-    assert told["mean"]["driving"]["r2_v_l"] == pytest.approx(0, abs=1e-9)
+    results = blind_predictors([track, track._replace(name="two", truth=truth + 1)])
+    assert results["zero"]["driving"]["re_v_l"] == pytest.approx(1)
+    assert results["mean"]["driving"]["r2_v_l"] == pytest.approx(0, abs=1e-9)
     assert summary([track])["rmse_v_l_m_s"] == 0
 
 
@@ -155,20 +155,20 @@ def test_the_figures_of_gehrig_2020_are_a_mean_length_and_a_median_ratio():
     truth[:, 5] = np.radians([0.5, 10, 20, 40])
     estimate = truth.copy()
     estimate[:, 3] = np.radians([5, 1, 4, 4])
-    told = summary([Track("driving", "one", np.zeros(4), truth, estimate, 1)])
-    assert told["gehrig_mean_error_deg_s"] == pytest.approx(3.5)
-    assert told["gehrig_median_re"] == pytest.approx(0.1)
+    results = summary([Track("driving", "one", np.zeros(4), truth, estimate, 1)])
+    assert results["gehrig_mean_error_deg_s"] == pytest.approx(3.5)
+    assert results["gehrig_median_re"] == pytest.approx(0.1)
 
 
-def test_contrast_maximisation_is_asked_where_it_makes_sense(finished):
-    _, _, _, told = finished
-    assert set(told["blind"]["contrast maximisation"]) == set(CONTRAST_GROUPS) - {"mvsec"}
-    hand_held = told["blind"]["contrast maximisation"]["hand-held"]
+def test_contrast_maximisation_is_evaluated_on_its_groups_and_for_rotation_only(finished):
+    _, _, _, results = finished
+    assert set(results["blind"]["contrast maximisation"]) == set(CONTRAST_GROUPS) - {"mvsec"}
+    hand_held = results["blind"]["contrast maximisation"]["hand-held"]
     assert hand_held["re_v_l"] is None
     assert hand_held["rmse_v_a_deg_s"] > 0
 
 
-def test_wrong_wishes_are_refused():
+def test_wrong_methods_steps_and_seeds_are_refused():
     with pytest.raises(InvalidField, match="methods=.*known are nve, nve-wo, ann, snn-ang"):
         run.method_config(QUICK, "gru", 0)
     with pytest.raises(InvalidField, match="steps"):
@@ -178,57 +178,57 @@ def test_wrong_wishes_are_refused():
         list(run.reproduce(experiment, Path("nowhere"), Path("nowhere"), quiet))
 
 
-def test_the_quick_command_trains_all_methods_and_leaves_tables_and_pictures(finished, tmp_path, capsys):
+def test_the_quick_command_trains_all_methods_and_writes_tables_and_plots(finished, tmp_path, capsys):
     folder, *_ = finished
     arguments = ["reproduce", "velocity", "--quick", "--data", str(folder / "data"), "--out", str(tmp_path)]
     assert main.main(arguments) == 0
     table = capsys.readouterr().out
-    told = json.loads((tmp_path / "velocity-quick.json").read_text())
-    assert table == report.markdown(told) == (tmp_path / "velocity-quick.md").read_text()
-    assert [row["method"] for row in told["runs"]] == list(run.METHODS)
+    results = json.loads((tmp_path / "velocity-quick.json").read_text())
+    assert table == report.markdown(results) == (tmp_path / "velocity-quick.md").read_text()
+    assert [row["method"] for row in results["runs"]] == list(run.METHODS)
     for name in ("NeuroVE", "NeuroVE w/o", "equal-size ANN", "SNN-ANG", "the mean of this truth", "zero"):
         assert f"| {name} |" in table
-    pictures = {path.name for path in tmp_path.glob("*.png")}
-    assert pictures == {f"velocity-quick-{name}.png" for name in ("tracks", "errors", "curves")}
-    runs = {row["method"]: row for row in told["runs"]}
+    plots = {path.name for path in tmp_path.glob("*.png")}
+    assert plots == {f"velocity-quick-{name}.png" for name in ("tracks", "errors", "curves")}
+    runs = {row["method"]: row for row in results["runs"]}
     assert runs["nve"]["firing_rate"] > 0
     assert runs["ann"]["firing_rate"] is None
     assert runs["nve"]["cost"] == 1.0
 
 
 def test_seeds_give_a_mean_and_a_spread(finished):
-    *_, told = finished
-    other = json.loads(json.dumps(told))
+    *_, results = finished
+    other = json.loads(json.dumps(results))
     for row in other["runs"]:
         row["seed"] = 1
         row["groups"]["driving"]["re_v_l"] += 0.1
-    both = told | {"runs": told["runs"] + other["runs"]}
+    both = results | {"runs": results["runs"] + other["runs"]}
     text = report.markdown(both)
     assert "2 seeds, mean ± spread between seeds" in text
-    first = told["runs"][0]["groups"]["driving"]["re_v_l"]
+    first = results["runs"][0]["groups"]["driving"]["re_v_l"]
     assert f"{first + 0.05:.2f} ± 0.07 /" in text
 
 
-def test_with_recordings_the_real_drives_and_the_real_events_are_there_too(finished, tmp_path, capsys):
+def test_with_recordings_the_real_drives_and_the_checks_on_real_events_are_included(finished, tmp_path, capsys):
     for check in real.CHECKS:
         shared(check.recording)
     folder, *_ = finished
     arguments = ["--quick", "--methods", "ann", "--data", str(folder / "data"), "--out", str(tmp_path), "--json"]
     assert main.main(["reproduce", "velocity", *arguments, "--recordings", str(SHARED)]) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert told["drives"] == 2
-    assert "mvsec" in told["groups"]
+    results = json.loads(capsys.readouterr().out)
+    assert results["drives"] == 2
+    assert "mvsec" in results["groups"]
     assert "| SNN-ANG |" not in (tmp_path / "velocity-quick.md").read_text()
     assert (tmp_path / "real.md").is_file()
 
 
 @pytest.mark.parametrize("file", sorted(RESULTS.glob("velocity*.json")), ids=lambda file: file.name)
-def test_committed_tables_are_those_of_the_committed_figures(file):
-    told = json.loads(file.read_text())
-    assert file.with_suffix(".md").read_text() == report.markdown(told)
+def test_committed_tables_match_the_committed_json(file):
+    results = json.loads(file.read_text())
+    assert file.with_suffix(".md").read_text() == report.markdown(results)
 
 
-def test_a_street_without_texture_shows_next_to_nothing_below():
+def test_a_street_without_texture_gives_few_events_in_the_lower_image():
     made = {scenario.group: scenario.simulation for scenario in held_out_scenarios(quick=True)}
     lower = {}
     for scene in ("driving", "bare street"):

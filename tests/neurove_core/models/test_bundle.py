@@ -1,4 +1,4 @@
-"""Bundles: what is loaded is what was saved, and a file that is anything else is refused with a reason."""
+"""Bundles: loading gives what was saved, and every other file is refused with a reason."""
 
 import errno
 import hashlib
@@ -25,10 +25,10 @@ from tests.bundles import (
     CONFIG,
     DATA,
     ORIGINAL,
+    join_header,
     make_bundle,
-    packed,
     refusal,
-    unpacked,
+    split_header,
     with_entries,
     with_fields,
     with_tensors,
@@ -71,12 +71,12 @@ def test_a_saved_model_is_loaded_with_the_same_digest_config_and_answers(tmp_pat
         NetworkConfig(channels=(2,), features=2, hidden=2, surrogate="arctan", surrogate_width=0.1, v_th=0.3),
     ],
 )
-def test_saving_what_was_loaded_gives_the_same_bytes_for_every_architecture(network):
+def test_saving_a_loaded_bundle_gives_the_same_bytes_for_every_architecture(network):
     data = make_bundle(network=network).to_bytes()
     assert bundle.from_bytes(data, "x").to_bytes() == data
 
 
-def test_the_same_seed_gives_the_same_model_and_another_seed_or_name_or_config_another():
+def test_the_same_seed_gives_the_same_model_and_another_seed_name_or_config_another_one():
     again = make_bundle()
     assert again.digest == ORIGINAL.digest
     assert answers_of(again) == answers_of(ORIGINAL)
@@ -85,7 +85,7 @@ def test_the_same_seed_gives_the_same_model_and_another_seed_or_name_or_config_a
     assert answers_of(others[0]) != answers_of(ORIGINAL)
 
 
-def test_drawing_a_model_leaves_the_callers_random_numbers_alone():
+def test_making_an_untrained_model_does_not_change_the_callers_random_numbers():
     torch.manual_seed(5)
     expected = torch.rand(3)
     torch.manual_seed(5)
@@ -94,7 +94,7 @@ def test_drawing_a_model_leaves_the_callers_random_numbers_alone():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_an_untrained_model_fires_and_sees_its_input(seed):
+def test_an_untrained_model_fires_and_reacts_to_its_input(seed):
     estimator = Estimator(bundle.untrained(seed))
     busy, quiet = make_events(30_000, duration_us=160_000), make_events(4, duration_us=160_000)
     twists = [
@@ -104,7 +104,7 @@ def test_an_untrained_model_fires_and_sees_its_input(seed):
     assert abs(twists[0] - twists[1]).max() > 0.05
 
 
-def test_info_tells_how_many_parameters_a_model_has_and_whether_it_was_trained():
+def test_info_gives_the_number_of_parameters_and_whether_the_model_was_trained():
     info = ORIGINAL.info
     assert (info.name, info.digest, info.trained) == ("untrained", ORIGINAL.digest, False)
     stored = safetensors.torch.load(DATA)
@@ -127,15 +127,15 @@ def test_a_flipped_bit_is_refused_or_makes_another_model(where, bit):
 
 @pytest.mark.parametrize("bit", range(8))
 def test_a_flipped_bit_of_the_header_is_refused_or_makes_another_model(bit):
-    for where in range(0, len(DATA) - len(unpacked()[1]), 7):
+    for where in range(0, len(DATA) - len(split_header()[1]), 7):
         flipped = bytearray(DATA)
         flipped[where] ^= 1 << bit
         assert_refused_or_another_model(bytes(flipped))
 
 
-@given(where=st.integers(0, len(DATA)), junk=st.binary(max_size=40), cut=st.integers(0, 40))
-def test_bytes_put_in_or_overwritten_anywhere_are_refused_or_make_another_model(where, junk, cut):
-    data = DATA[:where] + junk + DATA[where + cut :]
+@given(where=st.integers(0, len(DATA)), junk=st.binary(max_size=40), removed=st.integers(0, 40))
+def test_inserted_or_overwritten_bytes_are_refused_or_make_another_model(where, junk, removed):
+    data = DATA[:where] + junk + DATA[where + removed :]
     if data != DATA:
         assert_refused_or_another_model(data)
 
@@ -143,7 +143,7 @@ def test_bytes_put_in_or_overwritten_anywhere_are_refused_or_make_another_model(
 @given(st.binary(max_size=300))
 def test_any_bytes_are_refused(data):
     refusal(data)
-    refusal(packed(data))
+    refusal(join_header(data))
 
 
 @pytest.mark.parametrize(
@@ -152,40 +152,40 @@ def test_any_bytes_are_refused(data):
         (b"", "size=0"),
         (b"\x00" * 7, "size=7"),
         (b"# a text file, not a model\n" * 40, "not a safetensors file"),
-        (packed(b"not json"), "can not be read"),
-        (packed(b""), "can not be read"),
-        (packed(b"\xff\xfe\xfd"), "can not be read"),
-        (packed(b"[" * 100_000), "can not be read"),
-        (packed(b"[]"), "no 'neurove' entry"),
-        (packed(b"{}"), "no 'neurove' entry"),
-        (packed(b'{"__metadata__": 3}'), "no 'neurove' entry"),
-        (packed(b'{"__metadata__": {"neurove": 3}}'), "no 'neurove' entry"),
-        (packed(b'{"__metadata__": {"neurove": "{"}}'), "can not be read"),
-        (packed(b'{"__metadata__": {"neurove": "[1]"}}'), "bundle_version=None"),
+        (join_header(b"not json"), "cannot be read"),
+        (join_header(b""), "cannot be read"),
+        (join_header(b"\xff\xfe\xfd"), "cannot be read"),
+        (join_header(b"[" * 100_000), "cannot be read"),
+        (join_header(b"[]"), "no 'neurove' entry"),
+        (join_header(b"{}"), "no 'neurove' entry"),
+        (join_header(b'{"__metadata__": 3}'), "no 'neurove' entry"),
+        (join_header(b'{"__metadata__": {"neurove": 3}}'), "no 'neurove' entry"),
+        (join_header(b'{"__metadata__": {"neurove": "{"}}'), "cannot be read"),
+        (join_header(b'{"__metadata__": {"neurove": "[1]"}}'), "bundle_version=None"),
         (safetensors.torch.save({"weight": torch.zeros(3)}), "no 'neurove' entry"),
         (safetensors.torch.save({"weight": torch.zeros(3)}, {"format": "pt"}), "no 'neurove' entry"),
     ],
     ids=range(15),
 )
-def test_a_foreign_file_is_refused_and_says_what_it_is_not(data, word):
+def test_a_file_of_another_format_is_refused_and_the_message_says_why(data, word):
     assert word in refusal(data)
 
 
 @pytest.mark.parametrize(
     "length", [0, 1, 7, len(DATA) - 8, len(DATA) - 7, 1 << 20, (1 << 20) + 1, 1 << 40, (1 << 64) - 1]
 )
-def test_a_header_length_that_lies_is_refused(length):
+def test_a_wrong_header_length_is_refused(length):
     assert "header" in refusal(struct.pack("<Q", length) + DATA[8:])
 
 
-def test_a_header_over_its_cap_is_refused_even_if_it_is_whole():
+def test_a_header_above_its_limit_is_refused_even_if_it_is_complete():
     padding = " " * bundle.MAX_HEADER_BYTES
-    entries, tensors = unpacked()
-    assert str(bundle.MAX_HEADER_BYTES) in refusal(packed((json.dumps(entries) + padding).encode(), tensors))
+    entries, tensors = split_header()
+    assert str(bundle.MAX_HEADER_BYTES) in refusal(join_header((json.dumps(entries) + padding).encode(), tensors))
 
 
 @pytest.mark.parametrize("version", [0, 2, None, "1", [1], {"a": [[[[[[[1]]]]]]]}])
-def test_another_bundle_version_is_refused_and_both_are_named(version):
+def test_another_bundle_version_is_refused_with_both_versions(version):
     message = refusal(with_fields(lambda fields: fields.update(bundle_version=version)))
     assert "bundle_version=" in message
     assert "reads version 1" in message
@@ -221,24 +221,24 @@ def test_a_wrong_header_field_is_named_with_its_value_and_bound(edit, words):
 
 @pytest.mark.parametrize("depth", [100, 900, 5_000])
 @pytest.mark.parametrize("field", ["config", "name", "bundle_version"])
-def test_a_header_nested_deep_is_refused_in_a_short_sentence(field, depth):
-    entries, tensors = unpacked()
+def test_a_deeply_nested_header_is_refused_with_a_short_message(field, depth):
+    entries, tensors = split_header()
     fields = json.loads(entries["__metadata__"]["neurove"])
     text = json.dumps({**fields, field: "HERE"}).replace('"HERE"', "[" * depth + "]" * depth)
     entries["__metadata__"]["neurove"] = text
-    assert len(refusal(packed(json.dumps(entries).encode(), tensors))) < 500
+    assert len(refusal(join_header(json.dumps(entries).encode(), tensors))) < 500
 
 
 @pytest.mark.parametrize("level", ["tensors", "metadata", "own"])
-def test_a_key_that_stands_twice_is_refused(level):
-    header = DATA[8 : len(DATA) - len(unpacked()[1])].decode()
+def test_a_duplicate_key_is_refused(level):
+    header = DATA[8 : len(DATA) - len(split_header()[1])].decode()
     twice = {
         "tensors": header.replace(',"kappa_logit"', ',"kappa_logit":1,"kappa_logit"', 1),
         "metadata": header.replace('{"neurove":', '{"neurove":"{}","neurove":', 1),
         "own": header.replace('{\\"bundle_version\\":1', '{\\"trained\\":true,\\"bundle_version\\":1', 1),
     }[level]
     assert twice != header
-    assert "twice" in refusal(packed(twice.encode(), unpacked()[1]))
+    assert "twice" in refusal(join_header(twice.encode(), split_header()[1]))
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
@@ -255,12 +255,12 @@ def test_a_missing_tensor_is_refused_and_named(name):
     assert f"{name!r} is missing" in message
 
 
-def test_a_tensor_that_does_not_belong_is_refused_and_named():
+def test_an_unknown_tensor_is_refused_and_named():
     message = refusal(with_tensors(lambda tensors: tensors.update({"cells.1.w_x": torch.zeros(2)})))
     assert "'cells.1.w_x' is not one of this architecture" in message
 
 
-def test_more_tensors_than_the_cap_are_refused_before_they_are_read():
+def test_more_tensors_than_the_limit_are_refused_before_they_are_read():
     def crowd(entries: dict[str, Any]) -> None:
         entries.update({f"t{i}": 0 for i in range(bundle.MAX_TENSORS)})
 
@@ -281,7 +281,7 @@ def test_more_tensors_than_the_cap_are_refused_before_they_are_read():
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_a_tensor_of_another_shape_or_type_is_refused_and_both_are_named(tensor, word):
+def test_a_tensor_of_another_shape_or_type_is_refused_with_both(tensor, word):
     message = refusal(with_tensors(lambda tensors: tensors.update({"readout.bias": tensor})))
     assert "'readout.bias'" in message
     assert word in message
@@ -290,11 +290,11 @@ def test_a_tensor_of_another_shape_or_type_is_refused_and_both_are_named(tensor,
 
 @pytest.mark.parametrize("shape", [[0, 1 << 40, 1 << 40], [0, 1 << 63], [(1 << 64) - 1, 0], [0] * 2_000])
 @pytest.mark.parametrize("dtype", ["F32", "F4", "C64"])
-def test_a_tensor_without_elements_and_with_absurd_sides_is_refused(shape, dtype):
+def test_a_tensor_without_elements_and_with_huge_sizes_is_refused(shape, dtype):
     refusal(with_entries(lambda entries: entries.update(t={"dtype": dtype, "shape": shape, "data_offsets": [0, 0]})))
 
 
-def test_an_architecture_that_needs_terabytes_is_refused_by_its_tensors_before_any_memory_is_taken():
+def test_an_architecture_that_needs_terabytes_is_refused_before_memory_is_allocated():
     def inflate(fields: dict[str, Any]) -> None:
         fields["config"]["canonical"].update(width=1024, height=1024)
         fields["config"]["network"].update(channels=[1024], features=4096)
@@ -303,7 +303,7 @@ def test_an_architecture_that_needs_terabytes_is_refused_by_its_tensors_before_a
     assert "its header's architecture needs" in message
 
 
-def test_a_missing_file_and_a_directory_are_refused_with_the_systems_reason(tmp_path):
+def test_a_missing_file_and_a_directory_are_refused_with_the_reason_of_the_system(tmp_path):
     with pytest.raises(BadModel, match=r"gone\.safetensors: No such file"):
         bundle.load(tmp_path / "gone.safetensors")
     (tmp_path / "folder.safetensors").mkdir()
@@ -311,15 +311,15 @@ def test_a_missing_file_and_a_directory_are_refused_with_the_systems_reason(tmp_
         bundle.load(tmp_path / "folder.safetensors")
 
 
-def test_a_file_over_the_cap_is_refused_by_its_size_without_being_read(tmp_path):
+def test_a_file_above_the_size_limit_is_refused_without_being_read(tmp_path):
     path = tmp_path / "huge.safetensors"
     with path.open("wb") as file:
-        file.truncate(bundle.MAX_BYTES + 1)  # a hole: takes no space
+        file.truncate(bundle.MAX_BYTES + 1)  # sparse: takes no disk space
     with pytest.raises(BadModel, match=rf"size={bundle.MAX_BYTES + 1}.*{bundle.MAX_BYTES} bytes"):
         bundle.load(path)
 
 
-def test_a_file_is_named_in_errors_by_its_name_alone_not_by_where_it_lies(tmp_path):
+def test_errors_name_the_file_without_its_folder(tmp_path):
     path = tmp_path / "broken.safetensors"
     path.write_bytes(DATA[:100])
     with pytest.raises(BadModel) as refused:
@@ -327,7 +327,7 @@ def test_a_file_is_named_in_errors_by_its_name_alone_not_by_where_it_lies(tmp_pa
     assert str(tmp_path) not in refused.value.message
 
 
-def test_saving_replaces_the_file_whole_and_leaves_nothing_else(tmp_path):
+def test_saving_replaces_the_file_atomically_and_leaves_nothing_else(tmp_path):
     path = tmp_path / "model.safetensors"
     bundle.save(make_bundle(1), path)
     bundle.save(ORIGINAL, path)
@@ -335,7 +335,7 @@ def test_saving_replaces_the_file_whole_and_leaves_nothing_else(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_when_the_disk_is_full_the_old_file_stays_whole_and_nothing_else_is_left(tmp_path, monkeypatch):
+def test_when_the_disk_is_full_the_old_file_is_intact_and_nothing_else_is_left(tmp_path, monkeypatch):
     path = tmp_path / "model.safetensors"
     bundle.save(ORIGINAL, path)
 
@@ -349,7 +349,7 @@ def test_when_the_disk_is_full_the_old_file_stays_whole_and_nothing_else_is_left
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_file_that_can_not_be_put_in_its_place_leaves_nothing(tmp_path: Path):
+def test_a_file_that_cannot_be_moved_to_its_place_leaves_nothing(tmp_path: Path):
     path = tmp_path / "model.safetensors"
     path.mkdir()
     with pytest.raises(IsADirectoryError):

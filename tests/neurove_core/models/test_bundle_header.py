@@ -1,4 +1,4 @@
-"""The optional header of a bundle: it travels whole, old bundles do without, and whatever stands in it is checked."""
+"""The optional header fields: saved and loaded unchanged, absent in old bundles, and always checked."""
 
 import json
 from dataclasses import replace
@@ -13,9 +13,9 @@ from neurove_core.models import bundle, golden, manifest
 from neurove_core.models.bundle import Header
 from neurove_core.models.metadata import BundleLimits, MadeBy, Metadata
 from neurove_protocol.errors import BadModel
-from tests.bundles import CONFIG, DATA, ORIGINAL, packed, refusal, unpacked, with_entries, with_fields
+from tests.bundles import CONFIG, DATA, ORIGINAL, join_header, refusal, split_header, with_entries, with_fields
 
-TOLD = Metadata(
+METADATA = Metadata(
     release=7,
     figures={"heldout_re_v_l": 0.19, "heldout_rmse_v_l_m_s": 1.49},
     made_by=MadeBy(
@@ -63,30 +63,30 @@ VALUES = st.recursive(
 )
 
 
-def told_bytes() -> bytes:
-    return replace(ORIGINAL, metadata=TOLD).to_bytes()
+def bytes_with_metadata() -> bytes:
+    return replace(ORIGINAL, metadata=METADATA).to_bytes()
 
 
 def edited(path, value):
-    """The told bundle's bytes with one field of its header replaced, wherever the path leads."""
+    """The bytes of the bundle with metadata, with the header field at a path replaced."""
 
     def edit(fields):
         for step in path[:-1]:
             fields = fields[step]
         fields[path[-1]] = value
 
-    return with_fields(edit, told_bytes())
+    return with_fields(edit, bytes_with_metadata())
 
 
-def test_what_the_maker_tells_travels_with_the_model():
-    loaded = bundle.from_bytes(told_bytes(), "x")
-    assert loaded.metadata == TOLD
+def test_metadata_is_saved_and_loaded_unchanged():
+    loaded = bundle.from_bytes(bytes_with_metadata(), "x")
+    assert loaded.metadata == METADATA
     assert (loaded.release, loaded.prime_windows, loaded.limits.mean_dv_m_s) == (7, 40, 1.5)
-    assert loaded.to_bytes() == told_bytes()
+    assert loaded.to_bytes() == bytes_with_metadata()
 
 
-def test_a_bundle_that_tells_nothing_is_the_file_that_it_always_was():
-    fields = json.loads(unpacked(DATA)[0]["__metadata__"]["neurove"])
+def test_a_bundle_without_metadata_has_only_the_required_header_fields():
+    fields = json.loads(split_header(DATA)[0]["__metadata__"]["neurove"])
     assert list(fields) == [
         "bundle_version",
         "name",
@@ -100,7 +100,7 @@ def test_a_bundle_that_tells_nothing_is_the_file_that_it_always_was():
     assert loaded.prime_windows == CONFIG.settle_windows
 
 
-def test_no_window_at_all_may_be_asked_for_to_prime_with():
+def test_prime_windows_may_be_zero():
     assert bundle.from_bytes(edited(("prime_windows",), 0), "x").prime_windows == 0
 
 
@@ -131,11 +131,11 @@ def test_a_wrong_field_is_named_with_its_value_and_bound(path, value, words):
 
 
 @pytest.mark.parametrize("depth", [100, 240, 300, 900, 5_000, 100_000])
-def test_a_recipe_nested_deep_is_taken_or_refused_in_a_short_sentence(depth):
-    entries, tensors = unpacked(told_bytes())
+def test_a_deeply_nested_recipe_is_accepted_or_refused_with_a_short_message(depth):
+    entries, tensors = split_header(bytes_with_metadata())
     text = entries["__metadata__"]["neurove"].replace('{"sequences":112}', '{"x":' + "[" * depth + "]" * depth + "}")
     entries["__metadata__"]["neurove"] = text
-    data = packed(json.dumps(entries).encode(), tensors)
+    data = join_header(json.dumps(entries).encode(), tensors)
     if depth < 250:
         assert bundle.from_bytes(data, "x").metadata.made_by is not None
     else:
@@ -143,7 +143,7 @@ def test_a_recipe_nested_deep_is_taken_or_refused_in_a_short_sentence(depth):
 
 
 @given(path=st.sampled_from(PATHS), value=VALUES)
-def test_any_value_in_any_field_is_taken_or_refused_in_a_short_sentence(path, value):
+def test_any_value_in_any_field_is_accepted_or_refused_with_a_short_message(path, value):
     data = edited(path, value)
     try:
         loaded = bundle.from_bytes(data, "x")
@@ -154,18 +154,18 @@ def test_any_value_in_any_field_is_taken_or_refused_in_a_short_sentence(path, va
 
 
 @given(st.dictionaries(st.text(max_size=12), VALUES, max_size=6))
-def test_any_header_at_all_is_refused(fields):
-    refusal(packed(json.dumps({"__metadata__": {"neurove": json.dumps(fields)}}).encode()))
-    refusal(packed(json.dumps(fields).encode()))
+def test_random_headers_are_refused(fields):
+    refusal(join_header(json.dumps({"__metadata__": {"neurove": json.dumps(fields)}}).encode()))
+    refusal(join_header(json.dumps(fields).encode()))
 
 
-def test_two_hundred_thousand_empty_tensors_are_refused_before_one_of_them_is_made():
+def test_two_hundred_thousand_empty_tensors_are_refused_before_any_is_created():
     empty = {"dtype": "F32", "shape": [0], "data_offsets": [0, 0]}
     message = refusal(with_entries(lambda entries: entries.update({f"t{i}": empty for i in range(200_000)})))
     assert f"over {bundle.MAX_HEADER_BYTES} bytes" in message
 
 
-def test_a_pickle_is_refused_and_not_one_opcode_of_it_runs(tmp_path):
+def test_a_pickle_is_refused_and_none_of_its_opcodes_runs(tmp_path):
     import pickle
 
     class Trap:
@@ -176,7 +176,7 @@ def test_a_pickle_is_refused_and_not_one_opcode_of_it_runs(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_the_page_of_the_format_names_every_field_and_reason():
+def test_the_page_of_the_format_names_every_field_and_limit():
     page = (Path(neurove_core.__file__).parent / "BUNDLE.md").read_text()
     named = [*Header.model_fields, *MadeBy.model_fields, *BundleLimits.model_fields, *manifest.Signed.model_fields]
     named += [*bundle.UncertaintyHeader.model_fields, "spread.weight", "spread.bias", "output.correlation"]

@@ -1,5 +1,7 @@
-"""The model that comes with the package: small, whole, and better than any predictor that sees nothing."""
+"""The default model: small, complete, and better than any predictor that ignores the events."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +19,7 @@ from neurove_core.training import data
 from neurove_core.training.batches import with_gain
 
 
-def test_it_is_trained_small_and_says_how_it_was_made():
+def test_it_is_trained_and_small_and_has_its_provenance():
     found = models.find(models.DEFAULT)
     assert models.built_in()[0] is found
     assert found.trained
@@ -27,18 +29,23 @@ def test_it_is_trained_small_and_says_how_it_was_made():
     assert bundle.load(file).digest == found.digest
 
 
+def test_importing_the_package_of_models_does_not_load_torch():
+    program = "import sys, neurove_core.models; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
+
+
 @pytest.mark.parametrize("height_m", [0.5, 2.0])
-def test_it_sees_how_fast_it_drives_from_any_height(height_m):
+def test_it_estimates_the_speed_of_a_drive_at_any_camera_height(height_m):
     source = f"sim://street?seed=7001&seconds=2.5&camera=pinhole:86x65:75&height={height_m}"
     recording = open_source(source)
-    told = report([evaluate(estimate_recording(Estimator(models.find("default")), recording), recording.twists())])
-    assert told["re_v_l"] < 0.4 < told["zero"]["re_v_l"]
-    assert told["rmse_v_a_deg_s"] < 6
-    assert told["scaled"]
+    results = report([evaluate(estimate_recording(Estimator(models.find("default")), recording), recording.twists())])
+    assert results["re_v_l"] < 0.4 < results["zero"]["re_v_l"]
+    assert results["rmse_v_a_deg_s"] < 6
+    assert results["scaled"]
 
 
 def counts_of(scene):
-    """A drive through a scene, window by window (50, 2n, H, W)."""
+    """Counts of the windows of a drive through a scene (50, 2n, H, W)."""
     found = models.find("default")
     if found.uncertainty is None:
         pytest.skip("the default model is not calibrated: neurove calibrate default")
@@ -51,8 +58,8 @@ def drive():
     return counts_of("street")
 
 
-def claimed(counts):
-    """Sigma of vz [1/s] after each window, which windows are uncertain, and vz [1/s]."""
+def uncertainty_of(counts):
+    """Per window: sigma of vz [1/s], whether it is uncertain, and vz [1/s]."""
     found = models.find("default")
     engine, state = Engine(found.network), found.network.initial_state()
     scale, offset = found.scale.double().numpy(), found.offset.double().numpy()
@@ -69,41 +76,41 @@ def claimed(counts):
     return np.array(sigmas), np.array(uncertain), np.array(speed)
 
 
-def test_it_is_sure_of_a_plain_drive_and_unsure_while_it_sees_nothing_or_little(drive):
-    usual, flagged, _ = claimed(drive)
+def test_its_sigma_is_low_on_a_normal_drive_and_higher_with_few_or_no_events(drive):
+    usual, flagged, _ = uncertainty_of(drive)
     assert flagged[16:].mean() < 0.2
     blank, few = drive.copy(), drive.copy()
     blank[30:] = 0
     few[30:] = with_gain(np.random.default_rng(0), few[30:], 0.01)
-    for counts, wider in ((blank, 1.2), (few, 1.4)):  # a window without events is flagged low_activity besides
-        sigma, _, _ = claimed(counts)
+    for counts, wider in ((blank, 1.2), (few, 1.4)):  # a window without events is also flagged low_activity
+        sigma, _, _ = uncertainty_of(counts)
         assert (sigma[:30] == usual[:30]).all()
         assert np.median(sigma[35:]) > wider * np.median(usual[35:])
 
 
-def test_over_a_ground_without_texture_it_is_unsure(drive):
-    (sigma, flagged, _), (usual, _, _) = claimed(counts_of("bare-street")), claimed(drive)
+def test_its_sigma_is_higher_over_a_ground_without_texture(drive):
+    (sigma, flagged, _), (usual, _, _) = uncertainty_of(counts_of("bare-street")), uncertainty_of(drive)
     assert np.median(sigma) > 1.2 * np.median(usual)
     assert flagged[16:].mean() > 0.5
 
 
-def test_a_gap_makes_it_unsure(drive):
+def test_its_sigma_is_higher_after_a_gap(drive):
     counts = drive.copy()
     counts[30:40] = 0
-    (sigma, _, _), (usual, _, _) = claimed(counts), claimed(drive)
+    (sigma, _, _), (usual, _, _) = uncertainty_of(counts), uncertainty_of(drive)
     assert sigma[36:41].mean() > 1.3 * usual[36:41].mean()
 
 
-def test_a_second_without_events_makes_it_uncertain(drive):
+def test_after_a_second_without_events_its_estimates_are_uncertain(drive):
     counts = drive.copy()
     counts[30:] = 0
-    _, flagged, _ = claimed(counts)
+    _, flagged, _ = uncertainty_of(counts)
     assert flagged[35:].mean() > 0.5
 
 
-def test_after_half_a_second_without_events_it_sees_its_speed_again(drive):
+def test_after_half_a_second_without_events_it_recovers_the_speed(drive):
     counts = drive.copy()
     counts[15:25] = 0
-    (_, _, speed), (_, _, usual) = claimed(counts), claimed(drive)
+    (_, _, speed), (_, _, usual) = uncertainty_of(counts), uncertainty_of(drive)
     assert (speed[:15] == usual[:15]).all()
     assert abs(speed[-5:].mean() - usual[-5:].mean()) < 0.15 * usual[-5:].mean()

@@ -1,4 +1,4 @@
-"""The golden test: it travels small and whole, holds where a machine computes alike, and catches one that does not."""
+"""The golden test: stored compactly, it passes on a machine that computes alike and fails on one that does not."""
 
 import copy
 from dataclasses import replace
@@ -33,7 +33,7 @@ def with_test(counts=None, model=ORIGINAL, **how):
 TESTED = with_test().to_bytes()
 
 
-def test_a_golden_test_travels_with_its_model_and_holds():
+def test_a_golden_test_is_saved_with_its_model_and_passes():
     loaded = bundle.from_bytes(TESTED, "x")
     assert loaded.golden is not None
     np.testing.assert_array_equal(loaded.golden.counts, make_counts())
@@ -43,12 +43,12 @@ def test_a_golden_test_travels_with_its_model_and_holds():
     assert loaded.to_bytes() == TESTED
 
 
-def test_a_model_without_a_golden_test_passes():
+def test_a_model_without_a_golden_test_passes_the_self_test():
     assert ORIGINAL.golden is None
     self_test.check(Estimator(ORIGINAL))
 
 
-def test_the_answers_are_those_to_the_events_of_a_camera():
+def test_the_twists_are_those_for_the_events_of_a_camera():
     estimator = Estimator(ORIGINAL)
     sensor = Sensor(CONFIG.canonical.width, CONFIG.canonical.height)
     events = make_events(3_000, duration_us=50_000, sensor=sensor)
@@ -59,9 +59,9 @@ def test_the_answers_are_those_to_the_events_of_a_camera():
     np.testing.assert_array_equal(self_test.answers(estimator, counts), want)
 
 
-def test_windows_without_events_and_saturated_ones_are_pushed_as_they_are():
+def test_windows_without_events_and_saturated_windows_are_all_processed():
     counts = make_counts(30)
-    counts[[0, 1, 7]] = 0  # and a long hole, which a camera's stream would skip
+    counts[[0, 1, 7]] = 0  # and below a long gap, which a camera's stream would skip
     counts[3, 0, 0, 0] = 255
     counts[8:29] = 0
     model = replace(ORIGINAL, config=CONFIG)
@@ -70,14 +70,14 @@ def test_windows_without_events_and_saturated_ones_are_pushed_as_they_are():
     self_test.check(Estimator(bundle.from_bytes(replace(model, golden=test).to_bytes(), "x")))
 
 
-def test_a_plain_engine_holds_the_golden_test_of_a_fast_one():
+def test_the_reference_implementation_passes_the_golden_test_of_the_fast_path():
     loaded = bundle.from_bytes(TESTED, "x")
     with plain.plain():
         self_test.check(Estimator(loaded))
 
 
 @pytest.mark.parametrize("axis", range(6))
-def test_a_machine_that_computes_otherwise_is_refused_with_window_bin_and_axis(axis):
+def test_a_difference_is_refused_with_its_window_bin_and_axis(axis):
     model = with_test()
     wrong = model.golden.twists.copy()
     wrong[3, 1, axis] += 0.03
@@ -87,7 +87,7 @@ def test_a_machine_that_computes_otherwise_is_refused_with_window_bin_and_axis(a
 
 
 @pytest.mark.parametrize("precision", ["float32", "int8"])
-def test_a_refused_int8_model_is_told_that_its_precision_once_meant_less(precision):
+def test_the_error_for_an_int8_model_says_that_int8_once_covered_less(precision):
     network = CONFIG.network.model_copy(update={"precision": precision})
     model = with_test(model=make_bundle(network=network))
     off = model.golden._replace(twists=model.golden.twists + np.float32(0.1))
@@ -96,7 +96,7 @@ def test_a_refused_int8_model_is_told_that_its_precision_once_meant_less(precisi
     assert ("before the projection was in int8" in str(refused.value)) == (precision == "int8")
 
 
-def test_the_tolerance_is_a_share_of_the_models_own_scale():
+def test_the_tolerance_is_relative_to_the_scale_of_the_model():
     coarse = with_test(model=replace(ORIGINAL, scale=torch.full((6,), 100.0)))
     off = coarse.golden.twists + np.float32(1.5)
     self_test.check(Estimator(replace(coarse, golden=coarse.golden._replace(twists=off))))
@@ -111,7 +111,7 @@ def test_changed_weights_are_refused():
         self_test.check(Estimator(replace(changed, network=network)))
 
 
-def test_an_answer_that_is_not_finite_is_refused():
+def test_a_twist_that_is_not_finite_is_refused():
     broken = with_test()
     network = copy.deepcopy(broken.network)
     with torch.no_grad():
@@ -130,7 +130,7 @@ def test_a_golden_test_of_the_default_size_makes_a_bundle_at_most_200_kb_larger(
 
 @pytest.mark.parametrize("windows", [1, 3])
 @pytest.mark.parametrize(("width", "height"), [(9, 9), (8, 8), (11, 13)])
-def test_every_size_of_grid_travels(windows, width, height):
+def test_grids_of_every_size_are_saved_and_loaded(windows, width, height):
     config = CONFIG.model_copy(update={"canonical": CanonicalConfig(width=width, height=height)})
     counts = make_counts(windows, config=config)
     loaded = bundle.from_bytes(with_test(counts, bundle.untrained(config=config)).to_bytes(), "x")
@@ -150,24 +150,24 @@ def test_every_size_of_grid_travels(windows, width, height):
         ),
         (lambda t: t.update({"golden.twists": torch.zeros(0, 2, 6)}), ("0 windows: 0 cells",)),
         (lambda t: t.update({"golden.twists": torch.tensor(1.0)}), ("0 windows",)),
-        (lambda t: t.update({"golden.twists": torch.zeros(1 << 20, 0)}), ("cells, it may have",)),
+        (lambda t: t.update({"golden.twists": torch.zeros(1 << 20, 0)}), ("cells, allowed are",)),
         (lambda t: t.update({"golden.twists": torch.zeros(5, 2, 6).double()}), ("float64", "needs torch.float32")),
         (lambda t: t["golden.twists"].fill_(float("nan")), ("'golden.twists'", "not finite")),
         (lambda t: t.update({"golden.seen": t["golden.seen"].int()}), ("int32", "needs torch.uint8 (200,)")),
         (lambda t: t["golden.seen"].fill_(0), ("'golden.counts'", "needs torch.uint8 (0,)")),
         (lambda t: t.update({"golden.counts": t["golden.counts"][1:].clone()}), ("'golden.counts'", "needs")),
-        (lambda t: t["golden.counts"][3:4].zero_(), ("a count of 0",)),
+        (lambda t: t["golden.counts"][3:4].zero_(), ("a count is 0",)),
         (lambda t: t.update({"golden.more": torch.zeros(1)}), ("'golden.more' is not one of this architecture",)),
     ],
     ids=range(15),
 )
-def test_golden_tensors_that_are_not_a_golden_test_are_refused(edit, words):
+def test_invalid_golden_tensors_are_refused(edit, words):
     message = refusal(with_tensors(edit, TESTED))
     for word in words:
         assert word in message
 
 
-def test_a_bit_behind_the_last_cell_is_refused():
+def test_a_bit_after_the_last_cell_is_refused():
     config = CONFIG.model_copy(update={"canonical": CanonicalConfig(width=9, height=9)})  # 324 cells: 4 bits are left
     data = with_test(make_counts(1, config=config), bundle.untrained(config=config)).to_bytes()
 
@@ -175,13 +175,13 @@ def test_a_bit_behind_the_last_cell_is_refused():
         tensors["golden.seen"][-1] |= 1
         tensors["golden.counts"] = torch.cat([tensors["golden.counts"], torch.ones(1, dtype=torch.uint8)])
 
-    assert "behind the last cell" in refusal(with_tensors(edit, data))
+    assert "after the last cell" in refusal(with_tensors(edit, data))
 
 
 def test_golden_tensors_need_their_tolerance():
     assert "golden_tolerance=missing" in refusal(with_fields(lambda fields: fields.pop("golden_tolerance"), TESTED))
 
 
-def test_a_golden_test_is_recorded_with_the_tolerance_asked_for():
+def test_a_golden_test_is_recorded_with_the_given_tolerance():
     assert with_test(tolerance=0.5).golden.tolerance == 0.5
     assert isinstance(with_test().golden, Golden)

@@ -1,4 +1,4 @@
-"""Signatures: what a trusted key signed is taken as it is, and anything else is refused with its own reason."""
+"""Signatures: exactly what a trusted key signed is accepted, and everything else is refused with a reason."""
 
 import base64
 import hashlib
@@ -25,7 +25,7 @@ SIGNATURE = manifest.sign(DATA, KEY, release=4, created=WHEN)
 
 
 def refusal(reason, *, data=DATA, signature=SIGNATURE, trusted=(PUBLIC,)):
-    """The sentence that refuses, which must be for this reason."""
+    """The message of the refusal, which must have this reason."""
     with pytest.raises(Untrusted) as refused:
         manifest.verify(data, signature, trusted, "some.safetensors")
     assert refused.value.code == "untrusted"
@@ -41,7 +41,7 @@ def file_with(**fields):
 
 
 def signed_by_hand(text, key=KEY):
-    """A signature file whose manifest is any text, truly signed."""
+    """A signature file for any manifest text, with a valid signature."""
     signature = base64.b64encode(key.sign(text.encode())).decode()
     return json.dumps(
         {"manifest": text, "signature": signature, "key_id": signing_keys.key_id(key.public_key())}
@@ -49,11 +49,11 @@ def signed_by_hand(text, key=KEY):
 
 
 def manifest_with(**fields):
-    """The manifest with some fields replaced, truly signed."""
+    """The signature file of a manifest with some fields replaced, with a valid signature."""
     return signed_by_hand(manifest.canonical({**json.loads(json.loads(SIGNATURE)["manifest"]), **fields}))
 
 
-def test_what_a_trusted_key_signed_is_told_with_its_release():
+def test_a_bundle_that_a_trusted_key_signed_is_verified_with_its_release():
     signed = manifest.verify(DATA, SIGNATURE, [OTHER.public_key(), PUBLIC])
     assert (signed.name, signed.release, signed.allow_downgrade) == ("untrained", 4, False)
     assert (signed.sha256, signed.size) == (ORIGINAL.digest, len(DATA))
@@ -62,7 +62,7 @@ def test_what_a_trusted_key_signed_is_told_with_its_release():
     assert manifest.read(SIGNATURE) == signed
 
 
-def test_the_release_is_the_bundles_own_where_none_is_given():
+def test_the_default_release_is_that_of_the_bundle():
     data = replace(ORIGINAL, metadata=Metadata(release=9)).to_bytes()
     for given_release, want in ((None, 9), (0, 0), (12, 12)):
         signature = manifest.sign(data, KEY, release=given_release, allow_downgrade=True)
@@ -70,7 +70,7 @@ def test_the_release_is_the_bundles_own_where_none_is_given():
         assert (signed.release, signed.allow_downgrade) == (want, True)
 
 
-def test_signing_again_gives_the_same_bytes_and_another_configuration_another_digest_of_it():
+def test_signing_is_deterministic_and_the_manifest_has_the_digest_of_the_configuration():
     assert manifest.sign(DATA, KEY, release=4, created=WHEN) == SIGNATURE
     other = make_bundle(settle_windows=3).to_bytes()
     one, two = (manifest.read(manifest.sign(data, KEY)).config_sha256 for data in (DATA, other))
@@ -86,29 +86,29 @@ def test_the_signature_can_be_checked_without_this_program():
     assert signed["sha256"] == hashlib.sha256(DATA).hexdigest()
 
 
-def test_a_key_that_is_not_trusted_is_refused_and_the_trusted_ones_are_named():
+def test_an_untrusted_key_is_refused_and_the_trusted_keys_are_named():
     message = refusal("unknown_key", trusted=[OTHER.public_key()])
     assert signing_keys.key_id(PUBLIC) in message
     assert signing_keys.key_id(OTHER.public_key()) in message
     assert "trusted: none" in refusal("unknown_key", trusted=[])
 
 
-def test_a_key_that_calls_itself_by_a_trusted_ones_name_is_refused():
+def test_a_key_that_claims_the_id_of_a_trusted_key_is_refused():
     forged = json.loads(manifest.sign(DATA, OTHER, release=4))
     forged["key_id"] = signing_keys.key_id(PUBLIC)
     refusal("bad_signature", signature=json.dumps(forged).encode())
 
 
-def test_a_manifest_that_was_changed_is_refused():
+def test_a_changed_manifest_is_refused():
     text = json.loads(SIGNATURE)["manifest"]
     for changed in (text.replace('"release":4', '"release":5'), text + " ", text.replace("false", "true"), ""):
         refusal("bad_signature", signature=file_with(manifest=changed))
 
 
-def test_the_signature_of_one_bundle_does_not_serve_another():
+def test_a_signature_is_valid_for_one_bundle_only():
     other = make_bundle(1).to_bytes()
     assert len(other) == len(DATA)
-    assert "another file, or changed" in refusal("digest", data=other)
+    assert "another or changed file" in refusal("digest", data=other)
     message = refusal("size", data=DATA + b"\x00")
     assert str(len(DATA) + 1) in message
     refusal("size", data=b"")
@@ -127,15 +127,15 @@ def test_every_truncation_of_a_signed_bundle_is_refused(length):
 
 
 @given(where=st.integers(0, len(SIGNATURE) - 1), bit=st.integers(0, 7))
-def test_a_flipped_bit_of_a_signature_file_is_refused_or_says_the_same(where, bit):
+def test_a_flipped_bit_of_a_signature_file_is_refused_or_changes_nothing(where, bit):
     flipped = bytearray(SIGNATURE)
     flipped[where] ^= 1 << bit
     assert_refused_or_the_same(bytes(flipped))
 
 
-@given(where=st.integers(0, len(SIGNATURE)), junk=st.binary(max_size=20), cut=st.integers(0, 20))
-def test_bytes_put_into_a_signature_file_are_refused_or_say_the_same(where, junk, cut):
-    assert_refused_or_the_same(SIGNATURE[:where] + junk + SIGNATURE[where + cut :])
+@given(where=st.integers(0, len(SIGNATURE)), junk=st.binary(max_size=20), removed=st.integers(0, 20))
+def test_inserted_bytes_in_a_signature_file_are_refused_or_change_nothing(where, junk, removed):
+    assert_refused_or_the_same(SIGNATURE[:where] + junk + SIGNATURE[where + removed :])
 
 
 def assert_refused_or_the_same(signature):
@@ -147,20 +147,20 @@ def assert_refused_or_the_same(signature):
 
 
 @given(st.binary(max_size=300))
-def test_any_bytes_are_no_signature_file(data):
+def test_random_bytes_are_not_a_signature_file(data):
     refusal("malformed", signature=data)
 
 
 @pytest.mark.parametrize(
     ("signature", "words"),
     [
-        (b"", "not JSON that can be read"),
-        (b"\xff\xfe", "not JSON that can be read"),
-        (SIGNATURE.decode().encode("utf-16"), "not JSON that can be read"),
-        (b"[" * 16_000, "not JSON that can be read"),
-        (b"[1]", "an object is expected, not [1]"),
-        (SIGNATURE[:-20], "not JSON that can be read"),
-        (SIGNATURE.replace(b'{"key_id"', b'{"key_id":"","key_id"', 1), "a key stands twice"),
+        (b"", "not readable as JSON"),
+        (b"\xff\xfe", "not readable as JSON"),
+        (SIGNATURE.decode().encode("utf-16"), "not readable as JSON"),
+        (b"[" * 16_000, "not readable as JSON"),
+        (b"[1]", "expected an object, not [1]"),
+        (SIGNATURE[:-20], "not readable as JSON"),
+        (SIGNATURE.replace(b'{"key_id"', b'{"key_id":"","key_id"', 1), "a key occurs twice"),
         (file_with(more=1), "more=1: Extra inputs are not permitted"),
         (file_with(manifest=None), "manifest=None"),
         (file_with(manifest={}), "manifest={}"),
@@ -173,20 +173,20 @@ def test_any_bytes_are_no_signature_file(data):
     ],
     ids=range(16),
 )
-def test_a_signature_file_that_is_none_says_what_is_wrong(signature, words):
+def test_a_malformed_signature_file_is_refused_and_the_message_says_why(signature, words):
     assert words in refusal("malformed", signature=signature)
 
 
-def test_a_short_signature_is_not_one():
+def test_a_signature_that_is_too_short_is_refused():
     refusal("bad_signature", signature=file_with(signature=""))
     refusal("bad_signature", signature=file_with(signature="AAAA"))
 
 
-def test_a_manifest_that_no_text_encoding_holds_is_refused():
+def test_a_manifest_that_cannot_be_encoded_is_refused():
     refusal("malformed", signature=file_with(manifest="\ud800"))
 
 
-def test_a_huge_signature_file_is_refused_unread():
+def test_a_huge_signature_file_is_refused_before_it_is_parsed():
     message = refusal("too_large", signature=b"{" * (manifest.MAX_SIGNATURE_BYTES + 1))
     assert str(manifest.MAX_SIGNATURE_BYTES) in message
 
@@ -194,9 +194,9 @@ def test_a_huge_signature_file_is_refused_unread():
 @pytest.mark.parametrize(
     ("signature", "words"),
     [
-        (signed_by_hand("no JSON"), "manifest: not JSON"),
-        (signed_by_hand('{"release":1,"release":2}'), "manifest: not JSON that can be read: a key stands twice"),
-        (signed_by_hand("[]"), "manifest: an object is expected"),
+        (signed_by_hand("no JSON"), "manifest: not readable as JSON"),
+        (signed_by_hand('{"release":1,"release":2}'), "manifest: not readable as JSON: a key occurs twice"),
+        (signed_by_hand("[]"), "manifest: expected an object"),
         (manifest_with(kind="grocery list"), "kind='grocery list'"),
         (manifest_with(release=-1), "release=-1"),
         (manifest_with(release="4"), "release='4'"),
@@ -214,12 +214,12 @@ def test_a_manifest_that_is_none_is_refused_even_if_it_was_signed(signature, wor
     assert words in refusal("malformed", signature=signature)
 
 
-@pytest.mark.parametrize("lie", [{"name": "other"}, {"config_sha256": "0" * 64}])
-def test_a_manifest_that_names_another_model_than_the_bundle_does_is_refused(lie):
-    refusal("manifest", signature=manifest_with(**lie))
+@pytest.mark.parametrize("changes", [{"name": "other"}, {"config_sha256": "0" * 64}])
+def test_a_manifest_that_names_another_model_than_the_bundle_is_refused(changes):
+    refusal("manifest", signature=manifest_with(**changes))
 
 
-def test_what_is_no_bundle_is_not_signed_and_not_taken_even_if_it_was():
+def test_bytes_that_are_not_a_bundle_are_never_signed_and_never_accepted():
     with pytest.raises(BadModel):
         manifest.sign(b"hello", KEY)
     text = manifest_with(sha256=hashlib.sha256(b"hello").hexdigest(), size=5)
@@ -245,7 +245,7 @@ def test_a_release_out_of_bounds_is_not_signed(release):
         (0, 1 << 62, True, True),
     ],
 )
-def test_a_release_counter_never_goes_back_unless_a_signed_flag_allows_it(release, highest, flag, want):
+def test_a_lower_release_is_refused_unless_its_signature_allows_it(release, highest, flag, want):
     assert manifest.allowed(release, highest, flag) is want
     signed = manifest.read(manifest.sign(DATA, KEY, release=release, allow_downgrade=flag))
     if want:
@@ -256,7 +256,7 @@ def test_a_release_counter_never_goes_back_unless_a_signed_flag_allows_it(releas
         assert refused.value.code == "downgrade"
 
 
-def test_keys_come_back_from_their_files_and_are_known_by_the_same_id():
+def test_keys_are_read_from_their_files_with_the_same_id():
     private = signing_keys.read_private(signing_keys.private_pem(KEY), "k")
     public = signing_keys.read_public(signing_keys.public_pem(PUBLIC), "p")
     assert signing_keys.key_id(private.public_key()) == signing_keys.key_id(public) == signing_keys.key_id(PUBLIC)
@@ -275,14 +275,14 @@ def pem(key, encryption=None):
         (b"", "not a private key in PEM"),
         (signing_keys.private_pem(KEY)[:60], "not a private key in PEM"),
         (signing_keys.public_pem(PUBLIC), "it is a public key"),
-        (pem(KEY, serialization.BestAvailableEncryption(b"secret")), "locked by a pass phrase"),
-        (pem(ed448.Ed448PrivateKey.generate()), "not an Ed25519 one"),
-        (pem(ec.generate_private_key(ec.SECP256R1())), "not an Ed25519 one"),
+        (pem(KEY, serialization.BestAvailableEncryption(b"secret")), "it has a pass phrase"),
+        (pem(ed448.Ed448PrivateKey.generate()), "not an Ed25519 key"),
+        (pem(ec.generate_private_key(ec.SECP256R1())), "not an Ed25519 key"),
         (b" " * 20_000, "at most 16384"),
     ],
     ids=range(7),
 )
-def test_a_file_that_is_no_private_key_says_what_it_is(data, why):
+def test_a_file_that_is_not_a_private_key_is_refused_and_the_message_says_why(data, why):
     with pytest.raises(InvalidField, match=why) as refused:
         signing_keys.read_private(data, "some.key")
     assert "some.key" in refused.value.message
@@ -298,7 +298,7 @@ def test_a_file_that_is_no_private_key_says_what_it_is(data, why):
     ],
     ids=range(4),
 )
-def test_a_file_that_is_no_public_key_says_what_it_is(data, why):
+def test_a_file_that_is_not_a_public_key_is_refused_and_the_message_says_why(data, why):
     with pytest.raises(InvalidField, match=why):
         signing_keys.read_public(data, "some.pub")
 
@@ -306,9 +306,9 @@ def test_a_file_that_is_no_public_key_says_what_it_is(data, why):
 def test_a_public_key_of_another_algorithm_is_refused():
     other = ec.generate_private_key(ec.SECP256R1()).public_key()
     data = other.public_bytes(serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo)
-    with pytest.raises(InvalidField, match="not an Ed25519 one"):
+    with pytest.raises(InvalidField, match="not an Ed25519 key"):
         signing_keys.read_public(data, "some.pub")
 
 
-def test_a_name_outside_ascii_is_signed_as_it_is_written():
+def test_names_outside_ascii_are_not_escaped():
     assert manifest.canonical({"é": 1}) == '{"é":1}'

@@ -1,4 +1,4 @@
-"""The uncertainty of an estimate: fitted where the errors are known, kept in the bundle, told in the right units."""
+"""The uncertainty of an estimate: fitted to known errors, saved in the bundle, reported in the right units."""
 
 from dataclasses import replace
 
@@ -21,7 +21,7 @@ from neurove_protocol.errors import BadModel, InvalidField
 from tests.builders import make_events
 
 HIDDEN = 6
-STEADY = 1.25  # what a constant input of 1 adds up to in an output neuron that keeps a fifth
+STEADY = 1.25  # steady output for a constant input of 1 if an output neuron keeps a fifth per step
 SMALL = ModelConfig(
     window=WindowConfig(duration_us=10_000, bins=2),
     canonical=CanonicalConfig(width=10, height=8),
@@ -32,7 +32,7 @@ TWO_METRES = CameraInfo(stream="c", width=20, height=16, lens="pinhole", fx=9, f
 
 
 def wild(rng, sequences, windows=60):
-    """A model whose errors, unknown to it, grow with what its first unit says; and each sequence has a bias."""
+    """Errors that grow with the first hidden unit, with a bias per sequence."""
     for number in range(sequences):
         for seen in calibration.VARIANTS:
             inputs = np.concatenate([rng.normal(size=(windows, HIDDEN)), np.full((windows, 1), STEADY)], 1)
@@ -54,7 +54,7 @@ def answers(model, camera=TWO_METRES):
     return estimator.push(events, estimator.initial_state(SENSOR, camera), 60_000).estimates
 
 
-def test_a_scale_that_depends_on_the_inputs_is_found():
+def test_an_error_scale_that_depends_on_the_inputs_is_fitted():
     rng = np.random.default_rng(1)
     inputs = np.concatenate([rng.normal(size=(20_000, 3)), np.ones((20_000, 1))], 1)
     true = np.array([0.5, -1.0, 0.0, -2.0])
@@ -65,11 +65,11 @@ def test_a_scale_that_depends_on_the_inputs_is_found():
     assert np.exp(strong[3]) == pytest.approx(size.mean(), rel=0.02)
 
 
-def test_a_model_without_errors_gets_a_scale_that_is_finite():
+def test_a_model_without_errors_gets_a_finite_scale():
     assert np.isfinite(laplace_scale(np.ones((10, 2)), np.zeros(10), 0.1)).all()
 
 
-def test_intervals_of_a_fitted_model_hold_what_they_claim_on_sequences_it_never_saw(made):
+def test_fitted_intervals_have_their_nominal_coverage_on_unseen_sequences(made):
     spread = made.bundle.network.spread
     weights = np.concatenate([spread.weight.detach().numpy(), spread.bias.detach().numpy()[:, None]], 1)
     errors, sigmas = [], []
@@ -82,21 +82,21 @@ def test_intervals_of_a_fitted_model_hold_what_they_claim_on_sequences_it_never_
     assert np.abs(error[wide, 2]).mean() > 2 * np.abs(error[~wide, 2]).mean()
 
 
-def test_the_report_tells_coverage_by_axis_of_each_way_of_seeing(made):
+def test_the_report_gives_the_coverage_of_each_axis_for_each_augmentation(made):
     groups = made.report["groups"]
     assert set(groups) == set(calibration.VARIANTS) | {f"hard scenes, {seen}" for seen in calibration.VARIANTS}
     assert groups["as it is"]["vz"]["0.9"] == pytest.approx(0.9, abs=0.01)
     assert groups["as it is"]["vz"]["0.99"] > groups["as it is"]["vz"]["0.5"]
 
 
-def test_errors_that_go_together_are_correlated_in_the_bundle(made):
+def test_correlated_errors_are_correlated_in_the_bundle(made):
     correlation = made.bundle.uncertainty.correlation
     assert correlation[0, 4] < -0.2
     assert abs(correlation[1, 2]) < 0.2
     assert torch.linalg.eigvalsh(correlation)[0] > 0
 
 
-def test_calibrating_changes_no_answer_and_doing_it_again_replaces_it(made):
+def test_calibration_changes_no_twist_and_a_second_one_replaces_the_first(made):
     before = replace(bundle.untrained(1, SMALL), linear_unit=PER_HEIGHT, scale=made.bundle.scale)
     for one, other in zip(answers(before), answers(made.bundle), strict=True):
         np.testing.assert_allclose(one.twists, other.twists, rtol=1e-6)
@@ -106,7 +106,7 @@ def test_calibrating_changes_no_answer_and_doing_it_again_replaces_it(made):
     assert again.bundle.digest == made.bundle.digest
 
 
-def test_a_golden_test_is_that_of_the_calibrated_model(tmp_path):
+def test_calibration_records_the_golden_test_again(tmp_path):
     before = replace(bundle.untrained(1, SMALL), linear_unit=PER_HEIGHT, scale=torch.tensor([2.0] * 3 + [0.5] * 3))
     counts = np.random.default_rng(0).poisson(0.4, (5, 4, 8, 10)).astype(np.uint8)
     wrong = self_test.record(Estimator(before), counts, 0.03)._replace(twists=np.zeros((5, 2, 6), np.float32))
@@ -128,7 +128,7 @@ def test_a_covariance_is_symmetric_positive_definite_and_grows_with_the_square_o
 
 
 @pytest.mark.parametrize("precision", ["float32", "int8"])
-def test_streams_that_are_answered_together_have_the_covariances_of_each_alone(precision):
+def test_streams_in_one_batch_have_the_same_covariances_as_alone(precision):
     config = SMALL.model_copy(update={"network": SMALL.network.model_copy(update={"precision": precision})})
     model = replace(bundle.untrained(1, config), linear_unit=PER_HEIGHT)
     estimator = Estimator(with_uncertainty(model, list(wild(np.random.default_rng(0), 16)), "a test").bundle)
@@ -146,13 +146,15 @@ def test_streams_that_are_answered_together_have_the_covariances_of_each_alone(p
 def test_an_estimate_is_uncertain_where_its_sigma_is_too_large_for_its_speed():
     unsure = Uncertainty(torch.eye(6), 0.5, "a test")
     covariance = unsure.covariance(np.log([0.31, 1e-6, 0.4, 1, 1, 1]), np.ones(6))
-    assert unsure.is_uncertain(np.full((2, 6), 0.0), covariance)  # sigma 0.51 at rest, which counts as 0.5 m/s
+    assert unsure.is_uncertain(
+        np.full((2, 6), 0.0), covariance
+    )  # sigma 0.51 of a stationary camera, whose speed counts as 0.5 m/s
     assert unsure.is_uncertain(np.array([[0, 0, 0.9, 0, 0, 0]]), covariance)
     assert not unsure.is_uncertain(np.array([[0, 0, 1.1, 0, 0, 0]]), covariance)
     assert np.isfinite(unsure.covariance(np.full(6, 1e30), np.ones(6))).all()
 
 
-def test_a_calibrated_bundle_is_loaded_as_it_was_saved(made, tmp_path):
+def test_a_calibrated_bundle_is_saved_and_loaded_unchanged(made, tmp_path):
     path = tmp_path / "a.safetensors"
     bundle.save(made.bundle, path)
     loaded = bundle.load(path)
@@ -167,7 +169,7 @@ def test_a_calibrated_bundle_is_loaded_as_it_was_saved(made, tmp_path):
     ("row", "column", "value", "why"),
     [(0, 1, 0.5, "not symmetric"), (2, 2, 0.5, "diagonal that is not 1"), (None, None, 1.0, "not positive definite")],
 )
-def test_a_correlation_that_is_none_is_refused(made, row, column, value, why):
+def test_an_invalid_correlation_matrix_is_refused(made, row, column, value, why):
     data = made.bundle.to_bytes()
     tensors, about = safetensors.torch.load(data), bundle.read_header(data, "x")
     correlation = tensors["output.correlation"]
@@ -175,15 +177,15 @@ def test_a_correlation_that_is_none_is_refused(made, row, column, value, why):
         correlation[:] = value
     else:
         correlation[row, column] = value
-    told = {"neurove": about.model_dump_json(exclude_none=True)}
+    header = {"neurove": about.model_dump_json(exclude_none=True)}
     with pytest.raises(BadModel, match=f"tensor 'output.correlation' .*{why}"):
-        bundle.from_bytes(safetensors.torch.save(tensors, told), "x")
+        bundle.from_bytes(safetensors.torch.save(tensors, header), "x")
     del tensors["spread.bias"]
     with pytest.raises(BadModel, match=r"tensor 'spread.bias' is missing"):
-        bundle.from_bytes(safetensors.torch.save(tensors, told), "x")
+        bundle.from_bytes(safetensors.torch.save(tensors, header), "x")
 
 
-def test_a_bundle_of_another_camera_or_unit_is_not_calibrated(made, tmp_path):
+def test_a_bundle_with_another_camera_or_unit_is_not_calibrated(made, tmp_path):
     config = TrainingConfig(model=SMALL.model_copy(update={"canonical": CanonicalConfig()}))
     with pytest.raises(BadModel, match="not those of the configuration"):
         calibration.calibrate(made.bundle, config, tmp_path)
@@ -193,18 +195,18 @@ def test_a_bundle_of_another_camera_or_unit_is_not_calibrated(made, tmp_path):
         calibration.calibration_sets(TrainingConfig(), 15)
 
 
-def test_a_sequence_is_seen_as_it_is_with_holes_with_few_events_and_with_many():
+def test_a_sequence_is_used_unchanged_with_gaps_with_few_and_with_many_events():
     rng = np.random.default_rng(3)
     counts = rng.integers(0, 4, (60, 4, 5, 6)).astype(np.uint8)
-    plain, holes, few, many = (way for way, _ in variants_of(rng, counts, np.ones((60, 2, 6), np.float32)))
+    plain, gaps, few, many = (variant for variant, _ in variants_of(rng, counts, np.ones((60, 2, 6), np.float32)))
     assert (plain == counts).all()
-    empty = (holes == 0).all(axis=(1, 2, 3))
+    empty = (gaps == 0).all(axis=(1, 2, 3))
     assert 0 < empty.sum() < 60
     assert few[40:].sum() < 0.7 * counts[40:].sum()
     assert many.sum() > counts.sum()
 
 
-def test_half_of_a_normal_distribution_lies_within_two_thirds_of_a_sigma():
+def test_the_half_width_of_an_interval_is_that_of_a_normal_distribution():
     assert half_width(0.5) == pytest.approx(0.6745, abs=1e-4)
     rng = np.random.default_rng(0)
     assert coverage(rng.normal(size=(20_000, 6)), np.ones((20_000, 6)), 0.5) == pytest.approx(0.5, abs=0.02)

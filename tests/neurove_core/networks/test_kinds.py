@@ -182,7 +182,7 @@ def test_a_baseline_has_no_uncertainty(kind, tmp_path):
     with pytest.raises(BadModel, match=f"kind='{kind}': only a network of kind 'neurove'"):
         list(calibration.collect_errors(model, []))
     claimed = replace(model, uncertainty=Uncertainty(torch.eye(6), 0.5, "a test"))
-    with pytest.raises(ValueError, match=f"kind='{kind}' has none"):
+    with pytest.raises(ValueError, match=f"kind='{kind}' has no uncertainty"):
         claimed.to_bytes()
 
 

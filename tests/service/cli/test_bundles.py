@@ -103,7 +103,7 @@ def flipped(path):
     ("spoil", "reason", "words"),
     [
         (lambda path: path.with_name(path.name + ".sig").unlink(), "unsigned", "no night.safetensors.sig next to it"),
-        (flipped, "digest", "another file, or changed"),
+        (flipped, "digest", "another or changed file"),
         (lambda path: path.write_bytes(path.read_bytes()[:-1]), "size", "the signed file has"),
         (lambda path: path.write_bytes(b""), "size", "it has 0 bytes"),
         (lambda path: path.with_name(path.name + ".sig").write_text("{}"), "malformed", "manifest=missing"),

@@ -126,7 +126,7 @@ def with_nan():
     ("bad", "claimed", "telling"),
     [
         (flipped, None, "the sha256 of the received bytes is"),
-        (lambda data: data[: len(data) // 2], "itself", "not a whole safetensors file"),
+        (lambda data: data[: len(data) // 2], "itself", "not a complete safetensors file"),
         (lambda _: b"hello, I am no model at all", "itself", "not a safetensors file"),
         (lambda _: with_nan(), "itself", "not finite"),
     ],
