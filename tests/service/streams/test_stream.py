@@ -204,7 +204,7 @@ def test_streams_do_not_leak_state_into_each_other(slot):
 
 
 def test_a_packet_of_another_stream_is_refused(stream):
-    with pytest.raises(InvalidField, match="stream='cam1': it came on the key of stream 'cam0'"):
+    with pytest.raises(InvalidField, match="stream='cam1': received on the key of stream 'cam0'"):
         stream.accept(make_packet(stream="cam1"), Arrival(1, 2))
 
 
