@@ -119,20 +119,20 @@ class ModelStore:
         with self._reserved(wanted, self._folder), _disk_errors(wanted, self._folder):
             target = self._folder / "pushed" / wanted.digest
             if _size(target / FILE) != wanted.size:
-                return self._fetch_anew(wanted, target, pull, stop, on_progress, admit)
+                return self._fetch_new(wanted, target, pull, stop, on_progress, admit)
             on_progress(Progress("staged", "already stored"))
             data = (target / FILE).read_bytes()
             try:
                 model, signed = self._check(data, wanted, admit)
             except BadModel:  # the file changed on the disk
                 shutil.rmtree(target)
-                return self._fetch_anew(wanted, target, pull, stop, on_progress, admit)
+                return self._fetch_new(wanted, target, pull, stop, on_progress, admit)
             if wanted.signature is not None:
                 write_atomically(target / (FILE + manifest.SUFFIX), wanted.signature)
             on_progress(Progress("verified", _about(model, signed)))
             return model, signed, 0
 
-    def _fetch_anew(
+    def _fetch_new(
         self,
         wanted: PushRequest,
         target: Path,

@@ -64,10 +64,9 @@ class Activity:
         self.last_packet_ns = received_ns
 
     def lost(self, name: str, number: int) -> None:
-        """Count a loss, by the name of its counter."""
-        if number:
-            setattr(self.counters, name, getattr(self.counters, name) + number)
-            self.last_loss_ns = self._now_ns()
+        """Count a loss, by the name of its counter; `number` is above 0."""
+        setattr(self.counters, name, getattr(self.counters, name) + number)
+        self.last_loss_ns = self._now_ns()
 
     def published(self, estimate: TwistEstimate) -> None:
         """Record the latency of an estimate."""

@@ -170,7 +170,7 @@ class Comparison:
         (self._tried_ms if self.serving_is_tried else self._proven_ms).append(took_ms)
 
     def add_standby(self, result: WindowResult, took_ms: float) -> None:
-        """Add an answer of the standby model, which comes after that of the serving model."""
+        """Add an answer of the standby model, after that of the serving model."""
         (self._proven_ms if self.serving_is_tried else self._tried_ms).append(took_ms)
         other = min(self._serving, key=lambda one: abs(one.end_us - result.end_us), default=None)
         if other is None or abs(other.end_us - result.end_us) > self._reach_us:

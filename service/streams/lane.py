@@ -44,12 +44,12 @@ class Lane:
     Args:
         serving: the model.
         state: its initial state.
-        whole_from_us: windows that begin earlier are incomplete, because this lane did not get their first events.
+        complete_from_us: windows that begin earlier are incomplete, because this lane did not get their first events.
     """
 
-    def __init__(self, serving: Serving, state: StreamState, whole_from_us: int | None = None) -> None:
+    def __init__(self, serving: Serving, state: StreamState, complete_from_us: int | None = None) -> None:
         self.serving, self.state = serving, state
-        self._whole_from_us = whole_from_us
+        self._complete_from_us = complete_from_us
         self._answers_from_us: int | None = None
 
     @property
@@ -62,9 +62,9 @@ class Lane:
         """Start of the next window [us]; None before the first packet."""
         return self.state.windows.start_us
 
-    def whole(self, window: Window) -> bool:
+    def has_all_events(self, window: Window) -> bool:
         """Whether this lane got all events of a window."""
-        return self._whole_from_us is None or window.start_us >= self._whole_from_us
+        return self._complete_from_us is None or window.start_us >= self._complete_from_us
 
     def answer_from(self, start_us: int | None) -> None:
         """Do not answer windows that begin earlier: the previous lane answered them."""
@@ -86,7 +86,7 @@ class Lane:
         """
         state, answers = self.state, []
         for window in windows:
-            if not self.whole(window):
+            if not self.has_all_events(window):
                 continue
             began = time.thread_time()  # as in admission: time spent waiting for other work is not the model's
             (estimate,), state = self.estimator.follow((window,), state)

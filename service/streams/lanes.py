@@ -116,7 +116,7 @@ class Lanes:
             self._unanswered = pushed
             raise ServingModelFailed(f"{type(error).__name__}: {error}") from error
         self._unanswered = None
-        entries = [pack(window) for window in pushed.windows if lane.whole(window)]
+        entries = [pack(window) for window in pushed.windows if lane.has_all_events(window)]
         for entry in entries:
             self.history.ring.append(entry)
         if standby is not None:

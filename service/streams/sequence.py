@@ -10,9 +10,9 @@ REWIND_PACKETS = 3
 
 
 class Order(enum.Enum):
-    """The place of a packet in its stream."""
+    """Why a packet is not the expected one."""
 
-    NEXT = enum.auto()  # the expected one, or the first one
+    FIRST = enum.auto()  # the first packet of the stream
     AFTER_GAP = enum.auto()  # numbers are missing before it
     AFTER_RESTART = enum.auto()  # the driver restarted
     DUPLICATE = enum.auto()  # the newest number again
@@ -32,28 +32,37 @@ class Sequence:
         """Expect that many missing numbers: these packets arrived, but this node refused or dropped them."""
         self._unread += packets
 
+    def advance(self, packet: Packet) -> bool:
+        """Accept a packet if it is the expected one; otherwise return False and change nothing."""
+        if packet.seq != self._expected:
+            return False
+        self._expect_after(packet)
+        return True
+
     def place(self, packet: Packet) -> tuple[Order, int]:
-        """The order of a packet, and for AFTER_GAP the number of packets lost before this node."""
+        """The order of a packet that is not the expected one.
+
+        Returns:
+            the order, and for AFTER_GAP the number of packets lost before this node.
+        """
         expected = self._expected
-        if packet.seq == expected:
-            self._advance(packet)
-            return Order.NEXT, 0
         if expected is None:
             self._begin(packet)
-            return Order.NEXT, 0
+            return Order.FIRST, 0
         if packet.seq < expected:
             return self._place_old(packet, expected), 0
         lost = max(0, packet.seq - expected - self._unread)
-        self._advance(packet)
+        self._expect_after(packet)
         return Order.AFTER_GAP, lost
 
     def _begin(self, packet: Packet) -> None:
         self._first_t0_us = packet.t0_us
-        self._advance(packet)
+        self._expect_after(packet)
 
-    def _advance(self, packet: Packet) -> None:
+    def _expect_after(self, packet: Packet) -> None:
         self._expected, self._unread = packet.seq + 1, 0
-        self._rewind.clear()
+        if self._rewind:
+            self._rewind.clear()
 
     def _place_old(self, packet: Packet, expected: int) -> Order:
         if packet.seq == 0 and packet.t0_us != self._first_t0_us:

@@ -67,19 +67,21 @@ class Stream:
             InvalidField: the packet belongs to another stream.
         """
         if packet.stream != self.name:
-            raise InvalidField("event packet", "stream", packet.stream, f"it came on the key of stream {self.name!r}")
-        self.counters.packets_received += 1
-        self.counters.events_received += packet.events.n
-        self.activity.heard(arrival.received_ns)
-        self.activity.taken_ns = arrival.queued_ns
-        order, lost = self._sequence.place(packet)
-        if order is not Order.NEXT and not self._accept_irregular(order, lost, packet):
+            raise InvalidField("event packet", "stream", packet.stream, f"received on the key of stream {self.name!r}")
+        counters, activity = self.counters, self.activity
+        counters.packets_received += 1
+        counters.events_received += packet.events.n
+        activity.heard(arrival.received_ns)
+        activity.taken_ns = arrival.queued_ns
+        if not self._sequence.advance(packet) and not self._accept_irregular(packet):
             return []
         self._restart_if_changed(packet)
         pushing = self._push(packet)
-        self.counters.outside_events += pushing.outside_events
-        self.activity.lost("late_events", pushing.late_events)
-        self.activity.lost("skipped_windows", pushing.skipped_windows)
+        counters.outside_events += pushing.outside_events
+        if pushing.late_events:
+            activity.lost("late_events", pushing.late_events)
+        if pushing.skipped_windows:
+            activity.lost("skipped_windows", pushing.skipped_windows)
         return [self._estimate(window, pushing.serving, arrival) for window in pushing.estimates]
 
     @property
@@ -120,8 +122,9 @@ class Stream:
             self._restart()
         log.info("camera info set", stream=self.name, sensor=str(camera.sensor), lens=camera.lens)
 
-    def _accept_irregular(self, order: Order, lost: int, packet: Packet) -> bool:
-        """Handle a packet that is not the next one; whether it is processed."""
+    def _accept_irregular(self, packet: Packet) -> bool:
+        """Handle a packet that is not the expected one; whether it is processed."""
+        order, lost = self._sequence.place(packet)
         if order is Order.AFTER_GAP:
             self._flags.add_gap(self.lanes.horizon_us, packet.t0_us, lost)
             if lost:
@@ -131,6 +134,8 @@ class Stream:
         if order is Order.AFTER_RESTART:
             log.info("driver restarted", stream=self.name, seq=packet.seq)
             self._restart()
+            return True
+        if order is Order.FIRST:
             return True
         self.activity.lost(_LOSS_BY_ORDER[order], 1)
         return False
@@ -166,7 +171,9 @@ class Stream:
 
     def _assign_models(self, packet: Packet) -> None:
         optics = packet.sensor, self.calibration
-        self.activity.lost("skipped_windows", self.lanes.assign(self._models.roles(self.name), optics, packet))
+        skipped = self.lanes.assign(self._models.roles(self.name), optics, packet)
+        if skipped:
+            self.activity.lost("skipped_windows", skipped)
 
     def _estimate(self, window: WindowEstimate, serving: Serving, arrival: Arrival) -> TwistEstimate:
         bundle = serving.estimator.bundle

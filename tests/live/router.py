@@ -1,4 +1,4 @@
-"""A Zenoh router for tests: `python tests/live/router.py ENDPOINT`. There is no zenohd in the registries we use."""
+"""A Zenoh router for tests: `python tests/live/router.py ENDPOINT`. With it the tests need no zenohd."""
 
 import sys
 import threading

@@ -1,4 +1,4 @@
-"""Bundles for the long runs: good ones, signed, and each kind of bad one that a node must refuse, and why."""
+"""Bundles for the long runs: good signed ones, and each kind of bad one with the reason of its refusal."""
 
 import json
 import struct
@@ -21,7 +21,7 @@ CONFIG = ModelConfig(
     canonical=CanonicalConfig(width=44, height=33),
     network=NetworkConfig(channels=(8, 16), features=512, hidden=32),
 )
-"""Quick to run, for four streams share two cores with what drives them; 4 MiB, so that a copy that stays is seen."""
+"""Fast to run, because four streams share two cores with their driver; 4 MiB, so that a leaked copy is visible."""
 
 GOOD = ("one", "two")
 _RELEASE = 2
@@ -31,7 +31,7 @@ class Made:
     """A folder of models and the key that a node trusts.
 
     Args:
-        folder: for the bundles; the public key lies beside them.
+        folder: for the bundles and the public key.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -118,7 +118,7 @@ _SPOILT: dict[str, Callable[[bytes], bytes]] = {
     "wrong-dtype": _tensors(_retype),
     "nan": _tensors(_fill_nan),
     "duplicate-keys": _doubled,
-    "foreign": lambda _: b"PNG, or anything else that is no model" * 100,
+    "foreign": lambda _: b"PNG, or anything else that is not a model" * 100,
     "empty": lambda _: b"",
 }
 
@@ -136,4 +136,4 @@ REASONS = {
     "too-slow": ("too_slow", "may take at most"),
     "too-large": ("bad_model", "has at most"),
 }
-"""Code of the error that refuses each, and what its sentence must say."""
+"""Code of the error that refuses each, and words of its message."""

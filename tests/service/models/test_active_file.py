@@ -4,53 +4,53 @@ import pytest
 
 from neurove_service.models.active_file import Active, ActiveFile
 
-KEPT = Active(digest="5e" * 32, previous=None, configured="default", highest_release=7)
+SAVED = Active(digest="5e" * 32, previous=None, configured="default", highest_release=7)
 
 
-def test_what_is_kept_is_there_after_a_restart(tmp_path):
+def test_a_saved_record_is_read_after_a_restart(tmp_path):
     assert ActiveFile(tmp_path).active is None
-    assert ActiveFile(tmp_path / "new").keep(KEPT)
+    assert ActiveFile(tmp_path / "new").keep(SAVED)
     again = ActiveFile(tmp_path / "new")
-    assert (again.active, again.highest_release) == (KEPT, 7)
+    assert (again.active, again.highest_release) == (SAVED, 7)
     assert [file.name for file in (tmp_path / "new").iterdir()] == ["active.json"]
 
 
 @pytest.mark.parametrize("seed", range(0, 200, 13))
-def test_one_flipped_bit_anywhere_is_noticed(tmp_path, seed):
-    ActiveFile(tmp_path).keep(KEPT)
+def test_a_flipped_bit_anywhere_is_detected(tmp_path, seed):
+    ActiveFile(tmp_path).keep(SAVED)
     file = tmp_path / "active.json"
     data = bytearray(file.read_bytes())
     data[seed] ^= 1 << seed % 7
     file.write_bytes(data)
     found = ActiveFile(tmp_path).active
-    assert found is None or found == KEPT  # equal where the bit was of white space
+    assert found is None or found == SAVED  # equal if the bit was in white space
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "null", "5", '{"version": 2}', '{"version": 1}', "[" * 5000])
-def test_a_broken_file_is_as_good_as_none(tmp_path, text):
+def test_a_damaged_file_counts_as_no_file(tmp_path, text):
     (tmp_path / "active.json").write_text(text)
     assert ActiveFile(tmp_path).active is None
 
 
-def test_every_truncation_is_noticed(tmp_path):
-    ActiveFile(tmp_path).keep(KEPT)
+def test_every_truncation_is_detected(tmp_path):
+    ActiveFile(tmp_path).keep(SAVED)
     whole = (tmp_path / "active.json").read_bytes()
     for length in range(len(whole) - 2):
         (tmp_path / "active.json").write_bytes(whole[:length])
         assert ActiveFile(tmp_path).active is None
 
 
-def test_a_checksum_that_fits_a_record_that_does_not_is_refused(tmp_path):
-    ActiveFile(tmp_path).keep(KEPT)
-    told = json.loads((tmp_path / "active.json").read_text())
-    wrong = Active.model_construct(**told["active"] | {"digest": "../../etc"})
+def test_an_invalid_record_with_a_correct_checksum_is_refused(tmp_path):
+    ActiveFile(tmp_path).keep(SAVED)
+    saved = json.loads((tmp_path / "active.json").read_text())
+    wrong = Active.model_construct(**saved["active"] | {"digest": "../../etc"})
     ActiveFile(tmp_path).keep(wrong)
     assert ActiveFile(tmp_path).active is None
 
 
-def test_without_a_place_to_write_a_change_still_holds_until_the_end(tmp_path):
-    (tmp_path / "file").write_text("no folder")
+def test_without_a_writable_folder_a_record_is_kept_in_memory(tmp_path):
+    (tmp_path / "file").write_text("not a folder")
     for folder in (None, tmp_path / "file"):
         kept = ActiveFile(folder)
-        assert not kept.keep(KEPT)
+        assert not kept.keep(SAVED)
         assert kept.highest_release == 7

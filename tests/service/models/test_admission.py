@@ -16,7 +16,7 @@ def free(machine):
     return admission.free_bytes(machine / "meminfo", machine)
 
 
-def test_free_memory_is_the_machines_or_the_control_groups_if_that_is_less(machine):
+def test_free_memory_is_the_smaller_of_machine_and_control_group(machine):
     assert free(machine) == 4_000_000 << 10
     (machine / "memory.current").write_text("300\n")
     for bound, expected in (("max\n", 4_000_000 << 10), ("1000\n", 700), ("200\n", 0)):
@@ -24,7 +24,7 @@ def test_free_memory_is_the_machines_or_the_control_groups_if_that_is_less(machi
         assert free(machine) == expected
 
 
-def test_a_system_that_does_not_tell_its_memory_refuses_nothing(tmp_path):
+def test_a_system_that_does_not_report_its_memory_refuses_nothing(tmp_path):
     assert free(tmp_path) is None
     admission.check_memory("one", 1 << 60, None)
 
@@ -35,7 +35,7 @@ def test_a_model_needs_twice_its_size():
         admission.check_memory("one", 501, 1000)
 
 
-def test_this_machine_tells_its_memory():
+def test_this_machine_reports_its_memory():
     assert admission.free_bytes() > 0
 
 
@@ -48,7 +48,7 @@ def test_the_time_for_a_window_is_measured(slot):
     assert admission.weight_bytes(estimator.bundle) >= 4 * estimator.bundle.info.parameters
 
 
-def test_a_model_that_is_plainly_too_slow_is_not_timed_to_the_end(slot):
+def test_the_measurement_of_a_model_that_is_too_slow_ends_early(slot):
     estimator = slot.active.estimator
     assert len(admission.window_times_ms(estimator, 50, bound_ms=-1.0, max_slow=4)) == 5
     with pytest.raises(TooSlow, match="p99_ms="):

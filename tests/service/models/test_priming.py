@@ -1,4 +1,4 @@
-"""How a new model is brought up to date on streams with packets: in their spare time, before it answers."""
+"""Priming of a new model on streams with packets: in spare time, before it serves."""
 
 import threading
 import time
@@ -18,7 +18,7 @@ from neurove_service.streams.lane import windows_to_prime
 from neurove_service.streams.stream import Arrival, Stream
 from tests.builders import make_packets
 from tests.service.conftest import SMALL
-from tests.service.models.test_swap import LAX, feed, said, wait_until
+from tests.service.models.test_swap import LAX, feed, motion, wait_until
 
 PACKETS = make_packets(6_000, n=50, step_us=25_000)
 FEW = RingSize(8)
@@ -53,7 +53,7 @@ def slots(folder):
 
 
 class Camera:
-    """Feeds a stream as its worker does: packets as they come, and the model beside in between."""
+    """Runs a stream as its worker does: packets as they arrive, the standby model in between."""
 
     def __init__(self, slot, name="cam0", ring=RingSize()):  # noqa: B008  # immutable
         self.stream, self.estimates = Stream(name, slot, ring=ring), []
@@ -84,19 +84,19 @@ def never_swapped(slots, model, windows):
     return feed(Stream("cam0", slots(model)), PACKETS[: 2 * (windows + 1)])[:windows]
 
 
-def test_a_stream_with_packets_primes_a_new_model_beside_and_its_first_answer_is_that_of_one_that_always_served(slots):
-    told, slot = [], slots()
+def test_a_primed_model_answers_from_its_first_window_as_if_it_had_always_served(slots):
+    progress, slot = [], slots()
     with Camera(slot) as camera:
-        slot.activate("two", on_progress=told.append)
+        slot.activate("two", on_progress=progress.append)
         wait_until(lambda: camera.estimates[-1].model == "two")
     expected = never_swapped(slots, "two", len(camera.estimates))
     new = [at for at, one in enumerate(camera.estimates) if one.model == "two"]
-    assert said([camera.estimates[at] for at in new]) == said([expected[at] for at in new])
+    assert motion([camera.estimates[at] for at in new]) == motion([expected[at] for at in new])
     assert [one.seq for one in camera.estimates] == list(range(len(expected)))
-    assert "1 streams replayed" in [one.text for one in told if one.step == "priming"][-1]
+    assert "1 streams replayed" in [one.text for one in progress if one.step == "priming"][-1]
 
 
-def test_a_promoted_canary_is_primed_beside_all_other_streams_first(slots):
+def test_a_promoted_canary_is_first_primed_in_standby_on_all_other_streams(slots):
     slot = slots()
     with Camera(slot) as a, Camera(slot, "cam1") as b:
         slot.activate("two", canary=frozenset({"cam0"}))
@@ -109,22 +109,22 @@ def test_a_promoted_canary_is_primed_beside_all_other_streams_first(slots):
     assert [b.estimates[at].twists for at in new] == [expected[at].twists for at in new]
 
 
-def test_a_bundle_says_with_how_many_windows_it_is_primed(slots):
+def test_a_bundle_sets_the_number_of_windows_that_prime_it(slots):
     wanted = {model: windows_to_prime(slots(model).active.estimator) for model in ("two", "patient", "hasty")}
     assert wanted == {"two": 64, "patient": 40, "hasty": 2}
 
 
-def test_a_bundle_that_wants_more_windows_than_are_kept_waits_for_live_ones(slots):
+def test_a_bundle_that_needs_more_windows_than_are_kept_waits_for_live_ones(slots):
     slot = slots()
     with Camera(slot, ring=FEW) as camera:
         before = len(camera.estimates)
         slot.activate("patient")
         wait_until(lambda: camera.estimates[-1].model == "patient")
     old = sum(one.model == "one" for one in camera.estimates)
-    assert old - before >= 40 - FEW.windows - 4  # what came while it was loaded is kept too
+    assert old - before >= 40 - FEW.windows - 4  # windows that arrive during loading are kept too
 
 
-def test_the_node_says_for_how_long_a_bundle_may_wait(slots):
+def test_prime_s_bounds_the_wait_for_windows(slots):
     slot = slots(prime_s=0.0)
     with Camera(slot, ring=FEW) as camera:
         slot.activate("patient")
@@ -133,11 +133,11 @@ def test_the_node_says_for_how_long_a_bundle_may_wait(slots):
 
 
 @pytest.mark.parametrize("how", ["exception", "nan"])
-def test_a_model_that_fails_while_it_is_primed_is_refused_and_nothing_stays(slots, how):
-    slot, told = slots(), []
+def test_a_model_that_fails_during_priming_is_refused_and_leaves_no_trace(slots, how):
+    slot, steps = slots(), []
 
     def spoil(progress):
-        told.append(progress.step)
+        steps.append(progress.step)
         if progress.step == "priming" and "streams replayed" not in progress.text:
             follow = type(slot.active.estimator).follow
 
@@ -156,13 +156,13 @@ def test_a_model_that_fails_while_it_is_primed_is_refused_and_nothing_stays(slot
             slot.activate("two", on_progress=spoil)
         count = len(camera.estimates)
         wait_until(lambda: len(camera.estimates) > count + 3)
-    assert told[-1] == "refused"
+    assert steps[-1] == "refused"
     assert (slot.plan.phase, slot.active.epoch) == ("steady", 0)
     assert {one.model for one in camera.estimates} == {"one"}
     assert camera.stream.lanes.standby is None
 
 
-def test_a_model_without_spikes_takes_over_from_one_with_them_and_gives_back(slots):
+def test_a_model_without_spikes_replaces_one_with_spikes_and_is_rolled_back(slots):
     slot = slots()
     with Camera(slot) as camera:
         slot.activate("ann")

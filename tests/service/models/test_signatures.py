@@ -1,4 +1,4 @@
-"""What a node that trusts keys takes: pushed or from its folder, only what one of these keys has signed."""
+"""A node that trusts keys accepts only models that one of them signed, pushed or from its folder."""
 
 import hashlib
 import threading
@@ -27,7 +27,7 @@ def key_file(tmp_path):
 
 @pytest.fixture
 def folder(models_dir, tmp_path):
-    """`one` signed by a trusted key, `two` by nobody."""
+    """`one` is signed by a trusted key, `two` is not signed."""
     data = (models_dir / "one.safetensors").read_bytes()
     (tmp_path / "one.safetensors").write_bytes(data)
     (tmp_path / "one.safetensors.sig").write_bytes(manifest.sign(data, KEY, release=3))
@@ -43,7 +43,7 @@ def handlers_of(folder, key_file, highest_release=0):
     return Handlers("edge", slot, list, lambda: 0, store, active_file)
 
 
-def test_what_a_trusted_key_signed_may_serve_and_what_nobody_signed_may_not(folder, key_file):
+def test_a_signed_model_may_serve_and_an_unsigned_one_may_not(folder, key_file):
     handlers = handlers_of(folder, key_file)
     handlers.activate(ActivateRequest(model="one").encode())
     with pytest.raises(Untrusted, match="only signed models"):
@@ -54,7 +54,7 @@ def test_what_a_trusted_key_signed_may_serve_and_what_nobody_signed_may_not(fold
     assert (states["one"], states["two"]) == ("trusted", "untrusted")
 
 
-def test_the_release_that_counts_is_the_signed_one(folder, key_file):
+def test_the_signed_release_is_compared_with_the_highest(folder, key_file):
     with pytest.raises(Downgrade, match="release=3: release 4 was accepted before"):
         handlers_of(folder, key_file, highest_release=4).activate(ActivateRequest(model="one").encode())
     handlers_of(folder, key_file, highest_release=3).activate(ActivateRequest(model="one").encode())
@@ -79,7 +79,7 @@ def test_a_push_without_a_trusted_signature_leaves_nothing_on_the_node(folder, k
     assert not list((folder / "state").rglob("*.safetensors"))
 
 
-def test_a_signature_is_read_once_until_it_or_its_bundle_changes(folder, key_file):
+def test_a_signature_is_verified_once_until_it_or_its_bundle_changes(folder, key_file):
     read = []
     check = verifier((key_file,))
 
@@ -106,7 +106,7 @@ def test_a_signature_is_read_once_until_it_or_its_bundle_changes(folder, key_fil
     assert len(read) == 4
 
 
-def test_a_key_that_can_not_be_read_stops_the_start(tmp_path):
+def test_an_unreadable_key_stops_the_start(tmp_path):
     with pytest.raises(InvalidField, match=r"trusted_keys=.*none\.pub.*No such file"):
         verifier((tmp_path / "none.pub",))
     (tmp_path / "text.pub").write_text("hello")

@@ -17,7 +17,7 @@ def test_a_model_is_found_by_name_and_by_digest(slot):
     assert slot.previous.name == "two"
 
 
-def test_an_unknown_model_changes_nothing_and_says_what_there_is(slot):
+def test_an_unknown_model_changes_nothing_and_the_error_lists_the_available_ones(slot):
     before = slot.active
     with pytest.raises(UnknownModel, match="model='three'.*available: default, untrained, one, two"):
         slot.activate("three")
@@ -34,7 +34,7 @@ def test_a_broken_bundle_is_listed_with_its_reason_and_refused(models_dir, tmp_p
     shutil.copytree(models_dir, tmp_path, dirs_exist_ok=True)
     data = (tmp_path / "two.safetensors").read_bytes()
     (tmp_path / "two.safetensors").write_bytes(data[: len(data) // 2])
-    (tmp_path / "text.safetensors").write_text("hello, I am no model at all")
+    (tmp_path / "text.safetensors").write_text("hello, I am not a model")
     slot = ModelSlot("one", tmp_path)
     assert slot.available().unreadable.keys() == {"two.safetensors", "text.safetensors"}
     before = slot.active
@@ -43,12 +43,12 @@ def test_a_broken_bundle_is_listed_with_its_reason_and_refused(models_dir, tmp_p
     assert slot.active is before
 
 
-def test_two_models_of_one_name_must_be_told_apart_by_digest(models_dir, tmp_path):
+def test_two_models_of_one_name_need_a_digest(models_dir, tmp_path):
     from neurove_core.models import bundle
 
     shutil.copytree(models_dir, tmp_path, dirs_exist_ok=True)
-    twin = bundle.load(models_dir / "one.safetensors")
-    bundle.save(bundle.untrained(9, twin.config, "two"), tmp_path / "other.safetensors")
+    one = bundle.load(models_dir / "one.safetensors")
+    bundle.save(bundle.untrained(9, one.config, "two"), tmp_path / "other.safetensors")
     slot = ModelSlot("one", tmp_path)
     with pytest.raises(BadModel, match="2 models have this name"):
         slot.activate("two")
@@ -62,8 +62,8 @@ def test_the_model_given_at_the_start_stays_available_without_a_folder(models_di
         ModelSlot(str(models_dir / "none.safetensors"))
 
 
-def test_of_changes_at_once_those_that_come_late_are_told_of_a_conflict(slot):
-    told, began, go_on = [], threading.Event(), threading.Event()
+def test_a_change_during_another_change_is_a_conflict(slot):
+    progress, began, go_on = [], threading.Event(), threading.Event()
 
     def first_step(_):
         began.set()
@@ -78,9 +78,9 @@ def test_of_changes_at_once_those_that_come_late_are_told_of_a_conflict(slot):
         slot.rollback()
     go_on.set()
     winner.join()
-    slot.activate("one", on_progress=told.append)
+    slot.activate("one", on_progress=progress.append)
     assert (slot.active.epoch, slot.previous.name) == (2, "two")
-    steps = [progress.step for progress in told]
+    steps = [one.step for one in progress]
     assert (steps[:3], steps[-2:]) == (["verified", "loaded", "warmed"], ["active", "probation"])
 
 
@@ -104,17 +104,17 @@ def test_a_rollback_goes_back_once(slot):
         slot.rollback()
 
 
-def test_every_model_that_may_be_kept_is_told_with_the_one_before(models_dir):
-    told = []
-    slot = ModelSlot("one", models_dir, Rules(probation_s=0), lambda model: told.append((model.name, slot.previous)))
+def test_every_model_to_save_is_reported_with_the_previous_one(models_dir):
+    saved = []
+    slot = ModelSlot("one", models_dir, Rules(probation_s=0), lambda model: saved.append((model.name, slot.previous)))
     slot.activate("two")
-    wait_until(lambda: told)
+    wait_until(lambda: saved)
     slot.rollback()
-    assert [name for name, _ in told] == ["two", "one"]
-    assert [previous and previous.name for _, previous in told] == ["one", None]
+    assert [name for name, _ in saved] == ["two", "one"]
+    assert [previous and previous.name for _, previous in saved] == ["one", None]
 
 
-def test_the_model_that_served_last_goes_before_the_configured_one_if_it_can_be_loaded(models_dir, slot):
+def test_the_last_active_model_takes_precedence_over_the_configured_one_if_it_can_be_loaded(models_dir, slot):
     two = slot.activate("two")[1].estimator.bundle.digest
     one = slot.previous.digest
     again = ModelSlot("one", models_dir, kept=(two, one))

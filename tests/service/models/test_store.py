@@ -55,7 +55,7 @@ def wanted(data, **other):
 
 
 def source(data, *, until=None, asked=None):
-    """Answers chunks of these bytes, up to a place where it is cut."""
+    """Answers requests for chunks of these bytes; after `until` it no longer answers."""
 
     def pull(_, request):
         if asked is not None:
@@ -75,12 +75,12 @@ def files(folder):
 
 
 def pushed(store):
-    """Names of the sound models among the pushed ones, and what is wrong with the others."""
+    """Names of the valid pushed models, and the errors of the others."""
     available = Library(pushed=store.files).available()
     return {one.name for one in available.models} - {"default", "untrained"}, available.unreadable
 
 
-def test_a_pushed_bundle_is_whole_on_the_disk_and_can_be_activated(store, tmp_path, data):
+def test_a_pushed_bundle_is_complete_on_the_disk_and_can_be_activated(store, tmp_path, data):
     steps = []
     model, signed, moved = fetch(store, wanted(data), source(data), steps)
     assert (model.name, signed.state, moved) == ("three", "unsigned", len(data))
@@ -88,10 +88,10 @@ def test_a_pushed_bundle_is_whole_on_the_disk_and_can_be_activated(store, tmp_pa
     assert files(tmp_path) == [f"pushed/{model.digest}/bundle.safetensors"]
     slot = ModelSlot("untrained", pushed=store.files)
     assert slot.activate("three")[1].estimator.bundle.digest == model.digest
-    assert fetch(store, wanted(data), source(b""))[2] == 0  # it is there: not one chunk is asked for
+    assert fetch(store, wanted(data), source(b""))[2] == 0  # already stored: no chunk is requested
 
 
-def test_a_cut_push_goes_on_where_it_stopped_in_another_process_too(store, tmp_path, data):
+def test_an_interrupted_push_resumes_also_in_another_process(store, tmp_path, data):
     with pytest.raises(
         TransferInterrupted, match=r"interrupted at \d+ of \d+ bytes: the client that pushed it does not answer"
     ):
@@ -104,11 +104,11 @@ def test_a_cut_push_goes_on_where_it_stopped_in_another_process_too(store, tmp_p
     assert ModelStore(tmp_path).partial() == {}
 
 
-def test_left_over_bytes_that_do_not_fit_are_fetched_anew(store, tmp_path, data):
+def test_staged_bytes_that_do_not_match_are_fetched_again(store, tmp_path, data):
     staging = tmp_path / "staging" / wanted(data).digest
-    for left_over in (b"\0" * 1000, b"\0" * len(data), b"\0" * (len(data) + 1)):
+    for staged in (b"\0" * 1000, b"\0" * len(data), b"\0" * (len(data) + 1)):
         staging.mkdir(parents=True)
-        (staging / "bundle.safetensors").write_bytes(left_over)
+        (staging / "bundle.safetensors").write_bytes(staged)
         assert fetch(store, wanted(data), source(data))[0].name == "three"
         shutil.rmtree(tmp_path / "pushed")
 
@@ -123,7 +123,7 @@ def with_nan():
 
 
 @pytest.mark.parametrize(
-    ("bad", "claimed", "telling"),
+    ("bad", "claimed", "words"),
     [
         (flipped, None, "the sha256 of the received bytes is"),
         (lambda data: data[: len(data) // 2], "itself", "not a complete safetensors file"),
@@ -131,16 +131,16 @@ def with_nan():
         (lambda _: with_nan(), "itself", "not finite"),
     ],
 )
-def test_a_bad_bundle_is_refused_with_its_reason_and_leaves_nothing(store, tmp_path, data, bad, claimed, telling):
+def test_a_bad_bundle_is_refused_with_its_reason_and_leaves_nothing(store, tmp_path, data, bad, claimed, words):
     sent = bad(data)
     request = wanted(sent if claimed else data, size=len(sent))
-    with pytest.raises(BadModel, match=telling):
+    with pytest.raises(BadModel, match=words):
         fetch(store, request, source(sent))
     assert files(tmp_path) == []
     assert store.files() == {}
 
 
-def test_what_can_not_be_kept_is_refused_before_the_first_byte(tmp_path, data, monkeypatch):
+def test_a_bundle_that_cannot_be_stored_is_refused_before_the_first_byte(tmp_path, data, monkeypatch):
     never = source(data, until=0)
     with pytest.raises(NoStore, match="neither models_dir nor state_dir"):
         fetch(ModelStore(None), wanted(data), never)
@@ -148,20 +148,20 @@ def test_what_can_not_be_kept_is_refused_before_the_first_byte(tmp_path, data, m
         fetch(ModelStore(tmp_path), wanted(data, size=bundle.MAX_BYTES + 1), never)
     with pytest.raises(NoQuota, match=f"0 of {len(data) - 1} bytes for pushed models are in use"):
         fetch(ModelStore(tmp_path, quota_bytes=len(data) - 1), wanted(data), never)
-    monkeypatch.setattr(model_store, "SPARE_BYTES", 1 << 62)  # no disk of a test is full
+    monkeypatch.setattr(model_store, "SPARE_BYTES", 1 << 62)  # the disk of a test is never full
     with pytest.raises(NoSpace, match=f"needs {len(data)} bytes"):
         fetch(ModelStore(tmp_path), wanted(data), never)
     assert files(tmp_path) == []
 
 
-def test_a_folder_that_can_not_be_written_to_is_a_refusal(tmp_path, data):
-    (tmp_path / "staging").write_text("a file where a folder should be")
+def test_a_push_to_a_folder_that_is_not_writable_is_refused(tmp_path, data):
+    (tmp_path / "staging").write_text("a file instead of a folder")
     with pytest.raises(NoStore, match="its folder is not writable"):
         fetch(ModelStore(tmp_path), wanted(data), source(data))
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="this system has no full device")
-def test_a_disk_that_is_full_on_the_way_is_a_refusal_and_leaves_nothing(store, tmp_path, data):
+def test_a_push_that_fills_the_disk_is_refused_and_leaves_nothing(store, tmp_path, data):
     staging = tmp_path / "staging" / wanted(data).digest
     staging.mkdir(parents=True)
     (staging / "bundle.safetensors").symlink_to("/dev/full")
@@ -171,7 +171,7 @@ def test_a_disk_that_is_full_on_the_way_is_a_refusal_and_leaves_nothing(store, t
     assert fetch(store, wanted(data), source(data))[0].name == "three"
 
 
-def test_left_over_pushes_give_way_to_a_new_one_but_whole_models_do_not(tmp_path, data):
+def test_a_new_push_discards_interrupted_pushes_but_no_complete_models(tmp_path, data):
     store = ModelStore(tmp_path, quota_bytes=2 * len(data), patience_s=0.1)
     other = bytes_of(4, "four")
     third = bytes_of(5, "five")
@@ -186,7 +186,7 @@ def test_left_over_pushes_give_way_to_a_new_one_but_whole_models_do_not(tmp_path
     assert pushed(store) == ({"three", "five"}, {})
 
 
-def test_two_pushes_of_one_bundle_at_once_move_it_once(tmp_path, data):
+def test_two_pushes_of_one_bundle_at_once_transfer_it_once(tmp_path, data):
     store, results, gate = ModelStore(tmp_path), [], threading.Event()
     steps = [[], []]
 
@@ -212,7 +212,7 @@ def test_two_pushes_of_one_bundle_at_once_move_it_once(tmp_path, data):
     assert steps[1][0].text == "another push of the same model is in progress"
 
 
-def test_a_source_that_answers_wrongly_is_asked_again_and_then_given_up(store, data):
+def test_a_source_with_wrong_answers_is_asked_again_until_the_push_is_interrupted(store, data):
     def pull(digest, request):
         return source(data)(digest, request) + b"\0"
 
@@ -226,7 +226,7 @@ def test_a_source_that_answers_wrongly_is_asked_again_and_then_given_up(store, d
         fetch(store, wanted(data), refuses)
 
 
-def test_a_node_that_stops_does_not_wait_for_chunks(tmp_path, data):
+def test_a_node_that_is_stopping_does_not_wait_for_chunks(tmp_path, data):
     stopping = threading.Event()
     stopping.set()
     with pytest.raises(TransferInterrupted, match="this node is stopping"):
@@ -234,7 +234,7 @@ def test_a_node_that_stops_does_not_wait_for_chunks(tmp_path, data):
 
 
 def lengths_over(chunks, *, seconds_per_byte, seconds=0.0):
-    """Lengths of so many chunks over a link."""
+    """Lengths of consecutive chunks over a link."""
     length, found = ChunkLength(), []
     for _ in range(chunks):
         found.append(length.bytes)
@@ -242,7 +242,7 @@ def lengths_over(chunks, *, seconds_per_byte, seconds=0.0):
     return found
 
 
-def test_chunks_grow_as_far_as_they_hold_the_link_for_a_millisecond_or_two():
+def test_chunks_grow_until_they_occupy_the_link_for_a_millisecond_or_two():
     slow = lengths_over(500, seconds_per_byte=8 / 20e6)  # 20 Mbit/s
     assert (slow[0], max(slow)) == (MIN_CHUNK_BYTES, 2 * MIN_CHUNK_BYTES)
     assert np.mean(slow) < 1.2 * MIN_CHUNK_BYTES
@@ -250,15 +250,15 @@ def test_chunks_grow_as_far_as_they_hold_the_link_for_a_millisecond_or_two():
     assert max(lengths_over(500, seconds_per_byte=0)) == 1 << 20
 
 
-def test_a_link_that_takes_its_time_for_any_chunk_gets_larger_ones():
+def test_a_link_with_a_long_delay_gets_larger_chunks():
     assert max(lengths_over(500, seconds_per_byte=8 / 20e6, seconds=0.1)) == 1 << 17
 
 
-def test_a_model_that_rotted_on_the_disk_is_listed_with_its_reason_and_can_be_pushed_again(store, tmp_path, data):
+def test_a_model_that_changed_on_the_disk_is_listed_with_its_reason_and_can_be_pushed_again(store, tmp_path, data):
     digest = fetch(store, wanted(data), source(data))[0].digest
     file = tmp_path / "pushed" / digest / "bundle.safetensors"
-    for rotten in (flipped(data), data[:-1]):
-        file.write_bytes(rotten)
+    for changed in (flipped(data), data[:-1]):
+        file.write_bytes(changed)
         assert pushed(store)[1].keys() == {digest}
         with pytest.raises(BadModel):
             ModelSlot("untrained", pushed=store.files).activate(digest)
@@ -266,7 +266,7 @@ def test_a_model_that_rotted_on_the_disk_is_listed_with_its_reason_and_can_be_pu
         assert pushed(store)[1] == {}
 
 
-def test_only_folders_named_by_a_digest_are_looked_at(store, tmp_path, data):
+def test_only_folders_named_by_a_digest_are_read(store, tmp_path, data):
     fetch(store, wanted(data), source(data))
     for foreign in ("pushed/readme", "pushed/" + "x" * 64, "staging/.." + "5e" * 31):
         (tmp_path / foreign).mkdir(parents=True)
@@ -276,13 +276,13 @@ def test_only_folders_named_by_a_digest_are_looked_at(store, tmp_path, data):
 
 
 def trusts(data, signature):
-    """A node that wants the signature `good`, and honours its flag."""
+    """The rule of a node that accepts the signature `good` and its flag."""
     if signature is None or not signature.startswith(b"good"):
         raise Downgrade("x", 0, 1) if signature == b"old" else NeuroVEError("untrusted")
     return Signed("trusted", allow_downgrade=signature.endswith(b"flag"))
 
 
-def test_a_signature_is_asked_before_a_model_is_kept_and_kept_beside_it(tmp_path, data):
+def test_a_signature_is_verified_before_a_model_is_stored_and_stored_next_to_it(tmp_path, data):
     store = ModelStore(tmp_path / "state", tmp_path, verify=trusts)
     for signature in (None, b"bad"):
         with pytest.raises(NeuroVEError, match="untrusted"):
@@ -297,7 +297,7 @@ def test_a_signature_is_asked_before_a_model_is_kept_and_kept_beside_it(tmp_path
     assert ModelStore(tmp_path / "state", None, verify=trusts).signed(model.digest).allow_downgrade
 
 
-def test_signatures_beside_the_operators_own_files_count_too(tmp_path, data):
+def test_signatures_next_to_the_operators_own_files_are_verified_too(tmp_path, data):
     (tmp_path / "mine.safetensors").write_bytes(data)
     store = ModelStore(None, tmp_path, verify=trusts)
     digest = hashlib.sha256(data).hexdigest()
@@ -308,6 +308,6 @@ def test_signatures_beside_the_operators_own_files_count_too(tmp_path, data):
     assert store.signed("0" * 64).state == "unsigned"  # a built-in one
 
 
-def test_a_node_without_trusted_keys_says_whether_a_signature_came(store, data):
+def test_a_node_without_trusted_keys_reports_whether_a_signature_exists(store, data):
     assert fetch(store, wanted(data), source(data))[1].state == "unsigned"
     assert fetch(store, wanted(data, signature=b"{}"), source(data))[1].state == "unchecked"

@@ -73,7 +73,7 @@ def test_a_stream_that_loses_nothing_is_ok(handlers, stream, clock):
     assert health.model.trained is False
 
 
-def test_a_fresh_loss_makes_a_node_not_ok_and_an_old_one_does_not(handlers, stream, clock):
+def test_a_recent_loss_makes_a_node_not_ok_and_an_old_one_does_not(handlers, stream, clock):
     packets = make_packets(50)
     feed(stream, clock, packets[:20] + packets[21:])
     health = ask_health(handlers)
@@ -85,12 +85,12 @@ def test_a_fresh_loss_makes_a_node_not_ok_and_an_old_one_does_not(handlers, stre
     assert ask_health(handlers).streams[0].lost == Losses(gap_packets=1)
 
 
-def test_packets_without_estimates_are_a_stall(handlers, stream, clock):
+def test_a_stream_with_packets_but_without_estimates_is_stalled(handlers, stream, clock):
     clock[0] += 3 * SECOND_NS
     stream.refused(clock[0])
     clock[0] += SECOND_NS // 2
     stream.refused(clock[0])
-    assert ask_health(handlers).streams[0].verdict == "lossy"  # it began to flow only half a second ago
+    assert ask_health(handlers).streams[0].verdict == "lossy"  # packets have arrived for only half a second
     for _ in range(6):
         clock[0] += SECOND_NS // 2
         stream.refused(clock[0])
@@ -98,21 +98,21 @@ def test_packets_without_estimates_are_a_stall(handlers, stream, clock):
     assert (health.ok, health.streams[0].verdict) == (False, "stalled")
 
 
-def test_a_silent_camera_is_idle_which_is_no_fault_of_the_node(handlers, stream, clock):
+def test_a_stream_without_packets_is_idle_and_the_node_stays_ok(handlers, stream, clock):
     feed(stream, clock, make_packets(50))
     clock[0] += 2 * SECOND_NS
     health = ask_health(handlers)
     assert (health.ok, health.streams[0].verdict) == (True, "idle")
 
 
-def test_health_tells_how_the_newest_change_of_model_went_and_whether_the_node_is_ready(slot, handlers):
+def test_health_reports_the_newest_model_change_and_whether_the_node_is_ready(slot, handlers):
     assert (ask_health(handlers).change, ask_health(handlers).rollbacks, ask_health(handlers).ready) == ("", 0, True)
     _, serving = slot.activate("two")
     assert ask_health(handlers).change == "two is active"
     slot.fault(serving, "planted")
-    told = ask_health(handlers)
-    assert (told.change, told.rollbacks) == ("two was rolled back automatically: planted", 1)
-    assert (told.model.name, told.epoch) == ("one", 2)
+    health = ask_health(handlers)
+    assert (health.change, health.rollbacks) == ("two was rolled back automatically: planted", 1)
+    assert (health.model.name, health.epoch) == ("one", 2)
     with pytest.raises(UnknownModel):
         slot.activate("three")
     assert ask_health(handlers).change.startswith("three was refused: ")
@@ -121,7 +121,7 @@ def test_health_tells_how_the_newest_change_of_model_went_and_whether_the_node_i
     ).ready
 
 
-def test_models_tell_active_previous_and_available(handlers):
+def test_models_lists_active_previous_and_available_models(handlers):
     first = ModelsReply.decode(handlers.models(ModelsRequest().encode()))
     assert (first.active.name, first.previous, first.epoch) == ("one", None, 0)
     changed = ActivateReply.decode(handlers.activate(ActivateRequest(model="two").encode()))
@@ -131,7 +131,7 @@ def test_models_tell_active_previous_and_available(handlers):
     assert {info.name for info in then.available} == {"default", "untrained", "one", "two"}
 
 
-def test_a_request_that_is_not_one_is_refused(handlers):
+def test_an_invalid_request_is_refused(handlers):
     with pytest.raises(Malformed):
         handlers.health(b"")
     with pytest.raises(InvalidField, match="model=.*"):
@@ -147,8 +147,8 @@ def trusts_a_flag(_, signature):
     return Signed("trusted", allow_downgrade=True) if signature == b"flag" else Signed("unsigned")
 
 
-class Told:
-    """Progress replies that a caller hears."""
+class Replies:
+    """Progress replies that a caller gets."""
 
     def __init__(self):
         self.replies = []
@@ -162,13 +162,13 @@ class Told:
 
 
 @pytest.fixture
-def told():
-    return Told()
+def progress():
+    return Replies()
 
 
 @pytest.fixture
 def storing(models_dir, tmp_path):
-    """Handlers of a node that keeps pushed models, has served release 7, and trusts the signature `flag`."""
+    """Makes handlers of a node that stores pushed models and trusts the signature `flag`."""
 
     def make(highest_release=0):
         store = ModelStore(tmp_path, models_dir, verify=trusts_a_flag)
@@ -186,50 +186,52 @@ def push_of(name, signature=None):
     return request.encode(), lambda _, chunk: data[chunk.offset : chunk.offset + chunk.length]
 
 
-def test_a_pushed_model_is_staged_until_it_serves(storing, told):
+def test_a_pushed_model_is_staged_until_it_serves(storing, progress):
     handlers = storing()
     request, pull = push_of("eight")
-    reply = PushReply.decode(handlers.push(request, told, pull, RUNS))
+    reply = PushReply.decode(handlers.push(request, progress, pull, RUNS))
     assert (reply.model.name, reply.fetched > 0) == ("eight", True)
-    assert told.steps == ["fetching", "staged", "verified"]
+    assert progress.steps == ["fetching", "staged", "verified"]
     models = ModelsReply.decode(handlers.models(ModelsRequest().encode()))
     assert [info.name for info in models.staged] == ["eight"]
     assert models.staged[0] in models.available
-    changed = ActivateReply.decode(handlers.activate(ActivateRequest(model=reply.model.digest[:8]).encode(), told))
+    changed = ActivateReply.decode(handlers.activate(ActivateRequest(model=reply.model.digest[:8]).encode(), progress))
     assert (changed.active.name, changed.previous.name) == ("eight", "one")
     assert ModelsReply.decode(handlers.models(ModelsRequest().encode())).staged == ()
-    back = ActivateReply.decode(handlers.rollback(RollbackRequest(expect=reply.model.digest[:8]).encode(), told))
+    back = ActivateReply.decode(handlers.rollback(RollbackRequest(expect=reply.model.digest[:8]).encode(), progress))
     assert (back.active.name, back.epoch) == ("one", 2)
-    assert told.replies[-1].step == "rolled_back"
-    assert {reply.node for reply in told.replies} == {"edge"}
+    assert progress.replies[-1].step == "rolled_back"
+    assert {reply.node for reply in progress.replies} == {"edge"}
 
 
-def test_an_older_release_is_neither_taken_nor_activated_unless_a_trusted_signature_allows_it(storing, told, tmp_path):
+def test_an_older_release_is_neither_stored_nor_activated_unless_a_trusted_signature_allows_it(
+    storing, progress, tmp_path
+):
     handlers = storing(highest_release=7)
     request, pull = push_of("eight")
     with pytest.raises(Downgrade, match="release=0: release 7 was accepted before"):
-        handlers.push(request, told, pull, RUNS)
-    assert told.steps[-1] == "refused"
+        handlers.push(request, progress, pull, RUNS)
+    assert progress.steps[-1] == "refused"
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
     with pytest.raises(Downgrade):
-        handlers.activate(ActivateRequest(model="two").encode(), told)
+        handlers.activate(ActivateRequest(model="two").encode(), progress)
     request, pull = push_of("eight", b"flag")
-    assert PushReply.decode(handlers.push(request, told, pull, RUNS)).model.signature == "trusted"
+    assert PushReply.decode(handlers.push(request, progress, pull, RUNS)).model.signature == "trusted"
     changed = ActivateReply.decode(handlers.activate(ActivateRequest(model="eight").encode()))
     assert (changed.active.name, changed.active.signature) == ("eight", "trusted")
     assert ActivateReply.decode(handlers.rollback(RollbackRequest().encode())).active.name == "one"
 
 
-def test_a_refusal_is_the_last_step_that_is_told(handlers, told):
+def test_a_refusal_is_the_last_reported_step(handlers, progress):
     with pytest.raises(UnknownModel):
-        handlers.activate(ActivateRequest(model="three").encode(), told)
+        handlers.activate(ActivateRequest(model="three").encode(), progress)
     with pytest.raises(NothingBefore):
-        handlers.rollback(RollbackRequest().encode(), told)
+        handlers.rollback(RollbackRequest().encode(), progress)
     request, pull = push_of("eight")
     with pytest.raises(NoStore):
-        handlers.push(request, told, pull, RUNS)
-    assert told.steps == ["refused"] * 3
-    assert "model='three'" in told.replies[0].text
+        handlers.push(request, progress, pull, RUNS)
+    assert progress.steps == ["refused"] * 3
+    assert "model='three'" in progress.replies[0].text
 
 
 def test_a_model_whose_signature_is_refused_is_listed_as_untrusted(models_dir):

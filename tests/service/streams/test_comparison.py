@@ -9,13 +9,13 @@ from tests.bundles import make_bundle
 
 
 def trial(proven, tried, *, rates=(0.2, 0.2), ms=1.0, serving_is_tried=False, windows=20, reach_us=0, late_us=0):
-    """A trial in which both models say the same twist in every window."""
+    """A trial in which each model estimates the same twist in every window."""
     comparison = Comparison(serving_is_tried=serving_is_tried, window_ms=50.0, reach_us=reach_us)
-    front, beside = (tried, proven) if serving_is_tried else (proven, tried)
-    front_rate, beside_rate = rates[::-1] if serving_is_tried else rates
+    serving, standby = (tried, proven) if serving_is_tried else (proven, tried)
+    serving_rate, standby_rate = rates[::-1] if serving_is_tried else rates
     for i in range(windows):
-        comparison.add_serving(WindowResult(i * 50_000, np.array(front), front_rate), ms)
-        comparison.add_standby(WindowResult(i * 50_000 + late_us, np.array(beside), beside_rate), ms)
+        comparison.add_serving(WindowResult(i * 50_000, np.array(serving), serving_rate), ms)
+        comparison.add_standby(WindowResult(i * 50_000 + late_us, np.array(standby), standby_rate), ms)
     return comparison
 
 
@@ -23,7 +23,7 @@ DRIVING = (0.0, 0.0, 2.0, 0.0, 0.5, 0.0)
 
 
 @pytest.mark.parametrize("serving_is_tried", [False, True])
-def test_models_that_agree_are_not_told_apart(serving_is_tried):
+def test_models_that_agree_have_no_divergence(serving_is_tried):
     figures = trial(DRIVING, DRIVING, serving_is_tried=serving_is_tried).figures()
     assert figures.divergence == 0
     assert violation(figures, TrialLimits(divergence=0.01)) is None
@@ -42,11 +42,11 @@ def test_divergence_is_the_difference_in_units_of_the_proven_models_motion(tried
     assert violation(figures, TrialLimits(divergence=divergence + 0.1)) is None
 
 
-def test_at_rest_small_differences_are_small():
+def test_small_differences_of_a_stationary_camera_stay_small():
     assert trial((0.0,) * 6, (0.05, 0, 0, 0, 0, 0.02)).figures().divergence < 0.5
 
 
-def test_a_model_that_falls_silent_or_fires_without_end_is_found():
+def test_a_model_that_stops_firing_or_fires_too_much_is_found():
     for rates in ((0.3, 0.0), (0.05, 0.9)):
         assert violation(trial(DRIVING, DRIVING, rates=rates).figures(), TrialLimits()).field == "rate_ratio"
     assert violation(trial(DRIVING, DRIVING, rates=(0.0, 0.0)).figures(), TrialLimits()) is None
@@ -73,15 +73,15 @@ def test_a_bundle_may_be_stricter_about_itself_than_the_node(own, words, serving
     assert str(violation(figures, strict)) == words
     lax = metadata.BundleLimits(mean_dv_m_s=0.6, mean_dw_rad_s=0.3, latency_ratio=1.1)
     lax_too = TrialLimits(divergence=0.1).and_of(replace(make_bundle(), metadata=metadata.Metadata(limits=lax)))
-    assert violation(figures, lax_too).field == "divergence"  # what the node says holds all the same
+    assert violation(figures, lax_too).field == "divergence"  # the limits of the node still hold
 
 
-def test_too_few_windows_say_nothing():
+def test_with_too_few_windows_no_limit_is_checked():
     assert violation(trial(DRIVING, (9,) * 6, ms=99, windows=7).figures(), TrialLimits()) is None
     assert trial(DRIVING, DRIVING, windows=0).figures().divergence == 0
 
 
-def test_only_the_newest_windows_are_judged_where_asked():
+def test_newest_bounds_the_windows_that_are_evaluated():
     comparison = trial(DRIVING, DRIVING, windows=100)
     for i in range(100, 108):
         comparison.add_serving(WindowResult(i * 50_000, np.array(DRIVING), 0.2), 1.0)
@@ -90,12 +90,12 @@ def test_only_the_newest_windows_are_judged_where_asked():
     assert violation(comparison.figures(), TrialLimits(divergence=2.0), newest=8).field == "divergence"
 
 
-def test_windows_that_end_apart_are_compared_within_reach_alone():
+def test_windows_are_compared_only_if_their_ends_are_within_reach():
     assert len(trial(DRIVING, DRIVING, reach_us=10_000, late_us=10_000).figures().pairs) == 20
     assert len(trial(DRIVING, DRIVING, reach_us=10_000, late_us=10_001).figures().pairs) == 0
 
 
-def test_a_fault_goes_before_all_figures():
+def test_a_fault_takes_precedence_over_all_figures():
     comparison = trial(DRIVING, DRIVING)
     comparison.fault = "planted"
     assert str(violation(comparison.figures(), TrialLimits())) == "fault planted, the bound is none"

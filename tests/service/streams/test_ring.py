@@ -15,7 +15,7 @@ def window(number, share=0.1):
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 1.0])
 @pytest.mark.parametrize("shape", [SHAPE, (10, 130, 172)], ids=["small", "more than 16 bits of cells"])
-def test_a_window_comes_out_as_it_went_in_and_takes_no_more_room_than_its_counts(share, shape):
+def test_a_packed_window_is_lossless_and_not_larger_than_its_counts(share, shape):
     counts = np.resize(window(3, share).counts, shape)
     entry = pack(Window(7, counts, 5, 2))
     back = entry.window()
@@ -36,7 +36,7 @@ def test_a_ring_keeps_the_newest_windows_in_order():
     assert len(ring.after(None)) == 4
 
 
-def test_a_ring_never_takes_more_bytes_than_it_may():
+def test_a_ring_never_exceeds_its_maximum_size():
     entry = pack(window(0, 1.0))
     ring = Ring(1000, 3 * entry.size + 10)
     for number in range(50):

@@ -50,7 +50,7 @@ def tail_events():
     return sum(int((packet.events.t >= 7 * WINDOW_US).sum()) for packet in make_packets(100))
 
 
-def test_a_lost_packet_is_counted_and_flags_the_windows_that_miss_it(stream):
+def test_a_lost_packet_is_counted_and_flags_its_windows(stream):
     packets = make_packets(60)
     estimates = feed(stream, packets[:30] + packets[31:])
     assert stream.counters.losses().nonzero() == {"gap_packets": 1}
@@ -58,14 +58,14 @@ def test_a_lost_packet_is_counted_and_flags_the_windows_that_miss_it(stream):
     assert len(estimates) == 4
 
 
-def test_a_long_gap_flags_every_window_it_touches_and_no_other(stream):
+def test_a_long_gap_flags_every_window_that_it_overlaps_and_no_other(stream):
     packets = make_packets(80)
     estimates = feed(stream, packets[:20] + packets[50:])  # 80 ms to 200 ms are missing
     assert flagged(estimates, Flag.GAP) == [1, 2, 3]
     assert stream.counters.gap_packets == 30
 
 
-def test_packets_dropped_here_are_overload_and_not_lost_on_the_way(stream):
+def test_packets_dropped_by_the_queue_count_as_overload_and_not_as_a_gap(stream):
     packets = make_packets(60)
     estimates = feed(stream, packets[:30])
     stream.overloaded(5)
@@ -74,7 +74,7 @@ def test_packets_dropped_here_are_overload_and_not_lost_on_the_way(stream):
     assert flagged(estimates, Flag.OVERLOAD) == flagged(estimates, Flag.GAP) == [2]
 
 
-def test_a_refused_packet_is_not_counted_as_lost_on_the_way_too(stream):
+def test_a_malformed_packet_does_not_also_count_as_a_gap(stream):
     packets = make_packets(60)
     feed(stream, packets[:30])
     stream.refused(1)
@@ -82,7 +82,7 @@ def test_a_refused_packet_is_not_counted_as_lost_on_the_way_too(stream):
     assert stream.counters.losses().nonzero() == {"malformed_packets": 1}
 
 
-def test_duplicates_and_stragglers_are_counted_and_change_nothing(slot):
+def test_duplicate_and_late_packets_are_counted_and_change_nothing(slot):
     packets = make_packets(60)
     clean = feed(Stream("cam0", slot), packets)
     disturbed = Stream("cam0", slot)
@@ -92,7 +92,7 @@ def test_duplicates_and_stragglers_are_counted_and_change_nothing(slot):
 
 
 @given(st.lists(st.integers(0, 39), min_size=0, max_size=30, unique=True), st.randoms(use_true_random=False))
-def test_every_packet_that_was_sent_is_accounted_for(dropped, random):
+def test_every_sent_packet_is_counted(dropped, random):
     stream = Stream("cam0", _slot())
     kept = [packet for packet in make_packets(41, step_us=8000) if packet.seq not in dropped]
     repeats = random.sample(kept, min(3, len(kept)))
@@ -115,7 +115,7 @@ def _slot():
     return _SLOTS[0]
 
 
-def test_a_driver_that_restarts_begins_anew_at_once(stream):
+def test_a_restarted_driver_resets_the_stream_at_once(stream):
     feed(stream, make_packets(30))
     estimates = feed(stream, make_packets(30, start_us=10_000_000))
     assert estimates[0].start_us == 10_000_000
@@ -124,14 +124,14 @@ def test_a_driver_that_restarts_begins_anew_at_once(stream):
     assert stream.counters.resets == 1
 
 
-def test_a_driver_whose_first_packet_after_a_restart_was_lost_is_taken_up_after_three(stream):
+def test_a_restarted_driver_whose_first_packet_was_lost_is_accepted_after_three_packets(stream):
     feed(stream, make_packets(30))
     estimates = feed(stream, make_packets(40, start_us=10_000_000)[1:])
     assert estimates
     assert stream.counters.out_of_order_packets == 2
 
 
-def test_a_sensor_clock_that_goes_back_begins_anew(stream):
+def test_a_sensor_clock_that_goes_backwards_resets_the_stream(stream):
     feed(stream, make_packets(30, start_us=50_000_000))
     estimates = feed(stream, make_packets(30, first_seq=30))
     assert [one.start_us for one in estimates] == [0, WINDOW_US]
@@ -164,7 +164,7 @@ def test_camera_info_of_another_sensor_is_not_used(stream):
     assert all(Flag.UNCALIBRATED in one.flags for one in feed(stream, make_packets(30)))
 
 
-def test_a_hole_in_sensor_time_without_loss_skips_windows_and_says_so(stream):
+def test_a_gap_in_sensor_time_without_lost_packets_skips_and_counts_windows(stream):
     feed(stream, make_packets(30))
     estimates = feed(stream, make_packets(30, first_seq=30, start_us=10_000_000))
     assert stream.counters.skipped_windows == (10_000_000 - 150_000) // WINDOW_US
@@ -172,7 +172,7 @@ def test_a_hole_in_sensor_time_without_loss_skips_windows_and_says_so(stream):
     assert estimates[1].start_us == 10_000_000
 
 
-def test_a_model_change_takes_effect_at_a_window_and_keeps_the_state_primed(slot):
+def test_a_model_change_takes_effect_at_a_window_with_a_primed_state(slot):
     packets = make_packets(100)
     always_two = Stream("cam0", _at(slot, "two"))
     expected = feed(always_two, packets)
@@ -204,11 +204,11 @@ def test_streams_do_not_leak_state_into_each_other(slot):
 
 
 def test_a_packet_of_another_stream_is_refused(stream):
-    with pytest.raises(InvalidField, match="stream='cam1': it came on the key of stream 'cam0'"):
+    with pytest.raises(InvalidField, match="stream='cam1': received on the key of stream 'cam0'"):
         stream.accept(make_packet(stream="cam1"), Arrival(1, 2))
 
 
-def test_a_fault_of_ours_costs_one_packet_and_the_stream_begins_anew(stream):
+def test_an_internal_error_loses_one_packet_and_resets_the_stream(stream):
     feed(stream, make_packets(30))
     stream.failed()
     estimates = feed(stream, make_packets(30, first_seq=30, start_us=120_000))
@@ -224,7 +224,7 @@ def test_few_events_and_a_young_state_are_flagged(stream):
     assert all(Flag.UNTRAINED in one.flags for one in estimates)
 
 
-def test_an_estimate_of_a_calibrated_model_carries_its_covariance_and_says_when_it_is_uncertain(tmp_path):
+def test_an_estimate_of_a_calibrated_model_has_a_covariance_and_the_flag_uncertain(tmp_path):
     plain = bundle.untrained(1, SMALL, "one")
     network = copy.deepcopy(plain.network)
     network.add_spread()  # sigma is 1 in every axis

@@ -25,21 +25,21 @@ def drain(inbox):
         taken.append(one.payload[0])
 
 
-def test_an_inbox_hands_out_in_order_and_loses_nothing_within_its_bounds():
+def test_an_inbox_keeps_the_order_and_loses_nothing_within_its_bounds():
     inbox = Inbox(max_age_s=1, max_bytes=1 << 20)
     for number in range(100):
         inbox.put(sample(number, received_ns=number * 1_000_000))
     assert drain(inbox) == (list(range(100)), 0)
 
 
-def test_an_inbox_drops_the_oldest_that_waited_too_long_and_counts_them():
+def test_an_inbox_drops_and_counts_the_samples_that_waited_too_long():
     inbox = Inbox(max_age_s=0.01, max_bytes=1 << 20)
     for number in range(100):
         inbox.put(sample(number, received_ns=number * 1_000_000))
     assert drain(inbox) == (list(range(89, 100)), 89)
 
 
-def test_an_inbox_never_holds_more_bytes_than_it_may():
+def test_an_inbox_never_exceeds_its_maximum_size():
     inbox = Inbox(max_age_s=1, max_bytes=10_000)
     for number in range(20):
         inbox.put(sample(number, size=1000))
@@ -47,12 +47,12 @@ def test_an_inbox_never_holds_more_bytes_than_it_may():
     assert kept == list(range(20 - len(kept), 20))
     assert 0 < len(kept) * 1000 <= 10_000
     assert dropped == 20 - len(kept)
-    inbox.put(sample(0, size=100_000))  # larger than everything it may hold
+    inbox.put(sample(0, size=100_000))  # larger than the maximum
     assert drain(inbox) == ([], 1)
 
 
 class Published:
-    """A worker's outlet that keeps what is published."""
+    """An outlet that records the published estimates."""
 
     def __init__(self, camera=None):
         self.estimates: list[TwistEstimate] = []
@@ -94,7 +94,7 @@ def test_bytes_in_estimates_out(worker, published):
     assert all(one.trace.received_ns <= one.trace.queued_ns <= one.trace.computed_ns for one in published.estimates)
 
 
-def test_garbage_between_packets_is_counted_and_costs_nothing_else(worker, published):
+def test_malformed_packets_are_counted_and_lose_nothing_else(worker, published):
     for packet in make_packets(100):
         worker.put_packet(encode_packet(packet), 1)
         worker.put_packet(b"\x81garbage", 1)
@@ -102,7 +102,7 @@ def test_garbage_between_packets_is_counted_and_costs_nothing_else(worker, publi
     assert worker.stream.counters.losses().nonzero().keys() <= {"malformed_packets"}
 
 
-def test_a_fault_while_working_on_a_packet_does_not_end_the_stream(worker, published, monkeypatch, caplog):
+def test_an_internal_error_on_a_packet_does_not_end_the_stream(worker, published, monkeypatch, caplog):
     accept = worker.stream.accept
 
     def faulty(packet, arrival):
@@ -117,19 +117,19 @@ def test_a_fault_while_working_on_a_packet_does_not_end_the_stream(worker, publi
     assert worker.stream.counters.failed_packets == 1
 
 
-def test_a_model_beside_gets_its_turns_however_often_packets_come(worker, monkeypatch):
+def test_a_standby_model_runs_however_often_packets_arrive(worker, monkeypatch):
     turns = []
     monkeypatch.setattr(Lanes, "has_backlog", property(lambda _: True))
     monkeypatch.setattr(worker.stream.lanes, "run_standby", lambda: turns.append(threading.Event().wait(0.03)))
     for packet in make_packets(400, n=5):
         worker.put_packet(encode_packet(packet), 1)
-        threading.Event().wait(0.005)  # a packet comes in each of its rests
+        threading.Event().wait(0.005)  # a packet arrives in each of its pauses
         if len(turns) == 4:
             return
     pytest.fail(f"{len(turns)} turns in 400 packets")
 
 
-def test_a_camera_that_can_not_be_read_is_refused_and_the_stream_goes_on(slot):
+def test_an_unreadable_camera_info_is_refused_and_the_stream_continues(slot):
     def broken():
         raise Malformed("camera info", "planted")
 
