@@ -43,7 +43,7 @@ MAY_IMPORT = {
     "neurove_core.self_test": "config models estimator",
     "neurove_core.io": "files figures extras compiled geometry",
     "neurove_core.io.formats": "files extras compiled geometry io",
-    "neurove_core.sim": f"{_FILES} geometry io",
+    "neurove_core.sim": f"{_FILES} geometry io io.formats",
     "neurove_core.sources": "extras io io.formats sim",
     "neurove_core.evaluation": f"{_READ} networks models estimator",
     "neurove_core.training": f"{_READ} {_MODEL} sim evaluation",

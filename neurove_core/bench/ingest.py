@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neurove_core import io
+from neurove_core import sources
 from neurove_core.bench import Row, interleaved, peers, rows, window
 from neurove_core.compiled import compiled
 from neurove_core.config import ModelConfig
@@ -158,7 +158,7 @@ def decode(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool
         path.write_bytes(header + _evt3(events).tobytes())
 
         def ours() -> list[Events]:
-            return list(io.open_source(str(path)).chunks())
+            return list(sources.open_source(str(path)).chunks())
 
         runs: dict[str, Callable[[], Any]] = {"ours": ours}
         equal: dict[str, bool | None] = {}

@@ -19,9 +19,9 @@ from neurove_core.evaluation.contrast import angular
 from neurove_core.evaluation.evaluate import NoTruth, estimate_recording
 from neurove_core.evaluation.metrics import SKIP_S
 from neurove_core.experiments import save_text
-from neurove_core.io import open_source
 from neurove_core.io.recording import Recording
 from neurove_core.sim.render.camera import CAMERAS
+from neurove_core.sources import open_source
 from neurove_protocol import CameraInfo
 from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.events import Events

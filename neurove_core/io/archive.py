@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from neurove_core.extras import MissingExtra
 from neurove_core.io.errors import BrokenRecording, UnknownSource
-from neurove_core.io.recording import SUPPORTED
 
 BROKEN_ZIP = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, NotImplementedError, RuntimeError, ValueError)
 """What the standard library raises over an archive that is not whole, or packed in a way that it does not know."""
@@ -63,9 +62,9 @@ def folder_in_zip(path: Path, wanted: str) -> str:
         with zipfile.ZipFile(path) as archive:
             names = [name for name in archive.namelist() if name.rpartition("/")[2] == wanted]
     except BROKEN_ZIP as error:
-        raise UnknownSource(path, SUPPORTED, f"it is no zip file: {error}") from None
+        raise UnknownSource(path, f"it is no zip file: {error}") from None
     if not names:
-        raise UnknownSource(path, SUPPORTED, f"there is no {wanted} in it")
+        raise UnknownSource(path, f"there is no {wanted} in it")
     return min(names, key=len).removesuffix(wanted)
 
 

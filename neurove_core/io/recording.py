@@ -19,22 +19,6 @@ CHUNK_EVENTS: Final = 1 << 18
 BLOCK_BYTES: Final = 4 << 20
 """How much of a file is read at once [bytes]."""
 
-SUPPORTED: Final = (
-    "FILE.aedat4 (DV)",
-    "FILE.aedat (jAER's AEDAT 2.0)",
-    "FILE.raw (Prophesee EVT2, EVT3), FILE.dat (Prophesee DAT)",
-    "FILE.es (Event Stream)",
-    "FILE.mcap (our own, of `neurove record` and `neurove convert`)",
-    "FILE.bag (ROS 1), FILE.db3, FILE.mcap or their folder (ROS 2)",
-    "FILE.mat (eventVision-evbench)",
-    "FILE.npz (CARLA's event camera)",
-    "a folder with events.txt, a FILE.zip with one, or FILE.txt (Event Camera Dataset)",
-    "FILE.h5, FILE.hdf5 (MVSEC, DSEC, M3ED)",
-    "sim://SCENE?trajectory=...&seed=... (built-in simulator)",
-    "pattern:// (built-in)",
-)
-"""The sources that `open_source` knows."""
-
 
 class Imu(NamedTuple):
     """Samples of an inertial unit, ordered by time, in SI."""
@@ -178,7 +162,7 @@ def refuse_topic(source: str | Path, topic: str | None) -> None:
         UnknownSource: a topic is given.
     """
     if topic is not None:
-        raise UnknownSource(source, SUPPORTED, f"it has one event stream and no topic {topic!r}")
+        raise UnknownSource(source, f"it has one event stream and no topic {topic!r}")
 
 
 def whole(events: Events, sensor: Sensor, not_before_us: int | None) -> Events:

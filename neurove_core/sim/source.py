@@ -5,7 +5,8 @@ from typing import Final
 from urllib.parse import parse_qsl, urlsplit
 
 from neurove_core.io.errors import UnknownSource
-from neurove_core.io.recording import SUPPORTED
+from neurove_core.io.format import UrlFormat
+from neurove_core.io.recording import refuse_topic
 from neurove_core.sim.motion.curves import Mounted, Trajectory
 from neurove_core.sim.motion.trajectory import parse_trajectory
 from neurove_core.sim.render.camera import DEFAULT_CAMERA, DEFAULT_HEIGHT_M, named_camera
@@ -53,7 +54,7 @@ def simulation_of(url: str, sensor: Sensor | None = None) -> Simulation:
     unknown = sorted(query.keys() - set(_FIELDS))
     if parts.scheme != "sim" or parts.path.strip("/") or unknown:
         why = f"unknown parameter {unknown[0]!r}" if unknown else "sim://SCENE?trajectory=...&seed=... is expected"
-        raise UnknownSource(url, SUPPORTED, why)
+        raise UnknownSource(url, why)
     scene = parts.netloc or DEFAULT_SCENE
     make_scene = named_scene(scene)
     seed = _seed(url, query.get("seed", "0"))
@@ -90,3 +91,11 @@ def _number(url: str, query: dict[str, str], field: str, default: float) -> floa
     if math.isnan(value):
         raise InvalidField(url, field, query[field], "a number is expected")
     return value
+
+
+def _open(url: str, sensor: Sensor | None, topic: str | None) -> Simulation:
+    refuse_topic(url, topic)
+    return simulation_of(url, sensor)
+
+
+FORMAT = UrlFormat("sim://SCENE?trajectory=...&seed=... (built-in simulator)", "sim", _open)

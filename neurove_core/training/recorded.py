@@ -19,8 +19,9 @@ from neurove_core.geometry.camera import lookup_table
 from neurove_core.geometry.motion import Twists, twists
 from neurove_core.ingest import windows
 from neurove_core.ingest.windows import Window, WindowsState
-from neurove_core.io import Recording, UnknownSource, open_source, read_poses
-from neurove_core.io.recording import SUPPORTED
+from neurove_core.io import Recording, UnknownSource
+from neurove_core.io.formats.pose_files import read_poses
+from neurove_core.sources import open_source
 from neurove_core.training.config import RecordedConfig, TrainingConfig
 from neurove_core.training.data import FORMAT, Sequence, save
 from neurove_protocol.errors import InvalidField
@@ -174,7 +175,7 @@ def _sources(one: RecordedConfig) -> list[str]:
         return [one.source]
     inside = [child for child in sorted(path.iterdir()) if _may_be_recording(child) and _opens(child, one.topic)]
     if not inside:
-        raise UnknownSource(path, SUPPORTED, "neither a recording nor a folder with recordings")
+        raise UnknownSource(path, "neither a recording nor a folder with recordings")
     if one.truth is not None and len(inside) > 1:
         raise InvalidField(
             "training", "truth", one.truth, f"{one.source} contains {len(inside)} recordings; list each with its truth"

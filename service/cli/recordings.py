@@ -29,7 +29,7 @@ class NothingRecorded(NeuroVEError):
 
 def record(args: argparse.Namespace) -> int:
     """Record the packets that drivers publish, until Ctrl-C."""
-    from neurove_core.io import PacketWriter
+    from neurove_core.io.formats.packet_log.writer import PacketWriter
     from neurove_service.clients import ask
     from neurove_service.clients.recorder import Recorder, as_json
 
@@ -86,13 +86,13 @@ def _status_line(path: Path) -> Iterator[Callable[[Any], None] | None]:
 
 
 def _write_mcap(recording: Any, path: Path, progress: Progress) -> None:
-    from neurove_core.io import write_mcap
+    from neurove_core.io.formats.packet_log.writer import write_mcap
 
     write_mcap(recording, path, progress=lambda events, _: progress(events))
 
 
 def _write_dsec(recording: Any, path: Path, progress: Progress) -> None:
-    from neurove_core.io import write_dsec
+    from neurove_core.io.formats.hdf5.dsec_write import write_dsec
 
     try:
         write_dsec(recording, path, progress)
@@ -108,7 +108,7 @@ _ENDLESS_S: Final = 5.0  # that `info` reads of a source without end
 
 def convert(args: argparse.Namespace) -> int:
     """Convert a recording to a packet log (.mcap) or to DSEC's layout (.h5)."""
-    from neurove_core.io import open_source
+    from neurove_core.sources import open_source
 
     path: Path = args.out
     if path.suffix not in WRITERS:
@@ -141,7 +141,8 @@ def info(args: argparse.Namespace) -> int:
     """Show what a recording holds: sensor, counts, rates, IMU and truth."""
     from rich.console import Console
 
-    from neurove_core.io import open_source, summary
+    from neurove_core.io import summary
+    from neurove_core.sources import open_source
     from neurove_service.cli.views import survey_table
 
     recording = open_source(args.source, args.sensor, args.topic)
@@ -165,7 +166,7 @@ def info(args: argparse.Namespace) -> int:
 
 def simulate(args: argparse.Namespace) -> int:
     """Record a simulated event camera with its exact motion."""
-    from neurove_core.io import open_source
+    from neurove_core.sources import open_source
 
     if args.scene == "carla":
         return _simulate_carla(args)

@@ -51,7 +51,7 @@ def serve(args: argparse.Namespace) -> int:
 
 def drive(args: argparse.Namespace) -> int:
     """Publish a recording or a synthetic source as one stream; publish a packet log as it was recorded."""
-    from neurove_core.io import open_source
+    from neurove_core.sources import open_source
     from neurove_service.clients import ask
 
     stop = stop_on_signals(with_parent=args.with_parent)
@@ -78,7 +78,7 @@ def drive(args: argparse.Namespace) -> int:
 
 def _player(args: argparse.Namespace, recording: Any, transport: Any, keys: Any) -> Any:
     """A replay for a packet log, a driver for any other recording; both have the same methods."""
-    from neurove_core.io import McapRecording
+    from neurove_core.io.formats.packet_log.reader import McapRecording
     from neurove_service.clients.driver import Driver
     from neurove_service.clients.replay import Replay
 
@@ -96,7 +96,7 @@ def demo(args: argparse.Namespace) -> int:
     """Run driver, service and consumer on any source, then print a summary."""
     from rich.console import Console
 
-    from neurove_core.io import open_source
+    from neurove_core.sources import open_source
     from neurove_service.cli.demo import run
 
     stop = stop_on_signals()

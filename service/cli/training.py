@@ -76,7 +76,8 @@ def evaluate(args: argparse.Namespace) -> int:
     from neurove_core.estimator import Estimator
     from neurove_core.evaluation import evaluate as evaluation
     from neurove_core.geometry import motion
-    from neurove_core.io import open_source, read_poses
+    from neurove_core.io.formats.pose_files import read_poses
+    from neurove_core.sources import open_source
 
     torch.set_num_threads(1)
     estimator = Estimator(models.find(args.model))

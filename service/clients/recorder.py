@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any, Final, NamedTuple
 
-from neurove_core.io import PacketWriter
 from neurove_core.io.formats.packet_log.reader import LIMITS
+from neurove_core.io.formats.packet_log.writer import PacketWriter
 from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.events import decode_packet
 from neurove_protocol.keys import Keys

@@ -5,8 +5,8 @@ import threading
 import time
 from dataclasses import dataclass, field
 
-from neurove_core.io import BrokenRecording, McapRecording, RecordedPacket
-from neurove_core.io.formats.packet_log.reader import LIMITS
+from neurove_core.io import BrokenRecording
+from neurove_core.io.formats.packet_log.reader import LIMITS, McapRecording, RecordedPacket
 from neurove_protocol.camera import SCHEMA as CAMERA_SCHEMA
 from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.events import SCHEMA as EVENTS_SCHEMA

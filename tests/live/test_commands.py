@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from neurove_core.io import open_source
 from neurove_core.io.packets import slices
 from neurove_core.models import bundle
+from neurove_core.sources import open_source
 from tests.live.conftest import Process, client, free_endpoint, neurove, running, service, wait_until
 from tests.live.test_feed import start_router
 from tests.recordings import shared

@@ -4,7 +4,9 @@ import threading
 
 import pytest
 
-from neurove_core.io import McapRecording, PacketWriter, open_source
+from neurove_core.io.formats.packet_log.reader import McapRecording
+from neurove_core.io.formats.packet_log.writer import PacketWriter
+from neurove_core.sources import open_source
 from neurove_protocol import CameraInfo
 from neurove_protocol.events import decode_packet, encode_packet
 from neurove_protocol.keys import Keys

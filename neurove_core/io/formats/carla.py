@@ -19,7 +19,8 @@ from neurove_core.files import atomic_path
 from neurove_core.geometry.motion import Poses, Twists, twists
 from neurove_core.io.archive import BROKEN_ZIP
 from neurove_core.io.errors import BrokenRecording, UnknownSource
-from neurove_core.io.recording import BLOCK_BYTES, SUPPORTED, EventsOnly, in_chunks, whole
+from neurove_core.io.format import Format
+from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, in_chunks, refuse_topic, whole
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import EventOutsideSensor, InvalidField, TimeBackwards
 from neurove_protocol.events import Events, Sensor, check_events
@@ -104,13 +105,13 @@ class CarlaRecording(EventsOnly):
                 names = {name.removesuffix(".npy") for name in archive.namelist()}
             missing = {"events", "width", "height", "fov_deg"} - names
             if missing:
-                raise UnknownSource(path, SUPPORTED, f"it lacks {', '.join(sorted(missing))}")
+                raise UnknownSource(path, f"it lacks {', '.join(sorted(missing))}")
             width, height, fov_deg = (_array(path, name, ()).item() for name in ("width", "height", "fov_deg"))
             own = Sensor(int(width), int(height))
         except (*BROKEN_ZIP, BrokenRecording, InvalidField) as error:
-            raise UnknownSource(path, SUPPORTED, f"it is no recording of CARLA: {error}") from None
+            raise UnknownSource(path, f"it is no recording of CARLA: {error}") from None
         if not 0 < fov_deg < 180:
-            raise UnknownSource(path, SUPPORTED, f"fov_deg={fov_deg} must lie between 0 and 180")
+            raise UnknownSource(path, f"fov_deg={fov_deg} must lie between 0 and 180")
         posed = {"pose_t_ns", "location", "rotation_deg"} <= names
         return cls(path, sensor or own, float(fov_deg), ("events", "poses") if posed else ("events",))
 
@@ -245,3 +246,11 @@ def write(
     finally:
         raw.unlink(missing_ok=True)
     return n
+
+
+def _open(path: Path, sensor: Sensor | None, topic: str | None) -> CarlaRecording:
+    refuse_topic(path, topic)
+    return CarlaRecording.open(path, sensor)
+
+
+FORMAT = Format("FILE.npz (event camera of CARLA)", _open, (".npz",))

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from neurove_core.geometry.motion import Poses, Twists, twists
 from neurove_core.io.archive import Place, folder_in_zip, read_image
 from neurove_core.io.errors import BrokenRecording
-from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Frame, Imu, in_chunks
+from neurove_core.io.format import Format
+from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Frame, Imu, in_chunks, refuse_topic
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import EventOutsideSensor, InvalidField, TimeBackwards
 from neurove_protocol.events import Events, Sensor, check_events
@@ -298,3 +299,20 @@ def _first_bad(lines: list[bytes], sensor: Sensor, not_before_us: int | None) ->
 
     stop = bisect_left(range(1, len(lines)), True, key=lambda stop: fault(stop) != "") + 1
     return stop - 1, fault(stop)
+
+
+def _accepts(path: Path) -> bool:
+    """Whether this is a folder with events.txt, or a file of text or an archive."""
+    return (path / "events.txt").is_file() if path.is_dir() else path.suffix.lower() in (".txt", ".zip")
+
+
+def _open(path: Path, sensor: Sensor | None, topic: str | None) -> EcdRecording:
+    refuse_topic(path, topic)
+    if path.is_dir():
+        return EcdRecording.open(path / "events.txt", path.resolve().name, sensor)
+    return EcdRecording.open(path, path.name, sensor)
+
+
+FORMAT = Format(
+    "a folder with events.txt, a FILE.zip with one, or FILE.txt (Event Camera Dataset)", _open, accepts=_accepts
+)

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from neurove_core.geometry.motion import Twists
 from neurove_core.io.errors import BrokenRecording, UnknownSource
+from neurove_core.io.format import Format
 from neurove_core.io.formats.mat5 import MatFault, read_columns
-from neurove_core.io.recording import SUPPORTED, EventsOnly, in_chunks, whole
+from neurove_core.io.recording import EventsOnly, in_chunks, refuse_topic, whole
 from neurove_protocol.errors import EventOutsideSensor, TimeBackwards
 from neurove_protocol.events import Events, Sensor, check_events
 
@@ -54,7 +55,7 @@ class EvbenchRecording(EventsOnly):
         """
         columns = _columns(path)
         if len({column.size for column in columns.values()}) != 1 or set(columns) != set(COLUMNS):
-            raise UnknownSource(path, SUPPORTED, f"it has not the columns {', '.join(COLUMNS)} of one length")
+            raise UnknownSource(path, f"it has not the columns {', '.join(COLUMNS)} of one length")
         truth = ("twists",) if _rotation(path) is not None else ()
         return cls(path, sensor or DAVIS240B, ("events", *truth))
 
@@ -105,7 +106,7 @@ def _columns(path: Path) -> dict[str, NDArray[Any]]:
     try:
         return read_columns(path, COLUMNS, MAX_COLUMN_BYTES)
     except MatFault as fault:
-        raise UnknownSource(path, SUPPORTED, f"it can not be read as a MATLAB 5 file: {fault}") from None
+        raise UnknownSource(path, f"it can not be read as a MATLAB 5 file: {fault}") from None
 
 
 def _rotation(path: Path) -> float | None:
@@ -119,3 +120,11 @@ def _rotation(path: Path) -> float | None:
     sequence = re.match(r"seq_\d+", path.name)
     found = known.get(sequence.group()) if sequence else None
     return None if found is None else float(found)
+
+
+def _open(path: Path, sensor: Sensor | None, topic: str | None) -> EvbenchRecording:
+    refuse_topic(path, topic)
+    return EvbenchRecording.open(path, sensor)
+
+
+FORMAT = Format("FILE.mat (eventVision-evbench)", _open, (".mat",))

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from neurove_core.compiled import compiled
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
-from neurove_core.io.recording import BLOCK_BYTES, CHUNK_EVENTS, SUPPORTED, EventsOnly, empty_events
+from neurove_core.io.format import Format
+from neurove_core.io.recording import BLOCK_BYTES, CHUNK_EVENTS, EventsOnly, empty_events, refuse_topic
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
 
@@ -52,14 +53,14 @@ class EventStreamRecording(EventsOnly):
         with path.open("rb") as file:
             header = file.read(_HEADER_BYTES)
         if not header.startswith(_MAGIC[: len(header)]):
-            raise UnknownSource(path, SUPPORTED, "the file does not begin as Event Stream does")
+            raise UnknownSource(path, "the file does not begin as Event Stream does")
         if len(header) < _HEADER_BYTES:
             raise BrokenRecording(path, f"byte {len(header)}", "the file ends within its header")
         major, minor, _, kind = header[12:16]
         if major != 2:
-            raise UnknownSource(path, SUPPORTED, f"it is Event Stream {major}.{minor}, version 2 can be read")
+            raise UnknownSource(path, f"it is Event Stream {major}.{minor}, version 2 can be read")
         if kind not in (DVS, ATIS):
-            raise UnknownSource(path, SUPPORTED, f"its events are of type {kind} ({_TYPES.get(kind, 'unknown')})")
+            raise UnknownSource(path, f"its events are of type {kind} ({_TYPES.get(kind, 'unknown')})")
         try:
             width, height = np.frombuffer(header, "<u2", 2, 16).tolist()
             return cls(path, sensor or Sensor(width, height), kind)
@@ -165,3 +166,11 @@ def es_reference(
         if change:
             rows.append((t_us, x, height - 1 - y, p))
     return t_us, at, Events.from_columns(*(zip(*rows, strict=True) if rows else [()] * 4)), inside
+
+
+def _open(path: Path, sensor: Sensor | None, topic: str | None) -> EventStreamRecording:
+    refuse_topic(path, topic)
+    return EventStreamRecording.open(path, sensor)
+
+
+FORMAT = Format("FILE.es (Event Stream)", _open, (".es",))

@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.io.errors import UnknownSource
-from neurove_core.io.recording import SUPPORTED, EventsOnly, in_chunks
+from neurove_core.io.format import UrlFormat
+from neurove_core.io.recording import EventsOnly, in_chunks, refuse_topic
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
@@ -47,7 +48,7 @@ class Pattern(EventsOnly):
         parts = urlsplit(url)
         query = dict(parse_qsl(parts.query, keep_blank_values=True))
         if parts.netloc or parts.path or query.keys() - {"seed"}:
-            raise UnknownSource(url, SUPPORTED, "a pattern has a seed and nothing else")
+            raise UnknownSource(url, "a pattern has a seed and nothing else")
         seed = query.get("seed", "0")
         if not (seed.isascii() and seed.isdecimal() and len(seed) < 10):
             raise InvalidField(url, "seed", seed, "a whole number of at most 9 digits is expected")
@@ -132,3 +133,11 @@ def _crossings(
     level = level.copy()
     level[pixels] = crossed
     return Events.from_columns(t[order], x, y, brighter[order]), level
+
+
+def _open(url: str, sensor: Sensor | None, topic: str | None) -> Pattern:
+    refuse_topic(url, topic)
+    return Pattern.from_url(url, sensor)
+
+
+FORMAT = UrlFormat("pattern:// (built-in sliding texture)", "pattern", _open)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from neurove_core.geometry import rotations
 from neurove_core.geometry.motion import Poses, check_poses, filter_for, interpolate_poses, smoothed
-from neurove_core.io.poses import read_poses
+from neurove_core.io.formats.pose_files import read_poses
 from neurove_core.sim.motion.curves import Mounted, ScrewTrajectory, SplineTrajectory, Trajectory
 from neurove_core.sim.motion.generated import driving, hand_held
 from neurove_protocol.errors import InvalidField

@@ -6,8 +6,8 @@ import pytest
 from neurove_core.evaluation.contrast import accumulate, accumulate_reference, angular, image_grid, planar
 from neurove_core.geometry import rotations
 from neurove_core.geometry.camera import distort
-from neurove_core.io import open_source
 from neurove_core.io.formats.ecd import DAVIS240C, parse_calib
+from neurove_core.sources import open_source
 from neurove_protocol import CameraInfo, Events
 from neurove_protocol.errors import InvalidField
 from tests.neurove_core.geometry.test_geometry import ECD, MVSEC

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from neurove_core.evaluation.contrast import angular
-from neurove_core.io import open_source
+from neurove_core.sources import open_source
 from neurove_protocol.events import Events
 
 

@@ -9,10 +9,10 @@ from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.estimator import Estimator
 from neurove_core.evaluation.evaluate import NoTruth, estimate_recording, evaluate, report
 from neurove_core.geometry.motion import Twists
-from neurove_core.io import open_source
 from neurove_core.io.packets import slices
 from neurove_core.models import bundle
 from neurove_core.models.bundle import PER_HEIGHT
+from neurove_core.sources import open_source
 from neurove_protocol import EventPacket
 from neurove_service.models.slot import ModelSlot
 from neurove_service.streams.stream import Arrival, Stream

@@ -12,8 +12,8 @@ from neurove_core.estimator import Estimator
 from neurove_core.evaluation.contrast import angular
 from neurove_core.evaluation.evaluate import estimate_recording
 from neurove_core.experiments import real
-from neurove_core.io import open_source
 from neurove_core.models import bundle
+from neurove_core.sources import open_source
 from neurove_protocol import Events, Sensor
 from neurove_service.cli import main
 from tests.builders import make_events

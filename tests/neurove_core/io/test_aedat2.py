@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from neurove_core.io import UnknownSource, open_source
+from neurove_core.io import UnknownSource
+from neurove_core.sources import open_source
 from neurove_protocol import Events, Sensor
 from neurove_protocol.errors import InvalidField
 from tests.builders import make_events

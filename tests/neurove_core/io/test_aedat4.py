@@ -5,8 +5,9 @@ import struct
 import numpy as np
 import pytest
 
-from neurove_core.io import BrokenRecording, MissingGeometry, UnknownSource, open_source
+from neurove_core.io import BrokenRecording, MissingGeometry, UnknownSource
 from neurove_core.io.formats.aedat.aedat4 import EXPOSURE, EXTERNAL, GENERATOR, READOUT
+from neurove_core.sources import open_source
 from neurove_protocol import Events
 from tests.builders import SENSOR, make_events
 from tests.recordings import aedat4, all_samples, all_triggers, assert_same, put, read, read_broken, shared

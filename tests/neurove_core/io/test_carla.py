@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from neurove_core.extras import MissingExtra
-from neurove_core.io import BrokenRecording, UnknownSource, open_source
+from neurove_core.io import BrokenRecording, UnknownSource
 from neurove_core.io.formats.carla import RECORD, CarlaPoses, to_optical, write
 from neurove_core.io.formats.carla_server import record
+from neurove_core.sources import open_source
 from neurove_protocol import Events
 from neurove_protocol.errors import InvalidField
 from tests.builders import SENSOR, make_events

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from neurove_core.extras import MissingExtra
-from neurove_core.io import BrokenRecording, UnknownSource, open_source
+from neurove_core.io import BrokenRecording, UnknownSource
 from neurove_core.io.formats.hdf5 import file as hdf5
 from neurove_core.io.recording import CHUNK_EVENTS
+from neurove_core.sources import open_source
 from neurove_protocol import Events, NeuroVEError
 from neurove_protocol.events import check_events
 from tests.builders import SENSOR, make_events

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from neurove_core.geometry.motion import Twists
-from neurove_core.io import BrokenRecording, EventsOnly, open_source, read_poses, write_dsec
-from neurove_core.io.formats.hdf5.dsec_write import MAX_SPAN_S
+from neurove_core.io import BrokenRecording, EventsOnly
+from neurove_core.io.formats.hdf5.dsec_write import MAX_SPAN_S, write_dsec
+from neurove_core.io.formats.pose_files import read_poses
+from neurove_core.sources import open_source
 from neurove_protocol import Events, Sensor
 from neurove_protocol.errors import InvalidField
 from tests.builders import SENSOR, make_events

@@ -10,8 +10,9 @@ import pytest
 from PIL import Image
 
 from neurove_core.extras import MissingExtra
-from neurove_core.io import BrokenRecording, UnknownSource, open_source
+from neurove_core.io import BrokenRecording, UnknownSource
 from neurove_core.io.recording import BLOCK_BYTES
+from neurove_core.sources import open_source
 from neurove_protocol import Events
 from neurove_protocol.errors import InvalidField
 from tests.builders import SENSOR, make_events

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import scipy.io
 
-from neurove_core.io import UnknownSource, open_source
+from neurove_core.io import UnknownSource
+from neurove_core.sources import open_source
 from neurove_protocol import Events, Sensor
 from tests.recordings import assert_same, put, read, read_broken, shared
 

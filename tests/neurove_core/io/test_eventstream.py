@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neurove_core.io import UnknownSource, open_source
+from neurove_core.io import UnknownSource
 from neurove_core.io.formats.eventstream import ATIS, DVS, es_decode, es_reference
+from neurove_core.sources import open_source
 from neurove_protocol import Events, Sensor
 from tests.builders import SENSOR, make_events
 from tests.recordings import assert_same, put, read, read_broken, shared

@@ -5,7 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neurove_core.io import Recording, open_source
+from neurove_core.io import Recording
+from neurove_core.sources import open_source
 from neurove_protocol import Events, NeuroVEError, Sensor
 from neurove_protocol.events import check_events
 from tests.builders import SENSOR, make_events

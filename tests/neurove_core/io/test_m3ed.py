@@ -4,7 +4,8 @@ import h5py
 import numpy as np
 import pytest
 
-from neurove_core.io import BrokenRecording, open_source
+from neurove_core.io import BrokenRecording
+from neurove_core.sources import open_source
 from neurove_protocol import Events, Sensor
 from neurove_protocol.errors import InvalidField
 from tests.builders import SENSOR

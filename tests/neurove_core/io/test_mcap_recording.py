@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 from neurove_core.geometry.motion import Poses, Twists
-from neurove_core.io import BrokenRecording, PacketWriter, UnknownSource, open_source, write_mcap
+from neurove_core.io import BrokenRecording, UnknownSource
 from neurove_core.io.formats.packet_log.reader import McapRecording
+from neurove_core.io.formats.packet_log.writer import PacketWriter, write_mcap
 from neurove_core.io.packets import slices
 from neurove_core.io.recording import EventsOnly, Frame, Imu, Triggers
+from neurove_core.sources import open_source
 from neurove_protocol import CameraInfo, Events, NeuroVEError, Sensor
 from neurove_protocol.events import decode_packet, encode_packet
 from tests.builders import SENSOR, make_events, make_packet, make_packets

@@ -10,8 +10,9 @@ import pytest
 
 from neurove_core.geometry import rotations
 from neurove_core.geometry.motion import twists
-from neurove_core.io import BrokenRecording, open_source
+from neurove_core.io import BrokenRecording
 from neurove_core.io.formats.hdf5 import mvsec
+from neurove_core.sources import open_source
 from neurove_protocol import Sensor
 from neurove_protocol.errors import InvalidField
 from tests.builders import SENSOR

@@ -5,8 +5,9 @@ import itertools
 import numpy as np
 import pytest
 
-from neurove_core.io import Recording, open_source
+from neurove_core.io import Recording
 from neurove_core.io.formats.pattern import FRAME_US, shift_px
+from neurove_core.sources import open_source
 from neurove_protocol import Events, Sensor
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import check_events

@@ -9,7 +9,8 @@ import pytest
 
 from neurove_core.extras import MissingExtra
 from neurove_core.geometry import motion
-from neurove_core.io import BrokenRecording, UnknownSource, poses, read_poses
+from neurove_core.io import BrokenRecording, UnknownSource, poses
+from neurove_core.io.formats.pose_files import read_poses
 from neurove_protocol.errors import InvalidField
 from tests.builders import make_events
 from tests.datasets import make_poses, matrices, write_m3ed, write_mvsec

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from neurove_core.io import BrokenRecording, MissingGeometry, Triggers, UnknownSource, open_source
+from neurove_core.io import BrokenRecording, MissingGeometry, Triggers, UnknownSource
 from neurove_core.io.formats.prophesee.dat import RECORD, SEEK_RECORDS
 from neurove_core.io.recording import BLOCK_BYTES
+from neurove_core.sources import open_source
 from neurove_protocol import Events, Sensor
 from tests.builders import SENSOR, make_events
 from tests.builders_evt import (

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 
-from neurove_core.io import BrokenRecording, UnknownSource, open_source
+from neurove_core.io import BrokenRecording, UnknownSource
 from neurove_core.io.formats.prophesee.evt import ILLEGAL, OK, OUTSIDE
 from neurove_core.io.formats.ros.libcaer import WORD_EVENTS, LibcaerState, libcaer_decode, libcaer_reference
 from neurove_core.io.formats.ros.recording import RosbagRecording
+from neurove_core.sources import open_source
 from neurove_protocol import Events, Sensor
 from tests import ros_bags
 from tests.builders import SENSOR, make_events
@@ -265,7 +266,7 @@ def test_imu_poses_and_lens_are_read_on_the_events_clock(tmp_path, ros):
 
 @pytest.mark.parametrize(
     ("second", "why"),
-    [((STAMP_NS - 1, 1.0), "time runs backwards"), ((STAMP_NS + 10**6, 2.0), "are no pose")],
+    [((STAMP_NS - 1, 1.0), "time runs backwards"), ((STAMP_NS + 10**6, 2.0), "are not a pose")],
 )
 def test_a_pose_that_can_not_be_is_refused_and_one_that_came_twice_is_kept_once(tmp_path, second, why):
     store, of = ros_bags.Store(2), ros_bags.Store(2).of

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from neurove_core.extras import MissingExtra
-from neurove_core.io import BrokenRecording, UnknownSource, open_source
+from neurove_core.io import BrokenRecording, UnknownSource
+from neurove_core.sources import open_source
 from tests import ros_bags
 from tests.builders import make_events
 from tests.neurove_core.io.test_rosbag import beside, in_packets

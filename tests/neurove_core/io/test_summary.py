@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from neurove_core.geometry.motion import Poses, Twists, twists
-from neurove_core.io import BrokenRecording, EventsOnly, Frame, Imu, Triggers, open_source
+from neurove_core.io import BrokenRecording, EventsOnly, Frame, Imu, Triggers
 from neurove_core.io.recording import in_chunks
 from neurove_core.io.summary import survey
 from neurove_core.io.summary_plot import draw
+from neurove_core.sources import open_source
 from neurove_protocol import Events, Sensor
 from neurove_protocol.errors import InvalidField
 from tests.builders import SENSOR, make_events

@@ -12,9 +12,9 @@ from neurove_core import models
 from neurove_core.engine.engine import Engine
 from neurove_core.estimator import Estimator
 from neurove_core.evaluation.evaluate import estimate_recording, evaluate, report
-from neurove_core.io import open_source
 from neurove_core.models import bundle
 from neurove_core.networks.encoding import to_spikes
+from neurove_core.sources import open_source
 from neurove_core.training import data
 from neurove_core.training.batches import with_gain
 

@@ -12,13 +12,13 @@ from neurove_core import self_test
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.estimator import Estimator, Push
 from neurove_core.evaluation.evaluate import estimate_recording, evaluate, report
-from neurove_core.io import open_source
 from neurove_core.models import bundle
 from neurove_core.models.bundle import PER_HEIGHT
 from neurove_core.models.uncertainty import Uncertainty
 from neurove_core.networks import kinds
 from neurove_core.networks import state as carried
 from neurove_core.networks.snn_ang import CHANNELS, OUTPUT_TAU_STEPS
+from neurove_core.sources import open_source
 from neurove_core.training import calibration, data
 from neurove_core.training.config import DataConfig, RecipeConfig, TrainingConfig
 from neurove_core.training.loop import train

@@ -8,7 +8,7 @@ import pytest
 from neurove_core.geometry.camera import distort
 from neurove_core.geometry.motion import Poses
 from neurove_core.geometry.rotations import exp, matrix_of
-from neurove_core.io import UnknownSource, open_source
+from neurove_core.io import UnknownSource
 from neurove_core.io.recording import CHUNK_EVENTS
 from neurove_core.sim.draw import draw
 from neurove_core.sim.motion.trajectory import (
@@ -31,6 +31,7 @@ from neurove_core.sim.simulate import MOTION_PX, Simulation, simulate
 from neurove_core.sim.source import simulation_of
 from neurove_core.sim.world.scene import SCENES, named_scene
 from neurove_core.sim.world.textures import make_textures
+from neurove_core.sources import open_source
 from neurove_protocol import Events, Sensor
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import check_events

@@ -5,8 +5,10 @@ import pytest
 import torch
 
 from neurove_core.geometry.motion import Twists
-from neurove_core.io import UnknownSource, open_source, write_mcap
+from neurove_core.io import UnknownSource
+from neurove_core.io.formats.packet_log.writer import write_mcap
 from neurove_core.models import bundle
+from neurove_core.sources import open_source
 from neurove_core.training import config as configs
 from neurove_core.training import data
 from neurove_core.training.batches import draw

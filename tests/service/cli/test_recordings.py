@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from neurove_core.io import open_source
+from neurove_core.sources import open_source
 from neurove_protocol import Sensor
 from tests.builders import make_events
 from tests.recordings import ecd_text, shared

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from neurove_core.io import open_source
 from neurove_core.models import bundle
+from neurove_core.sources import open_source
 from neurove_service.cli import main
 
 CONFIG = """

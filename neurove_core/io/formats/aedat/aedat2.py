@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from neurove_core.io.clock import count_on
 from neurove_core.io.errors import BrokenRecording, UnknownSource
-from neurove_core.io.recording import BLOCK_BYTES, SUPPORTED, EventsOnly, Imu, in_chunks, whole
+from neurove_core.io.format import Format
+from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Imu, in_chunks, refuse_topic, whole
 from neurove_protocol.errors import EventOutsideSensor, InvalidField, TimeBackwards
 from neurove_protocol.events import Events, Sensor, check_events
 
@@ -109,13 +110,13 @@ class Aedat2Recording(EventsOnly):
         with path.open("rb") as file:
             head = file.read(MAX_HEADER_BYTES)
         if not head.startswith(_MAGIC):
-            raise UnknownSource(path, SUPPORTED, "the file does not begin as AEDAT 2.0 does")
+            raise UnknownSource(path, "the file does not begin as AEDAT 2.0 does")
         header = parse_header(head)
         name = (header.chip_name or "").upper()
         chip = next((chip for start, chip in CHIPS.items() if name.startswith(start)), None)
         if chip is None:
             why = f"its chip is {header.chip_name!r}" if name else "its header names no AEChip"
-            raise UnknownSource(path, SUPPORTED, f"{why}; addresses of {', '.join(CHIPS)} can be read")
+            raise UnknownSource(path, f"{why}; addresses of {', '.join(CHIPS)} can be read")
         return cls(path, sensor or chip.sensor, chip, header)
 
     @property
@@ -206,3 +207,11 @@ class Aedat2Recording(EventsOnly):
                 at += pairs.nbytes
                 if len(block) % PAIR.itemsize:
                     raise BrokenRecording(self.path, f"byte {at}", "the file ends within a pair of address and time")
+
+
+def _open(path: Path, sensor: Sensor | None, topic: str | None) -> Aedat2Recording:
+    refuse_topic(path, topic)
+    return Aedat2Recording.open(path, sensor)
+
+
+FORMAT = Format("FILE.aedat (AEDAT 2.0 of jAER)", _open, (".aedat",))

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
-from neurove_core.io.recording import SUPPORTED, EventsOnly, Frame, Imu, Triggers, in_chunks, whole
+from neurove_core.io.format import Format
+from neurove_core.io.recording import EventsOnly, Frame, Imu, Triggers, in_chunks, refuse_topic, whole
 from neurove_protocol.errors import EventOutsideSensor, InvalidField, TimeBackwards
 from neurove_protocol.events import Events, Sensor, check_events
 
@@ -77,7 +78,7 @@ class Aedat4Recording(EventsOnly):
         """
         with path.open("rb") as file:
             if not _MAGIC.startswith(file.read(len(_MAGIC))):
-                raise UnknownSource(path, SUPPORTED, "the file does not begin as AEDAT4 does")
+                raise UnknownSource(path, "the file does not begin as AEDAT4 does")
             _read_header(path, file)
         try:
             streams = _guarded(lambda: aedat.Decoder(path).id_to_stream())
@@ -85,7 +86,7 @@ class Aedat4Recording(EventsOnly):
             raise BrokenRecording(path, f"byte {len(_MAGIC)}", f"the header can not be read: {fault}") from None
         ids = sorted(key for key, stream in streams.items() if stream["type"] == "events")
         if not ids:
-            raise UnknownSource(path, SUPPORTED, "the file has no event stream")
+            raise UnknownSource(path, "the file has no event stream")
         try:
             sensor = sensor or Sensor(streams[ids[0]]["width"], streams[ids[0]]["height"])
         except InvalidField:
@@ -264,3 +265,11 @@ def _find(file: BinaryIO, at: int, size: int, stream: int) -> _Packet | None:
     while packet is not None and packet.stream != stream:
         packet = _packet(file, packet.stop, size)
     return packet
+
+
+def _open(path: Path, sensor: Sensor | None, topic: str | None) -> Aedat4Recording:
+    refuse_topic(path, topic)
+    return Aedat4Recording.open(path, sensor)
+
+
+FORMAT = Format("FILE.aedat4 (DV)", _open, (".aedat4",))

@@ -13,7 +13,6 @@ from typing import Final, NamedTuple, Protocol, TypeVar
 
 from neurove_core.extras import MissingExtra
 from neurove_core.io.errors import BrokenRecording, UnknownSource
-from neurove_core.io.recording import SUPPORTED
 
 T = TypeVar("T")
 
@@ -86,7 +85,7 @@ class SqliteBag:
             with _connected(path) as connection:
                 rows = connection.execute("SELECT name, type FROM topics").fetchall()
         except sqlite3.Error as error:
-            raise UnknownSource(path, SUPPORTED, f"not a ROS 2 bag: {error}") from None
+            raise UnknownSource(path, f"not a ROS 2 bag: {error}") from None
         return cls(path, {str(name): type_name(str(kind)) for name, kind in rows})
 
     def messages(self, topics: Collection[str], since_ns: int | None = None) -> Iterator[BagMessage]:
@@ -196,5 +195,5 @@ def in_recorded_order(folder: Path) -> list[Path]:
     if not files:
         packed = any(path.suffix == ".zstd" for path in folder.iterdir())
         why = "its files are compressed as a whole: `zstd -d` them" if packed else "the folder has no .db3 or .mcap"
-        raise UnknownSource(folder, SUPPORTED, why)
+        raise UnknownSource(folder, why)
     return sorted(files, key=lambda path: (int((re.findall(r"_(\d+)$", path.stem) or [-1])[0]), path.name))

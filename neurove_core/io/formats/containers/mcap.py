@@ -36,7 +36,6 @@ from neurove_core.io.formats.containers.mcap_records import (
     note,
     summary,
 )
-from neurove_core.io.recording import SUPPORTED
 
 
 class Record(NamedTuple):
@@ -68,10 +67,10 @@ class McapFile:
         """
         with path.open("rb") as file:
             if file.read(len(MAGIC)) != MAGIC:
-                raise UnknownSource(path, SUPPORTED, "the file does not begin as MCAP does")
+                raise UnknownSource(path, "the file does not begin as MCAP does")
             head = RECORD.unpack(file.read(RECORD.size).ljust(RECORD.size, b"\0"))
             if head[0] != HEADER or not 4 <= head[1] <= 1 << 16:
-                raise UnknownSource(path, SUPPORTED, "the file has no MCAP header")
+                raise UnknownSource(path, "the file has no MCAP header")
             body = file.read(head[1])
             profile = body[4 : 4 + int.from_bytes(body[:4], "little")].decode("utf-8", "replace")
             try:

@@ -15,7 +15,6 @@ from typing import Any, BinaryIO, Final, NamedTuple, Self
 from neurove_core.extras import MissingExtra
 from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.formats.containers.bags import MAX_RECORD_BYTES, BagMessage
-from neurove_core.io.recording import SUPPORTED
 
 MAGIC: Final = b"#ROSBAG V2.0\n"
 MAX_HEADER_BYTES: Final = 1 << 20
@@ -56,7 +55,7 @@ class Ros1Bag:
         """
         with path.open("rb") as file:
             if file.read(len(MAGIC)) != MAGIC:
-                raise UnknownSource(path, SUPPORTED, "the file does not begin as a ROS 1 bag of version 2.0 does")
+                raise UnknownSource(path, "the file does not begin as a ROS 1 bag of version 2.0 does")
             connections, chunk_ends = _index(file)
         if not connections:
             self = cls(path, connections, ())

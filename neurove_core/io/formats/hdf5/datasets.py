@@ -3,13 +3,14 @@
 from pathlib import Path
 
 from neurove_core.io.errors import UnknownSource
+from neurove_core.io.format import Format
 from neurove_core.io.formats.hdf5.dsec import DsecRecording
 from neurove_core.io.formats.hdf5.file import has, opened
 from neurove_core.io.formats.hdf5.m3ed import TOPICS as M3ED_TOPICS
 from neurove_core.io.formats.hdf5.m3ed import M3edRecording
 from neurove_core.io.formats.hdf5.mvsec import TOPICS as MVSEC_TOPICS
 from neurove_core.io.formats.hdf5.mvsec import MvsecRecording
-from neurove_core.io.recording import SUPPORTED, Recording, refuse_topic
+from neurove_core.io.recording import Recording, refuse_topic
 from neurove_protocol.events import Sensor
 
 _LOOKED_FOR = (
@@ -46,4 +47,7 @@ def open_hdf5(path: Path, sensor: Sensor | None = None, topic: str | None = None
         refuse_topic(path, topic)
         return DsecRecording.open(path, sensor)
     why = f"it has no events; looked for {'; '.join(_LOOKED_FOR)}"
-    raise UnknownSource(path, SUPPORTED, why + (f"; it has poses: {truth[0]}" if truth else ""))
+    raise UnknownSource(path, why + (f"; it has poses: {truth[0]}" if truth else ""))
+
+
+FORMAT = Format("FILE.h5, FILE.hdf5 (MVSEC, DSEC, M3ED)", open_hdf5, (".h5", ".hdf5"))

@@ -22,8 +22,8 @@ import numpy as np
 from neurove_core.geometry.motion import Poses, Twists
 from neurove_core.io.errors import BrokenRecording
 from neurove_core.io.formats.hdf5.file import Column, dataset, has, opened, value
+from neurove_core.io.formats.hdf5.poses import stored_poses, table
 from neurove_core.io.formats.hdf5.tables import EventTable, ImuTable, TableRecording, seek_indexed
-from neurove_core.io.poses import stored_poses, table
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor

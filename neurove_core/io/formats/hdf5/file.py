@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from neurove_core.extras import MissingExtra
 from neurove_core.io.errors import BrokenRecording, UnknownSource
-from neurove_core.io.recording import SUPPORTED
 
 MAX_CHUNK_BYTES: Final = 64 << 20
 """Largest chunk that a data set may be stored in: HDF5 unpacks a chunk as a whole, so this bounds the memory."""
@@ -38,7 +37,7 @@ def opened(path: Path) -> Iterator[Any]:
     with path.open("rb") as file:
         head = file.read(len(_MAGIC))
     if not head or not _MAGIC.startswith(head):
-        raise UnknownSource(path, SUPPORTED, "the file does not begin as HDF5 does")
+        raise UnknownSource(path, "the file does not begin as HDF5 does")
     try:
         opened_file = h5py.File(path, "r", rdcc_nbytes=_CACHE_BYTES, locking="best-effort")
     except FAULTS as error:

@@ -20,8 +20,8 @@ from neurove_core.geometry import rotations
 from neurove_core.geometry.motion import Poses
 from neurove_core.io.errors import BrokenRecording
 from neurove_core.io.formats.hdf5.file import Column, dataset, has, opened, value
+from neurove_core.io.formats.hdf5.poses import m3ed_poses
 from neurove_core.io.formats.hdf5.tables import EventTable, ImuTable, TableRecording, chosen_topic, seek_indexed
-from neurove_core.io.poses import m3ed_poses
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor

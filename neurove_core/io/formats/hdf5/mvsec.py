@@ -18,8 +18,8 @@ from neurove_core.geometry import rotations
 from neurove_core.geometry.motion import Poses
 from neurove_core.io.errors import BrokenRecording
 from neurove_core.io.formats.hdf5.file import Column, dataset, has, opened, read_rows
+from neurove_core.io.formats.hdf5.poses import mvsec_odometry
 from neurove_core.io.formats.hdf5.tables import EventTable, ImuTable, TableRecording, chosen_topic
-from neurove_core.io.poses import mvsec_odometry
 from neurove_core.io.recording import Frame
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.events import Sensor

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from neurove_core.geometry.motion import Twists, twists
 from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.formats.hdf5.file import FAULTS, Column, opened, read_rows
-from neurove_core.io.recording import CHUNK_EVENTS, SUPPORTED, EventsOnly, Imu, later
+from neurove_core.io.recording import CHUNK_EVENTS, EventsOnly, Imu, later
 from neurove_protocol.events import Events, Sensor
 
 _MAX_T_US = 1 << 62
@@ -229,5 +229,5 @@ def chosen_topic(path: Path, topics: tuple[str, ...], topic: str | None) -> str:
     """
     wanted = topic.strip("/") if topic is not None else next(iter(topics), "")
     if wanted not in topics:
-        raise UnknownSource(path, SUPPORTED, f"it has no event stream {wanted!r}; it has {', '.join(topics) or 'none'}")
+        raise UnknownSource(path, f"it has no event stream {wanted!r}; it has {', '.join(topics) or 'none'}")
     return wanted

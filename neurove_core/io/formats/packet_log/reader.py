@@ -10,10 +10,11 @@ import numpy as np
 from neurove_core.geometry.motion import Poses, Twists
 from neurove_core.io.checked import checked
 from neurove_core.io.errors import BrokenRecording, UnknownSource
+from neurove_core.io.format import Format
 from neurove_core.io.formats.containers.mcap import McapFile, Record
 from neurove_core.io.formats.packet_log import layout
-from neurove_core.io.formats.packet_log.layout import BadColumns
-from neurove_core.io.recording import SUPPORTED, EventsOnly, Frame, Imu, Triggers, later
+from neurove_core.io.formats.packet_log.layout import PROFILE, BadColumns
+from neurove_core.io.recording import EventsOnly, Frame, Imu, Triggers, later
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.events import EventPacket, Events, PacketLimits, Sensor, decode_packet
@@ -61,14 +62,14 @@ class McapRecording(EventsOnly):
         wanted = topic.removesuffix("/events") if topic is not None else None
         if not streams or wanted not in (None, *streams):
             why = f"no stream {wanted!r}; its streams are {', '.join(streams)}" if streams else "it holds no stream"
-            raise UnknownSource(path, SUPPORTED, why)
+            raise UnknownSource(path, why)
         name = path.name if wanted is None else f"{path.name} ({wanted})"
         if wanted is None and len(streams) > 1:
             name = f"{path.name} ({streams[0]}, the first of {len(streams)} streams)"
         stream = wanted or streams[0]
         first = next(file.records((f"{stream}/events",)), None)
         if first is None:
-            raise UnknownSource(path, SUPPORTED, f"its stream {stream} has no packet")
+            raise UnknownSource(path, f"its stream {stream} has no packet")
         return cls(path, name, sensor or _decoded(path, first).sensor, stream, file)
 
     @property
@@ -192,3 +193,13 @@ def _decoded(path: Path, record: Record) -> EventPacket:
 
 def _begins_us(packet: EventPacket) -> int:
     return int(packet.events.t[0]) if packet.events.n else packet.t0_us
+
+
+def _accepts(path: Path) -> bool:
+    """Whether this is an .mcap file with our profile."""
+    return path.is_file() and McapFile.open(path).profile == PROFILE
+
+
+FORMAT = Format(
+    "FILE.mcap (our own, from `neurove record` and `neurove convert`)", McapRecording.open, (".mcap",), _accepts
+)

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from neurove_core.io.clock import count_on
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
+from neurove_core.io.format import Format
 from neurove_core.io.formats.prophesee.raw import HEADER_BYTES, parse_header
-from neurove_core.io.recording import BLOCK_BYTES, SUPPORTED, EventsOnly, Triggers, in_chunks, later, whole
+from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Triggers, in_chunks, later, refuse_topic, whole
 from neurove_protocol.errors import EventOutsideSensor, TimeBackwards
 from neurove_protocol.events import Events, Sensor, check_events
 
@@ -52,7 +53,7 @@ class DatRecording(EventsOnly):
             raise BrokenRecording(path, f"byte {len(head)}", "the file ends within its header")
         kind, size = kind_and_size
         if kind not in _EVENTS + _TRIGGERS or size != RECORD.itemsize:
-            raise UnknownSource(path, SUPPORTED, f"its records are of type 0x{kind:02x} and {size} bytes")
+            raise UnknownSource(path, f"its records are of type 0x{kind:02x} and {size} bytes")
         sensor = sensor or header.sensor
         if sensor is None:
             raise MissingGeometry(path)
@@ -134,3 +135,11 @@ class DatRecording(EventsOnly):
                 at += records.nbytes
                 if len(block) % RECORD.itemsize:
                     raise BrokenRecording(self.path, f"byte {at}", "the file ends within a record")
+
+
+def _open(path: Path, sensor: Sensor | None, topic: str | None) -> DatRecording:
+    refuse_topic(path, topic)
+    return DatRecording.open(path, sensor)
+
+
+FORMAT = Format("FILE.dat (Prophesee DAT)", _open, (".dat",))

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
+from neurove_core.io.format import Format
 from neurove_core.io.formats.prophesee import evt, triggers
-from neurove_core.io.recording import BLOCK_BYTES, CHUNK_EVENTS, SUPPORTED, EventsOnly, Triggers, empty_events
+from neurove_core.io.recording import BLOCK_BYTES, CHUNK_EVENTS, EventsOnly, Triggers, empty_events, refuse_topic
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
 
@@ -113,7 +114,7 @@ class PropheseeRecording(EventsOnly):
             header = parse_header(path, file.read(HEADER_BYTES))
         if header.format not in FORMATS:
             why = f"its words are {header.format}" if header.format else "its header names no word format"
-            raise UnknownSource(path, SUPPORTED, why)
+            raise UnknownSource(path, why)
         sensor = sensor or header.sensor
         if sensor is None:
             raise MissingGeometry(path)
@@ -183,3 +184,11 @@ class PropheseeRecording(EventsOnly):
         if verdict == evt.OUTSIDE:
             return f"an event at x={out.x[n]} y={out.y[n]} lies outside the sensor {self.sensor}"
         return self._unknown(word)
+
+
+def _open(path: Path, sensor: Sensor | None, topic: str | None) -> PropheseeRecording:
+    refuse_topic(path, topic)
+    return PropheseeRecording.open(path, sensor)
+
+
+FORMAT = Format("FILE.raw (Prophesee EVT2, EVT3)", _open, (".raw",))

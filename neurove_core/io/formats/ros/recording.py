@@ -12,13 +12,14 @@ from neurove_core.geometry import motion
 from neurove_core.geometry.motion import Poses, Twists
 from neurove_core.io.checked import checked
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
+from neurove_core.io.format import Format
 from neurove_core.io.formats.containers.bags import BagFile, BagFolder, BagMessage, SqliteBag, in_recorded_order
 from neurove_core.io.formats.containers.mcap import McapFile
 from neurove_core.io.formats.containers.ros1 import Ros1Bag
 from neurove_core.io.formats.ros import messages
 from neurove_core.io.formats.ros.events import UNIX_TIME, Anchor, Decoder
 from neurove_core.io.formats.ros.messages import BadMessage, EventMessage
-from neurove_core.io.recording import SUPPORTED, EventsOnly, Imu, Triggers, later
+from neurove_core.io.recording import EventsOnly, Imu, Triggers, later
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
@@ -50,7 +51,7 @@ def open_bag(path: Path) -> BagFile:
         case ".mcap":
             return McapFile.open(path)
         case suffix:
-            raise UnknownSource(path, SUPPORTED, f"no bag has the suffix {suffix!r}")
+            raise UnknownSource(path, f"no bag has the suffix {suffix!r}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +88,7 @@ class RosbagRecording(EventsOnly):
         if not topics or topic not in (None, *topics):
             known = ", ".join(topics or sorted(bag.topics)) or "none"
             what = f"topic {topic!r} has no events; topics with events are" if topics else "no topic has events; it has"
-            raise UnknownSource(path, SUPPORTED, f"{what} {known}")
+            raise UnknownSource(path, f"{what} {known}")
         name = path.resolve().name
         if topic is not None:
             name = f"{name} ({topic})"
@@ -234,26 +235,9 @@ class RosbagRecording(EventsOnly):
         topic = self._beside(*POSE_TYPES)
         if topic is None:
             return None
-        offset_us = self.ros_offset_us
         read = messages.odometry if self.bag.topics[topic] == "nav_msgs/Odometry" else messages.pose
-        samples: list[messages.PoseSample] = []
-        for message in self.bag.messages((topic,)):
-            sample = self._read(message, read)
-            if samples and sample.stamp_ns // 1000 <= samples[-1].stamp_ns // 1000:
-                if sample.stamp_ns < samples[-1].stamp_ns:
-                    raise BrokenRecording(self.path, message.where, "time runs backwards")
-                continue
-            length = float(np.linalg.norm(sample.orientation))
-            if not (abs(length - 1) < 1e-2 and np.isfinite(sample.position_m).all()):  # so written that nan fails
-                why = f"position {sample.position_m} and orientation {sample.orientation} are no pose"
-                raise BrokenRecording(self.path, message.where, why)
-            samples.append(sample)
-        if not samples:
-            return None
-        t = np.array([sample.stamp_ns for sample in samples]) // 1000 - offset_us
-        orientation = np.array([sample.orientation for sample in samples])
-        orientation /= np.linalg.norm(orientation, axis=1, keepdims=True)
-        return Poses(t, np.array([sample.position_m for sample in samples]), orientation)
+        found = ((message.where, self._read(message, read)) for message in self.bag.messages((topic,)))
+        return _poses(self.path, found, self.ros_offset_us)
 
     def twists(self) -> Twists | None:
         """How the tracked body moved, by its poses; None where these are too few. See `geometry.twists`."""
@@ -286,7 +270,7 @@ def _first(path: Path, bag: BagFile, topic: str) -> EventMessage:
         except BadMessage as why:
             raise BrokenRecording(path, message.where, str(why)) from None
         return parsed._replace(data=memoryview(b""))
-    raise UnknownSource(path, SUPPORTED, f"its topic {topic} has no message")
+    raise UnknownSource(path, f"its topic {topic} has no message")
 
 
 def _in_common(one: str, other: str) -> int:
@@ -295,7 +279,45 @@ def _in_common(one: str, other: str) -> int:
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
+def _poses(path: Path, found: Iterator[tuple[str, messages.PoseSample]], offset_us: int) -> Poses | None:
+    """The poses of some messages, each with its place in the file; None if there are none."""
+    samples: list[messages.PoseSample] = []
+    for where, sample in found:
+        if samples and sample.stamp_ns // 1000 <= samples[-1].stamp_ns // 1000:
+            if sample.stamp_ns < samples[-1].stamp_ns:
+                raise BrokenRecording(path, where, "time runs backwards")
+            continue
+        length = float(np.linalg.norm(sample.orientation))
+        if not (abs(length - 1) < 1e-2 and np.isfinite(sample.position_m).all()):  # written so that nan fails
+            why = f"position {sample.position_m} and orientation {sample.orientation} are not a pose"
+            raise BrokenRecording(path, where, why)
+        samples.append(sample)
+    if not samples:
+        return None
+    t = np.array([sample.stamp_ns for sample in samples]) // 1000 - offset_us
+    orientation = np.array([sample.orientation for sample in samples])
+    orientation /= np.linalg.norm(orientation, axis=1, keepdims=True)
+    return Poses(t, np.array([sample.position_m for sample in samples]), orientation)
+
+
 def _imu(samples: list[messages.ImuSample], offset_us: int) -> Imu:
     t = np.array([sample.stamp_ns for sample in samples]) // 1000 - offset_us
     accel = np.array([sample.accel_m_s2 for sample in samples])
     return Imu(t, accel, np.array([sample.gyro_rad_s for sample in samples]))
+
+
+def _accepts(path: Path) -> bool:
+    """Whether this is a bag; the metadata.yaml of a folder is missing if its recorder was killed."""
+    if path.is_file():
+        return path.suffix.lower() in (".bag", ".db3", ".mcap")
+    if (path / "events.txt").is_file():
+        return False
+    return any(
+        one.name == "metadata.yaml" or one.name.endswith((".db3", ".mcap", ".db3.zstd", ".mcap.zstd"))
+        for one in path.iterdir()
+    )
+
+
+FORMAT = Format(
+    "FILE.bag (ROS 1), FILE.db3, FILE.mcap or a folder of them (ROS 2)", RosbagRecording.open, accepts=_accepts
+)
