@@ -299,7 +299,7 @@ def test_a_finished_run_goes_on_for_another_cycle_as_if_it_had_been_planned(fold
     at_once = bundle.load(train(planned, tmp_path / "planned", folder))
     train(TINY, tmp_path / "longer", folder)
     longer_run = bundle.load(train(planned, tmp_path / "longer", folder, resume=True))
-    assert longer_run.about.made_by.updates == 2 * TINY.recipe.steps
+    assert longer_run.metadata.made_by.updates == 2 * TINY.recipe.steps
     weights = longer_run.network.state_dict()
     assert all(torch.equal(tensor, weights[name]) for name, tensor in at_once.network.state_dict().items())
     with pytest.raises(BadModel, match="recipe.cycles=2, the configuration says 1"):
