@@ -47,7 +47,7 @@ def test_least_primed_is_the_first_number_of_windows_within_the_bound(results):
     assert results.least_primed == (within[0] if within else None)
 
 
-def test_the_report_are_written_as_tables_json_and_figure(results, tmp_path):
+def test_the_results_are_written_as_tables_json_and_figure(results, tmp_path):
     files = repriming.save(results, tmp_path)
     assert {file.name for file in files} == {f"repriming.{kind}" for kind in ("json", "md", "png", "svg")}
     written = json.loads((tmp_path / "repriming.json").read_text())

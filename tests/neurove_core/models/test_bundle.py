@@ -141,7 +141,7 @@ def test_inserted_or_overwritten_bytes_are_refused_or_make_another_model(where, 
 
 
 @given(st.binary(max_size=300))
-def test_any_bytes_are_refused(data):
+def test_random_bytes_are_refused(data):
     refusal(data)
     refusal(join_header(data))
 

@@ -210,7 +210,7 @@ def test_a_huge_signature_file_is_refused_before_it_is_parsed():
     ],
     ids=range(13),
 )
-def test_a_manifest_that_is_none_is_refused_even_if_it_was_signed(signature, words):
+def test_an_invalid_manifest_is_refused_even_with_a_valid_signature(signature, words):
     assert words in refusal("malformed", signature=signature)
 
 
