@@ -9,7 +9,8 @@ import pytest
 
 from neurove_core.extras import MissingExtra
 from neurove_core.geometry import motion
-from neurove_core.io import BrokenRecording, UnknownSource, poses
+from neurove_core.io import BrokenRecording, UnknownSource
+from neurove_core.io.formats import pose_files
 from neurove_core.io.formats.pose_files import read_poses
 from neurove_protocol.errors import InvalidField
 from tests.builders import make_events
@@ -152,7 +153,7 @@ def test_a_unit_does_not_depend_on_where_a_long_file_is_cut(tmp_path):
 
 
 def test_more_poses_than_fit_are_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(poses, "MAX_POSES", 10)
+    monkeypatch.setattr(pose_files, "MAX_POSES", 10)
     with pytest.raises(InvalidField, match="at most 10"):
         read_poses(put(tmp_path, "".join(f"{i} 0 0 0 0 0 0 1\n" for i in range(11))))
 
