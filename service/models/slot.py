@@ -170,5 +170,5 @@ def _kept(library: Library, digest: str) -> Bundle | None:
     try:
         return library.find(digest)
     except (BadModel, UnknownModel) as error:
-        log.warning("cannot load the last active model", digest=digest, why=error.message)
+        log.warning("cannot restore the last active model", digest=digest, why=error.message)
         return None

@@ -205,7 +205,7 @@ class Service:
         if active is None:
             return None, None
         if active.configured != self._config.model:
-            log.info("configured model takes precedence over the last active model", model=self._config.model)
+            log.info("configured model is newer than the last active one", model=self._config.model)
             return None, None
         try:
             self._store.signed(active.digest)

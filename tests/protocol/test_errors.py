@@ -67,7 +67,7 @@ ERRORS: list[NeuroVEError] = [
     Diverged("spire-8", "divergence", 2.34567, 1.0),
     Diverged("spire-8", "fault", "not finite", "none"),
     NothingBefore(),
-    RolledBack("spire-8 was rolled back by itself: stream cam0: divergence 4, the bound is 3"),
+    RolledBack("spire-8 was rolled back automatically: stream cam0: divergence 4, the bound is 3"),
 ]
 every_error = pytest.mark.parametrize("error", ERRORS, ids=lambda error: error.code)
 

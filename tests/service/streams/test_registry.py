@@ -65,7 +65,7 @@ def test_each_stream_gets_a_worker_and_its_own_estimates(make, network):
 def test_a_camera_info_before_the_first_packet_calibrates_it(make, network):
     registry = make()
     camera = CameraInfo(stream="cam0", width=64, height=48, lens="pinhole", fx=40, fy=40, cx=32, cy=24)
-    registry.put_camera("cam0", camera.encode(), 1)
+    registry.put_camera("cam0", camera.encode(), time.monotonic_ns())
     put(registry, "cam0")
     wait_until(lambda: len(network.estimates) == 2)
     assert not any("uncalibrated" in one.flags for one in network.estimates)
