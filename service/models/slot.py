@@ -302,7 +302,7 @@ class ModelSlot:
         tell("priming", f"{len(self._streams(canary))} streams")
         plan = self._plan
         promoted = plan.phase == "canary"
-        if plan.active.estimator.cuts_like(candidate.estimator):
+        if plan.active.estimator.has_same_windows(candidate.estimator):
             with self._turn:
                 beside = Plan(plan.active, candidate, canary, "priming")
                 self._set(plan._replace(promoting=True) if promoted else beside, self.last_change)

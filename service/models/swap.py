@@ -115,7 +115,7 @@ def prime(
 
 def _worker_primes(serving: Serving, stream: Subject) -> bool:
     front = stream.lanes.front
-    return stream.flowing and front is not None and front.estimator.cuts_like(serving.estimator)
+    return stream.flowing and front is not None and front.estimator.has_same_windows(serving.estimator)
 
 
 def _at_its_end(serving: Serving, stream: Subject, *, late: bool) -> bool:

@@ -200,6 +200,6 @@ class Beside:
             return self.lane.follow([owed.window()], checked=True)
         self._owed_events -= owed.events.n
         state = self.lane.state
-        pushed = self.lane.estimator.cut(owed.events, state, owed.t0_us)
+        pushed = self.lane.estimator.to_windows(owed.events, state, owed.t0_us)
         self.lane.state = state._replace(windows=pushed.state)
         return self.lane.follow(pushed.windows, checked=True)

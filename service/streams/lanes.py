@@ -95,7 +95,7 @@ class Lanes:
             the lane, or None where the stream is at rest or cuts otherwise than the model.
         """
         front, about, ring = self.front, self._about, self._ring
-        if front is None or about is None or not front.estimator.cuts_like(serving.estimator):
+        if front is None or about is None or not front.estimator.has_same_windows(serving.estimator):
             return None
         if before is None or before.ring is not ring:
             return Primed(
@@ -138,7 +138,7 @@ class Lanes:
         """
         front, beside = self.front, self.beside
         assert front is not None, "arrange comes first"
-        cut = self._cut or front.estimator.cut(packet.events, front.state, packet.t0_us)
+        cut = self._cut or front.estimator.to_windows(packet.events, front.state, packet.t0_us)
         front.state = front.state._replace(windows=cut.state)
         try:
             answers = front.follow(cut.windows, checked=beside is not None)
@@ -190,7 +190,7 @@ class Lanes:
         """Another model answers from here on: windows up to here are the old one's, all later ones the new one's."""
         new = self._lane(roles.answers, packet)
         self.front = new
-        if new.estimator.cuts_like(old.estimator):
+        if new.estimator.has_same_windows(old.estimator):
             new.state = new.state._replace(windows=old.state.windows)
             return 0
         open_us = old.state.windows.start_us
@@ -209,7 +209,7 @@ class Lanes:
                 self.attend()
             if not beside.lost:
                 return beside.lane
-        if not self.front.estimator.cuts_like(serving.estimator):
+        if not self.front.estimator.has_same_windows(serving.estimator):
             return _from_here(serving, packet, about) if self.front.next_us is not None else _at_rest(serving, about)
         offered = self._taken(serving)
         if offered is not None:
@@ -239,7 +239,7 @@ class Lanes:
         assert self._about is not None
         if old.estimator is wanted.estimator:
             lane, replayed = old, list[Packed]()
-        elif not self.front.estimator.cuts_like(wanted.estimator):
+        elif not self.front.estimator.has_same_windows(wanted.estimator):
             return Beside(self._lane(wanted, packet), alike=False)
         elif (offered := self._taken(wanted)) is not None:
             lane, replayed = offered, self._ring.after(offered.state.end_us)
@@ -248,7 +248,7 @@ class Lanes:
                 _at_rest(wanted, self._about),
                 self._ring.newest(windows_to_prime(wanted.estimator)),
             )
-        alike = lane.estimator.cuts_like(self.front.estimator)
+        alike = lane.estimator.has_same_windows(self.front.estimator)
         if alike:
             lane.state = lane.state._replace(windows=WindowsState())
         return Beside(lane, alike=alike, replayed=replayed)
