@@ -178,11 +178,11 @@ class Engine:
         self, rows: Tensor | Array, steps: int, state: NetworkState
     ) -> tuple[Tensor, tuple[ASLSTMState, ...], Tensor]:
         x: Array = rows.numpy() if isinstance(rows, Tensor) else rows
-        carried = torch.stack([field for cell in state.cells for field in cell])  # (3 L, B, N): c, v, s of each layer
+        stacked = torch.stack([field for cell in state.cells for field in cell])  # (3 L, B, N): c, v, s of each layer
         y = state.readout.clone()
         answers = np.empty((steps, *y.shape), np.float32)
-        run_cells(x, self._weights, self._features_inside, self._constants, carried.numpy(), y.numpy(), answers)
-        fields = carried.unbind()
+        run_cells(x, self._weights, self._features_inside, self._constants, stacked.numpy(), y.numpy(), answers)
+        fields = stacked.unbind()
         cells = tuple([ASLSTMState(*fields[i : i + 3]) for i in range(0, len(fields), 3)])
         return torch.from_numpy(answers[..., : 6 * self._bins].reshape(steps, -1, self._bins, 6)), cells, y
 

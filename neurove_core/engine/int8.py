@@ -1,4 +1,4 @@
-"""Convolutions and projection in 8-bit integers, for networks whose bundle asks for them: equal to float32 bit for bit.
+"""Convolutions and projection in 8-bit integers, for networks with precision int8; equal to float32 bit for bit.
 
     precision = "int8": the weights of every convolution and of the projection are integer multiples q of a step per
     output channel, |q| <= 127, and the network's input is rounded to 1/32. Spikes are 0 or 1.
