@@ -1,10 +1,10 @@
-"""What only an extra of this package brings, and how its absence is told."""
+"""The error for a library that only an optional extra of this package installs."""
 
 from neurove_protocol.errors import NeuroVEError
 
 
 class MissingExtra(NeuroVEError):
-    """A library that this needs, and that the plain package does without, is not installed."""
+    """An optional library is needed and not installed."""
 
     code = "missing_extra"
 

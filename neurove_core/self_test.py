@@ -1,34 +1,31 @@
-"""A model's self-test: run its golden windows through this machine's estimator and compare."""
+"""Self-test of a model: run its golden windows through the estimator on this machine and compare the estimates."""
 
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurove_core.config import ModelConfig
+from neurove_core.estimator import Estimator
+from neurove_core.models.golden import TOLERANCE, Golden
 from neurove_protocol import Events, Sensor
 from neurove_protocol.errors import BadModel
 
-if TYPE_CHECKING:  # an estimator has a bundle, and a bundle a golden test
-    from neurove_core.config import ModelConfig
-    from neurove_core.estimator import Estimator
-from neurove_core.models.golden import TOLERANCE, Golden
-
-_INT8_GREW: Final = "; an int8 model made before the projection was in int8 too may answer otherwise (decision 38)"
-
+_INT8_GREW: Final = "; an int8 model made before the projection was int8 too may give other estimates (decision 38)"
 
 _AXES: Final = ("vx", "vy", "vz", "wx", "wy", "wz")
 
 
-def check(estimator: "Estimator") -> None:
-    """Push the golden windows of a model through it and compare; a model without them passes.
+def check(estimator: Estimator) -> None:
+    """Run the golden windows of a model and compare the estimates; a model without golden windows passes.
 
-    They go the way of a camera's events: through windows, encoding and engine.
+    The windows are processed like a camera's events: by windowing, encoding and engine.
 
     Args:
-        estimator: of the model; no state of it is touched.
+        estimator: estimator of the model; none of its streams is affected.
 
     Raises:
-        BadModel: an answer is off by more than the tolerance, or not finite; window, bin and axis are named.
+        BadModel: an estimate differs by more than the tolerance, or is not finite; window, bin and axis are named.
     """
     golden = estimator.bundle.golden
     if golden is None:
@@ -41,32 +38,29 @@ def check(estimator: "Estimator") -> None:
     if off[window, bin_, axis] > 1:
         raise BadModel(
             estimator.bundle.name,
-            f"golden test: window {window}, bin {bin_}: {_AXES[axis]}={got[window, bin_, axis]:.6g}, where its maker "
-            f"had {want[window, bin_, axis]:.6g}; the tolerance is {allowed[axis]:.2g}"
+            f"golden test: window {window}, bin {bin_}: {_AXES[axis]}={got[window, bin_, axis]:.6g}, expected "
+            f"{want[window, bin_, axis]:.6g}; the tolerance is {allowed[axis]:.2g}"
             + (_INT8_GREW if estimator.config.network.precision == "int8" else ""),
         )
 
 
-def record(estimator: "Estimator", counts: NDArray[np.uint8], tolerance: float = TOLERANCE) -> Golden:
-    """The golden test that these windows make with this model.
+def record(estimator: Estimator, counts: NDArray[np.uint8], tolerance: float = TOLERANCE) -> Golden:
+    """The golden test of a model with these windows.
 
     Args:
-        estimator: of the model as it will be saved.
+        estimator: estimator of the model as it will be saved.
         counts: (T, 2n, H, W) consecutive windows.
         tolerance: see `Golden`.
     """
     return Golden(counts, answers(estimator, counts).astype(np.float32), tolerance)
 
 
-def answers(estimator: "Estimator", counts: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """What a model answers to windows (T, 2n, H, W), from a state at rest: (T, n, 6)."""
+def answers(estimator: Estimator, counts: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Twists (T, n, 6) of a model for windows (T, 2n, H, W), from the zero state."""
     config = estimator.config
-    sensor = Sensor(config.canonical.width, config.canonical.height)  # scaled plainly onto a grid of its own size
-    at_rest = estimator.initial_state(sensor)
-    state, twists = (
-        estimator.push(Events.empty(), at_rest, 0).state,
-        [],
-    )  # windows begin at 0, the first one may be empty
+    sensor = Sensor(config.canonical.width, config.canonical.height)  # each pixel is one cell of the grid
+    state = estimator.push(Events.empty(), estimator.initial_state(sensor), 0).state  # windows begin at time 0
+    twists = []
     for index, window in enumerate(counts):
         events = _events(window, index * config.window.duration_us, config)
         answer = estimator.push(events, state, (index + 1) * config.window.duration_us)
@@ -75,8 +69,8 @@ def answers(estimator: "Estimator", counts: NDArray[np.uint8]) -> NDArray[np.flo
     return np.stack(twists)
 
 
-def _events(counts: NDArray[np.uint8], start_us: int, config: "ModelConfig") -> Events:
-    """Events that are counted as these counts (2n, H, W): all of a bin at its beginning."""
+def _events(counts: NDArray[np.uint8], start_us: int, config: ModelConfig) -> Events:
+    """Events that give these counts (2n, H, W), all at the beginning of their bins."""
     channel, y, x = np.nonzero(counts)
     times = counts[channel, y, x]
     columns: list[NDArray[Any]] = [start_us + channel // 2 * config.window.bin_us, x, y, channel % 2]

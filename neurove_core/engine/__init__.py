@@ -1,1 +1,1 @@
-"""The fast path: a network's inference in compiled code. README.md lists each form with its reference and its test."""
+"""The fast path of inference: NeuroVE on a CPU, equal to the plain PyTorch path; README.md lists each fast form."""

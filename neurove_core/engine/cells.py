@@ -1,4 +1,4 @@
-"""The compiled pass from the last feature map to the twists: ASLSTM layers and readout."""
+"""The compiled pass from the last feature map to the twists: projection, ASLSTM layers and readout."""
 
 import numpy as np
 import torch
@@ -13,16 +13,17 @@ Array = NDArray[np.float32]
 
 
 def copied_params(params: ASLSTMParams) -> ASLSTMParams:
-    """A copy of a cell's weights that later changes of the network do not reach."""
+    """A copy of a cell's weights, independent of later changes of the network."""
     w_x, w_v, b, d_time = (tensor.detach().clone() for tensor in (params.w_x, params.w_v, params.b, params.d_time))
     return ASLSTMParams(w_x, w_v, b, d_time, params.alpha, params.v_th)
 
 
 def flattened_weights(project: Folded | None, cells: list[ASLSTMParams], d_space: Tensor, readout: Folded) -> Array:
-    """All weights of the compiled pass in one vector, in the order in which `run_cells` takes them off it.
+    """All weights of the compiled pass in one vector, in the order in which `run_cells` reads them.
 
-    Matrices are transposed, so that a row is what one input gives to all outputs; one array is handed over in a few
-    microseconds, twenty would take longer than a layer. A projection of its own is none of it.
+    Matrices are transposed, so that a row has the weights of one input to all outputs. Passing one array to compiled
+    code takes a few microseconds; twenty arrays would take longer than a layer. `project` is None where the rows are
+    projected elsewhere.
     """
     tensors = [project.weight.T, project.bias] if project else []
     for params, d in zip(cells, d_space, strict=True):
@@ -35,8 +36,8 @@ def flattened_weights(project: Folded | None, cells: list[ASLSTMParams], d_space
 def _add_product(x, w, out):  # type: ignore[no-untyped-def]  # compiled for its arguments
     """Out (R, J) += x (R, I) w (I, J), four rows of w at a time, each read once for all R.
 
-    Rows of w that no x asks for are not read: where weights come from far memory, that is most of the time. Every
-    out[r, j] is summed in the order of I, whatever the width of the machine's vectors.
+    Rows of w whose inputs are all 0 are not read, because reading weights from main memory takes most of the time.
+    Every out[r, j] is summed in the order of I, for any width of the machine's vectors.
     """
     rows, inputs = x.shape
     active = np.empty(inputs, np.int64)
@@ -66,24 +67,24 @@ def _add_product(x, w, out):  # type: ignore[no-untyped-def]  # compiled for its
 
 @fused
 def _matrix(weights, at, rows, columns):  # type: ignore[no-untyped-def]  # compiled for its arguments
-    """The next matrix of the vector of weights, and where the one after it begins."""
+    """The next matrix of the vector of weights, and the index behind it."""
     end = at + rows * columns
     return weights[at:end].reshape(rows, columns), end
 
 
 @fused
 def _rows_of(bias, rows):  # type: ignore[no-untyped-def]  # compiled for its arguments
-    """Rows of a bias, to add products to."""
+    """Copies of a bias as rows, to which products are added."""
     out = np.empty((rows, bias.size), bias.dtype)
     for r in range(rows):
-        for j in range(bias.size):  # assigning a whole row would take seconds to compile
+        for j in range(bias.size):  # assigning a row at once would take seconds to compile
             out[r, j] = bias[j]
     return out
 
 
 @fused
 def _layer(x, weights, at, c, v, s, alpha, v_th):  # type: ignore[no-untyped-def]  # compiled for its arguments
-    """One ASLSTM layer over a sequence: inputs (T * B, I) to what goes up (T * B, N); c, v, s (B, N) move on."""
+    """One ASLSTM layer over a sequence: inputs (T * B, I) to outputs (T * B, N); updates c, v, s (B, N) in place."""
     rows, inputs = x.shape
     batch, hidden = c.shape
     one, none = c.dtype.type(1), c.dtype.type(0)
@@ -103,7 +104,7 @@ def _layer(x, weights, at, c, v, s, alpha, v_th):  # type: ignore[no-untyped-def
         _add_product(v, w_v, gates)
         for b in range(batch):
             for j in range(2 * hidden, 3 * hidden):
-                gates[b, j] += gates[b, j]  # tanh(g) = 2 sigmoid(2 g) - 1: one pass for all gates
+                gates[b, j] += gates[b, j]  # tanh(g) = 2 sigmoid(2 g) - 1, so that one pass computes all gates
         sigmoid(gates, one, True)
         for b in range(batch):
             for j in range(hidden):
@@ -123,13 +124,13 @@ def _layer(x, weights, at, c, v, s, alpha, v_th):  # type: ignore[no-untyped-def
 
 
 @fused
-def run_cells(rows, weights, features, constants, carried, y, answers):  # type: ignore[no-untyped-def]  # compiled for its arguments
-    """From the last map's spikes (T * B, cells of it) to answers (T, B, R); features 0: rows are projected already.
+def run_cells(rows, weights, features, constants, state, y, answers):  # type: ignore[no-untyped-def]  # compiled for its arguments
+    """From the last map's spikes (T * B, I), or with features 0 from their projection, to outputs (T, B, R).
 
-    The carried c, v, s of each layer (3 L, B, N) and the potentials y (B, R) of the readout move on in place.
+    The state c, v, s of each layer (3 L, B, N) and the potentials y (B, R) of the readout are updated in place.
     """
     steps, batch, outputs = answers.shape
-    layers, _, hidden = carried.shape
+    layers, _, hidden = state.shape
     alpha, v_th, kappa = constants
     x, at = rows, 0
     if features:
@@ -138,7 +139,7 @@ def run_cells(rows, weights, features, constants, carried, y, answers):  # type:
         x = _rows_of(bias[0], steps * batch)
         _add_product(rows, project, x)
     for layer in range(0, layers, 3):
-        x, at = _layer(x, weights, at, carried[layer], carried[layer + 1], carried[layer + 2], alpha, v_th)
+        x, at = _layer(x, weights, at, state[layer], state[layer + 1], state[layer + 2], alpha, v_th)
     readout, at = _matrix(weights, at, hidden, outputs)
     bias, at = _matrix(weights, at, 1, outputs)
     from_x = _rows_of(bias[0], steps * batch)

@@ -1,22 +1,26 @@
-"""NeuroVE as the service runs it: the norms folded into the weights, each part in its fastest form, same state.
+"""The engine: NeuroVE as the service runs it. Norms are folded into the weights, each part runs in its fastest form.
 
     Engine(network)(spikes, state) -> (twists, state)
 
-is what the network in evaluation mode computes, up to rounding: folding a norm moves the last bits of a current, and a
-spike that hangs on them. What holds bit for bit is tested against the engine inside `neurons.plain()`: the same folded
-weights through `lif_step`, `aslstm_step` and `readout_step`. State goes to and fro between all of them. Convolutions
-and projection are sums over the neurons that fired where widths allow it (sparse.py, sparse_int8.py), else dense.
+This equals the network in evaluation mode up to rounding: folding a norm moves the last bits of a current, and a spike
+may depend on these. The engine inside `plain()` is the reference implementation: the same folded weights through
+`lif_step`, `aslstm_step` and `readout_step`. Tests compare the spikes of both bit for bit. A state may pass between
+network, engine and reference. Convolutions and projection run over spike lists where the widths allow it (sparse.py,
+sparse_int8.py), else dense. README.md in this folder lists every fast form with its reference implementation.
 """
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import linear
 
-from neurove_core.engine import int8, sparse, spike_lists
 from neurove_core.engine.cells import Array, copied_params, flattened_weights, run_cells
+from neurove_core.engine.convolution import Convolution
+from neurove_core.engine.encoding import CountInput
+from neurove_core.engine.fallback import vectors_work
 from neurove_core.engine.folding import (
     Folded,
     folded,
@@ -25,6 +29,8 @@ from neurove_core.engine.folding import (
     int8_layer,
     int8_projection,
 )
+from neurove_core.engine.int8 import Int8Extractor, Int8Projection
+from neurove_core.engine.spike_lists import SpikeList, to_maps
 from neurove_core.networks.neurove import NetworkState, NeuroVE, SpikingBlock
 from neurove_core.spiking.alif import diffuse
 from neurove_core.spiking.aslstm import ASLSTM, ASLSTMState, aslstm_step
@@ -33,12 +39,15 @@ from neurove_core.spiking.lif import LIFParams, LIFState, lif_scan_reference
 from neurove_core.spiking.plain import is_plain
 from neurove_core.spiking.readout import readout_step
 
+if TYPE_CHECKING:  # it needs the vector code, which may not work with this numba
+    from neurove_core.engine.sparse import SparseExtractor
+
 
 class Engine:
-    """The inference of one network; holds no stream's state and is safe to share between threads.
+    """Inference of one network. It holds no stream's state and is safe to share between threads.
 
     Args:
-        network: in float32 on the CPU; its weights are copied, later changes of them are not seen.
+        network: in float32 on the CPU. Its weights are copied; later changes have no effect.
     """
 
     def __init__(self, network: NeuroVE) -> None:
@@ -48,44 +57,42 @@ class Engine:
         sizes = [(grid.height, grid.width), *network.map_sizes()]
         with torch.no_grad():
             self._lif: LIFParams = blocks[0].lif
-            self._extractor, self._sparse, self._convolutions = None, None, []
+            self._int8, self._sparse = None, None
+            self._convolutions: list[Convolution] = []
+            self._project: Folded | Int8Projection
             if net.precision == "int8":
-                self._extractor = int8.Extractor(
-                    [int8_layer(block, at=i) for i, block in enumerate(blocks)], sizes, self._lif
-                )
+                layers = [int8_layer(block, at=i) for i, block in enumerate(blocks)]
+                self._int8 = Int8Extractor(layers, sizes, self._lif)
+                self._project = Int8Projection(int8_projection(network, net.channels[-1], *sizes[-1]))
             else:
                 self._convolutions = [
                     folded_convolution(block, *size) for block, size in zip(blocks, sizes, strict=False)
                 ]
-            self._project: Folded | int8.Projection
-            if net.precision == "int8":
-                self._project = int8.Projection(int8_projection(network, net.channels[-1], *sizes[-1]))
-            else:
                 self._project = folded_projection(network, net.channels[-1], *sizes[-1])
-                self._sparse = self._over_lists(blocks, sizes)
+                self._sparse = _over_lists(blocks, self._convolutions, sizes, self._project, self._lif)
             self._readout = Folded(*(tensor.detach().clone() for tensor in network.outputs()))
             self._kappa = float(torch.sigmoid(network.kappa_logit))
             cells = [cell for cell in network.cells if isinstance(cell, ASLSTM)]
             self._params = [copied_params(cell.params()) for cell in cells]
             self._d_space = network.d_space.detach().clone()
         inside = self._project if isinstance(self._project, Folded) and self._sparse is None else None
-        self._features_inside = inside.bias.numel() if inside else 0  # of a projection that `run_cells` computes
+        self._features_inside = inside.bias.numel() if inside else 0  # of a projection that `run_cells` computes itself
         self._weights = flattened_weights(inside, self._params, self._d_space, self._readout)
         self._constants = np.array([net.alpha, net.v_th, self._kappa], np.float32)
 
     @property
     def reads_counts(self) -> bool:
-        """Whether it takes `encoding.to_counts` in less time than `to_spikes`."""
+        """Whether `encoding.to_count_input` is a faster input than `to_spikes`."""
         return self._sparse is not None
 
     @torch.inference_mode()
-    def __call__(self, spikes: Tensor | sparse.Counts, state: NetworkState) -> tuple[Tensor, NetworkState]:
+    def __call__(self, spikes: Tensor | CountInput, state: NetworkState) -> tuple[Tensor, NetworkState]:
         """Velocities of T consecutive windows, and the state after them.
 
         Args:
-            spikes: (T, B, 2n, H, W), any layout; channels last is read as it lies. An int8 network takes
-                `encoding.to_codes` too, and one in float32 `encoding.to_counts`.
-            state: of these B streams, the network's or the engine's.
+            spikes: (T, B, 2n, H, W), any layout; channels last is read without a copy. An int8 network also takes
+                `encoding.to_codes`, a float32 network `encoding.to_count_input`.
+            state: state of these B streams, from the network or the engine.
 
         Returns:
             twists (T, B, n, 6) in scaled units and the next state, as NeuroVE.forward.
@@ -97,17 +104,18 @@ class Engine:
 
     @torch.inference_mode()
     def together(
-        self, spikes: Tensor | sparse.Counts, states: Sequence[NetworkState]
+        self, spikes: Tensor | CountInput, states: Sequence[NetworkState]
     ) -> list[tuple[Tensor, NetworkState]]:
-        """One window of each of B streams: the same as a call for each, of eight in 0.8 of the time.
+        """One window of each of B streams in one batch; eight streams take 0.8 of the time of eight calls.
 
-        The feature extractor takes all at once; cells and readout take each stream alone, so that no sum of a stream
-        is grouped by what another one does. Answers are those of single calls bit for bit in int8, and over spikes
-        alone (sparse.py); a dense convolution of several maps may round otherwise than one of a single map.
+        The feature extractor runs on all streams at once. Cells and readout run on each stream alone, so that the
+        rounding of one stream never depends on another. Answers equal those of single calls bit for bit in int8 and
+        over spike lists (sparse.py); a dense convolution of several maps may round differently from one of a single
+        map.
 
         Args:
             spikes: (1, B, 2n, H, W), as in a call.
-            states: of the streams, each of a batch of one.
+            states: state of each stream, for a batch of one.
 
         Returns:
             twists (1, 1, n, 6) and the next state of each stream.
@@ -120,25 +128,27 @@ class Engine:
         answers = []
         for b, state in enumerate(states):
             twists, cells, y = (self._plain_cells if is_plain() else self._fused_cells)(rows[b : b + 1], 1, state)
-            own = tuple(LIFState(membrane.v[b : b + 1].clone()) for membrane in membranes)  # a view would keep all
+            own = tuple(
+                LIFState(membrane.v[b : b + 1].clone()) for membrane in membranes
+            )  # a view would keep the memory of all streams
             answers.append((twists, NetworkState(own, cells, y)))
         return answers
 
     @torch.inference_mode()
-    def features(self, spikes: Tensor | sparse.Counts, state: NetworkState) -> tuple[Tensor, tuple[LIFState, ...]]:
-        """Spikes (T * B, C, H', W') of the last map of the feature extractor alone, and its membranes after them."""
+    def features(self, spikes: Tensor | CountInput, state: NetworkState) -> tuple[Tensor, tuple[LIFState, ...]]:
+        """Run the feature extractor alone: spikes (T * B, C, H', W') of the last map, and the membranes after them."""
         x, membranes = self._features(spikes, state)
-        return spike_lists.maps_of(x) if isinstance(x, spike_lists.Fired) else x.float(), membranes
+        return to_maps(x) if isinstance(x, SpikeList) else x.float(), membranes
 
     def _features(
-        self, spikes: Tensor | sparse.Counts, state: NetworkState
-    ) -> tuple[Tensor | spike_lists.Fired, tuple[LIFState, ...]]:
+        self, spikes: Tensor | CountInput, state: NetworkState
+    ) -> tuple[Tensor | SpikeList, tuple[LIFState, ...]]:
         if self._sparse is not None and not is_plain():
             return self._sparse(spikes, state.membranes)
-        if isinstance(spikes, sparse.Counts):
+        if isinstance(spikes, CountInput):
             spikes = spikes.spikes()
-        if self._extractor is not None:
-            return self._extractor(spikes.flatten(0, 1), state.membranes)
+        if self._int8 is not None:
+            return self._int8(spikes.flatten(0, 1), state.membranes)
         x = spikes.flatten(0, 1).contiguous(memory_format=torch.channels_last)
         fire = self._plain_fire if is_plain() else self._fused_fire
         membranes = []
@@ -147,22 +157,15 @@ class Engine:
             membranes.append(LIFState(after))
         return x, tuple(membranes)
 
-    def _rows(self, x: Tensor | spike_lists.Fired) -> Tensor | Array:
-        """What the cells are given of the last map (R, C, H, W): its spikes (R, I), or their projection (R, F)."""
-        if isinstance(x, spike_lists.Fired):
-            if isinstance(self._project, int8.Projection):
+    def _rows(self, x: Tensor | SpikeList) -> Tensor | Array:
+        """The input of the cells from the last map (R, C, H, W): its spikes (R, I), or their projection (R, F)."""
+        if isinstance(x, SpikeList):
+            if isinstance(self._project, Int8Projection):
                 return self._project(x)
-            assert self._sparse is not None  # it made them
+            assert self._sparse is not None  # it made the list
             return self._sparse.project(x)
-        rows = x.permute(0, 2, 3, 1).flatten(1)  # as it lies in memory
-        return self._project(rows) if isinstance(self._project, int8.Projection) else rows
-
-    def _over_lists(self, blocks: list[SpikingBlock], sizes: list[tuple[int, int]]) -> sparse.Extractor | None:
-        layers = [
-            sparse.Layer(*folded(block.conv.weight, block.norm), convolve, *size)
-            for block, convolve, size in zip(blocks, self._convolutions, sizes, strict=False)
-        ]
-        return sparse.extractor(layers, self._project, self._lif) if isinstance(self._project, Folded) else None
+        rows = x.permute(0, 2, 3, 1).flatten(1)  # in memory order
+        return self._project(rows) if isinstance(self._project, Int8Projection) else rows
 
     def _fused_fire(self, currents: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         return scan.scan_in_place(currents, v, self._lif.decay, self._lif.v_th)
@@ -175,11 +178,11 @@ class Engine:
         self, rows: Tensor | Array, steps: int, state: NetworkState
     ) -> tuple[Tensor, tuple[ASLSTMState, ...], Tensor]:
         x: Array = rows.numpy() if isinstance(rows, Tensor) else rows
-        carried = torch.stack([field for cell in state.cells for field in cell])  # (3 L, B, N): c, v, s of each layer
+        stacked = torch.stack([field for cell in state.cells for field in cell])  # (3 L, B, N): c, v, s of each layer
         y = state.readout.clone()
         answers = np.empty((steps, *y.shape), np.float32)
-        run_cells(x, self._weights, self._features_inside, self._constants, carried.numpy(), y.numpy(), answers)
-        fields = carried.unbind()
+        run_cells(x, self._weights, self._features_inside, self._constants, stacked.numpy(), y.numpy(), answers)
+        fields = stacked.unbind()
         cells = tuple([ASLSTMState(*fields[i : i + 3]) for i in range(0, len(fields), 3)])
         return torch.from_numpy(answers[..., : 6 * self._bins].reshape(steps, -1, self._bins, 6)), cells, y
 
@@ -198,4 +201,20 @@ class Engine:
         return twists, tuple(cells), y
 
 
-# --- the compiled pass from the last map to the answers ---------------------------------------------------------------
+def _over_lists(
+    blocks: list[SpikingBlock],
+    convolutions: list[Convolution],
+    sizes: list[tuple[int, int]],
+    projection: Folded,
+    lif: LIFParams,
+) -> "SparseExtractor | None":
+    """The extractor over spike lists, or None where it does not work with these widths or on this machine."""
+    if not vectors_work():
+        return None
+    from neurove_core.engine.sparse import SparseLayer, sparse_extractor
+
+    layers = [
+        SparseLayer(*folded(block.conv.weight, block.norm), convolve, *size)
+        for block, convolve, size in zip(blocks, convolutions, sizes, strict=False)
+    ]
+    return sparse_extractor(layers, projection, lif)

@@ -1,17 +1,19 @@
-"""Convolutions and projection in 8-bit integers, for networks whose bundle asks for them: as in float32, bit for bit.
+"""Convolutions and projection in 8-bit integers, for networks with precision int8; equal to float32 bit for bit.
 
-    precision = "int8": the weights of every convolution and of the projection are whole multiples q of a step per
+    precision = "int8": the weights of every convolution and of the projection are integer multiples q of a step per
     output channel, |q| <= 127, and the network's input is rounded to 1/32. Spikes are 0 or 1.
 
-So a convolution or a projection is a sum of products of whole numbers, exact in any order and any arithmetic that can
-hold it: int32, or float32 below 2**24. The norm's factor and offset follow in float32, one product and one sum for each
-neuron, and then the LIF scan or the first cell. `neurons.plain()` computes the same with the public float32 operators;
-tests compare bit for bit. Training sees the rounding (`rounded`) and passes gradients through it. Where the widths suit
-its vectors sparse_int8.py sums over the neurons that fired alone; here are the dense forms.
+So a convolution or a projection is a sum of integer products. It is exact in any order and in any arithmetic that can
+hold it: int32, or float32 below 2**24. The norm's factor and offset follow in float32, one product and one sum for
+each neuron, then the LIF scan or the first cell. Inside `plain()` the same is computed with the public float32
+operators, and tests compare both bit for bit. Training applies the same rounding (`quantisation.rounded`) and passes
+gradients through.
+
+This module has the dense forms. Where the widths are multiples of LANES, sparse_int8.py sums over spike lists instead.
 """
 
 from collections.abc import Callable
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 import torch
@@ -20,60 +22,63 @@ from torch import Tensor
 from torch.nn.functional import conv2d, linear
 
 from neurove_core.compiled import compiled
-from neurove_core.engine import sparse_int8
-from neurove_core.engine.convolution import Convolution, say_once
-from neurove_core.engine.spike_lists import Fired, maps_of
-from neurove_core.engine.vectors import LANES
+from neurove_core.engine.convolution import Convolution
+from neurove_core.engine.fallback import reason_of, vectors_work, warn_once
+from neurove_core.engine.spike_lists import SpikeList, to_maps
+from neurove_core.engine.tiles import LANES
 from neurove_core.networks.quantisation import MAX_WEIGHT, Quantised, codes
 from neurove_core.spiking.lif import LIFParams, LIFState, lif_scan_reference
 from neurove_core.spiking.plain import is_plain
 
-_EXACT: Final = 1 << 24  # whole numbers below this are exact in float32
-_BLOCK: Final = 1024  # neurons whose potentials stay in the first cache over all steps
+if TYPE_CHECKING:  # it needs the vector code, which may not work with this numba
+    from neurove_core.engine.sparse_int8 import SparseInt8Extractor
+
+_EXACT: Final = 1 << 24  # integers below this are exact in float32
+_BLOCK: Final = 1024  # neurons whose potentials stay in the first-level cache over all steps
 _GATHERED: Final = 256  # inputs whose weights are summed in 16 bits: 256 * 127 < 2**15
 
 Array = NDArray[Any]
 
 
-class Layer(NamedTuple):
-    """One block of the extractor, whole numbers in and spikes out; or the projection, spikes in and currents out."""
+class Int8Layer(NamedTuple):
+    """A layer of weights with its norm: a block of the extractor (integers to spikes), or the projection."""
 
     weights: Quantised
-    factor: Tensor  # (C') float32: of the norm and the steps
+    factor: Tensor  # (C') float32: product of the norm's factor and the steps
     offset: Tensor  # (C') float32
 
 
-class Extractor:
-    """The feature extractor of one network in whole numbers.
+class Int8Extractor:
+    """The feature extractor of one network in 8-bit integers, over spike lists where possible, else dense.
 
     Args:
-        layers: its blocks; the first sees codes, the others spikes.
+        layers: its blocks. The first one reads codes, the others read spikes.
         sizes: rows and columns of each block's input.
-        lif: of its neurons.
+        lif: parameters of its neurons.
     """
 
-    def __init__(self, layers: list[Layer], sizes: list[tuple[int, int]], lif: LIFParams) -> None:
+    def __init__(self, layers: list[Int8Layer], sizes: list[tuple[int, int]], lif: LIFParams) -> None:
         self._layers, self._lif = layers, lif
         self._decay, self._v_th = np.float32(lif.decay), np.float32(lif.v_th)
         self._blocks = [(_over_a_block(layer.factor), _over_a_block(layer.offset)) for layer in layers]
         tops = [255] + [1] * (len(layers) - 1)
-        self._plain = [plain_sums(layer.weights.q, top) for layer, top in zip(layers, tops, strict=True)]
-        self._fast = [sums(layer.weights.q, top, *size) for layer, top, size in zip(layers, tops, sizes, strict=False)]
-        over = [
-            sparse_int8.Layer(layer.weights.q, layer.factor, layer.offset, dense, *size)
-            for layer, dense, size in zip(layers, self._fast, sizes, strict=False)
+        self._plain = [plain_int8_convolution(layer.weights.q, top) for layer, top in zip(layers, tops, strict=True)]
+        self._fast = [
+            int8_convolution(layer.weights.q, top, *size) for layer, top, size in zip(layers, tops, sizes, strict=False)
         ]
-        self._over_lists = sparse_int8.extractor(over, lif)
+        self._sparse = _over_lists(layers, self._fast, sizes, lif)
 
-    def __call__(self, spikes: Tensor, membranes: tuple[LIFState, ...]) -> tuple[Tensor | Fired, tuple[LIFState, ...]]:
-        """Input (T * B, 2n, H, W), as float32 or as uint8 codes, to spikes of the last map and potentials.
+    def __call__(
+        self, spikes: Tensor, membranes: tuple[LIFState, ...]
+    ) -> tuple[Tensor | SpikeList, tuple[LIFState, ...]]:
+        """Input (T * B, 2n, H, W), float32 or uint8 codes, to the spikes of the last map and the potentials.
 
         Returns:
-            who fired, or uint8 spikes (T * B, C', H', W') where layers are dense; and the potentials.
+            a spike list, or uint8 spikes (T * B, C', H', W') where layers are dense; and the potentials.
         """
         given = spikes if spikes.dtype == torch.uint8 else codes(spikes)
-        if self._over_lists is not None and not is_plain():
-            return self._over_lists(given, membranes)
+        if self._sparse is not None and not is_plain():
+            return self._sparse(given, membranes)
         x = given.contiguous(memory_format=torch.channels_last)
         after = []
         for index, (layer, membrane) in enumerate(zip(self._layers, membranes, strict=True)):
@@ -84,13 +89,13 @@ class Extractor:
             after.append(LIFState(v))
         return x, tuple(after)
 
-    def _plain_fire(self, found: Tensor, layer: Layer, v: Tensor) -> tuple[Tensor, Tensor]:
-        currents = found * layer.factor.view(-1, 1, 1) + layer.offset.view(-1, 1, 1)
+    def _plain_fire(self, sums: Tensor, layer: Int8Layer, v: Tensor) -> tuple[Tensor, Tensor]:
+        currents = sums * layer.factor.view(-1, 1, 1) + layer.offset.view(-1, 1, 1)
         spikes, after = lif_scan_reference(currents.view(-1, *v.shape), LIFState(v), self._lif)
         return spikes.flatten(0, 1).to(torch.uint8), after.v
 
-    def _fire(self, found: Tensor, block: tuple[Array, Array], v: Tensor) -> tuple[Tensor, Tensor]:
-        rows = np.ascontiguousarray(found.numpy().transpose(0, 2, 3, 1))
+    def _fire(self, sums: Tensor, block: tuple[Array, Array], v: Tensor) -> tuple[Tensor, Tensor]:
+        rows = np.ascontiguousarray(sums.numpy().transpose(0, 2, 3, 1))
         before = np.ascontiguousarray(v.detach().numpy().transpose(0, 2, 3, 1))
         spikes, after = np.empty(rows.shape, np.uint8), np.empty_like(before)
         steps = rows.reshape(-1, before.size), *block, before.reshape(-1), after.reshape(-1)
@@ -98,25 +103,41 @@ class Extractor:
         return torch.from_numpy(spikes).permute(0, 3, 1, 2), torch.from_numpy(after).permute(0, 3, 1, 2)
 
 
-class Projection:
-    """The projection of one network in whole numbers: weights are read where a spike asks for them, and added up.
+def _over_lists(
+    layers: list[Int8Layer], dense: list[Convolution], sizes: list[tuple[int, int]], lif: LIFParams
+) -> "SparseInt8Extractor | None":
+    """The extractor over spike lists, or None where it does not work with these widths or on this machine."""
+    if not vectors_work():
+        return None
+    from neurove_core.engine.sparse_int8 import SparseInt8Layer, sparse_int8_extractor
+
+    over = [
+        SparseInt8Layer(layer.weights.q, layer.factor, layer.offset, convolve, *size)
+        for layer, convolve, size in zip(layers, dense, sizes, strict=False)
+    ]
+    return sparse_int8_extractor(over, lif)
+
+
+class Int8Projection:
+    """The projection of one network in 8-bit integers: only the weight rows of spikes are read and summed.
 
     Args:
-        layer: its weights (F, I), in the order in which spikes lie in memory.
+        layer: its weights (F, I), inputs in the memory order of the spikes.
     """
 
-    def __init__(self, layer: Layer) -> None:
+    def __init__(self, layer: Int8Layer) -> None:
         self.layer = layer
         self._largest = _largest_sum(layer.weights.q)
-        self._rows = layer.weights.q.T.contiguous().numpy()  # (I, F): what one spike gives to all features
+        self._rows = layer.weights.q.T.contiguous().numpy()  # (I, F): weights of one input to all features
+        self._project_list = self._list_projection()
 
-    def __call__(self, spikes: Tensor | Fired) -> Tensor:
-        """Spikes (R, I), uint8 of 0 and 1, or who fired, to currents (R, F)."""
+    def __call__(self, spikes: Tensor | SpikeList) -> Tensor:
+        """Spikes (R, I), uint8 of 0 and 1, or a spike list, to currents (R, F)."""
         (q, _), factor, offset = self.layer
-        if isinstance(spikes, Fired):
-            if factor.numel() % LANES == 0 and self._largest < 1 << 31:
-                return torch.from_numpy(sparse_int8.project(spikes, self._rows, factor.numpy(), offset.numpy()))
-            spikes = maps_of(spikes, np.uint8).permute(0, 2, 3, 1).flatten(1)
+        if isinstance(spikes, SpikeList):
+            if self._project_list is not None:
+                return torch.from_numpy(self._project_list(spikes, self._rows, factor.numpy(), offset.numpy()))
+            spikes = to_maps(spikes, np.uint8).permute(0, 2, 3, 1).flatten(1)
         if is_plain() or self._largest >= 1 << 31:
             kind = torch.float32 if self._largest < _EXACT else torch.float64
             return linear(spikes.to(kind), q.to(kind)).to(torch.float32) * factor + offset
@@ -124,43 +145,60 @@ class Projection:
         _gather(spikes.numpy(), self._rows, factor.numpy(), offset.numpy(), currents.numpy())
         return currents
 
+    def _list_projection(self) -> Callable[[SpikeList, NDArray[np.int8], Array, Array], Array] | None:
+        """The projection over a spike list where it is exact, else None."""
+        factor, offset = self.layer.factor.numpy(), self.layer.offset.numpy()
+        if factor.size % LANES or self._largest >= 1 << 31 or not vectors_work():
+            return None
+        try:
+            from neurove_core.engine.sparse_int8 import project, projects
+
+            if projects(self._rows, factor, offset):
+                return project
+            reason = "its results differ"
+        except Exception as error:  # noqa: BLE001  # numba raises anything while it compiles
+            reason = reason_of(error)
+        warn_once("8-bit projection over spike lists", reason)
+        return None
+
 
 def _over_a_block(by_channel: Tensor) -> Array:
-    """Numbers of the channels, again and again, for a block of neurons: a loop that the compiler turns into vectors."""
+    """Values of the channels, repeated for a block of neurons, so that the compiler can vectorise the loop."""
     return by_channel.repeat(max(1, _BLOCK // by_channel.numel())).numpy()
 
 
-# --- sums of products of whole numbers --------------------------------------------------------------------------------
+# --- dense integer sums -----------------------------------------------------------------------------------------------
 
 
-def sums(q: Tensor, top: int, rows: int, columns: int) -> Convolution:
+def int8_convolution(q: Tensor, top: int, rows: int, columns: int) -> Convolution:
     """A convolution of uint8 maps with int8 weights, its sums as float32, by this machine's 8-bit products.
 
-    The operator is private to torch, and on processors without such products it may saturate: at load it is tried on
-    the largest sums that there are. Where it is missing or wrong, `plain_sums` serves, slower; said once in the log.
+    The operator is private to torch, and it may saturate on processors without such products. When a model is loaded,
+    it is checked on the largest possible sums. Where it is missing or wrong, `plain_int8_convolution` is used and one
+    warning is logged.
 
     Args:
         q: (C', C, 3, 3) int8.
-        top: largest number of a map.
-        rows: of the map that it mostly sees.
-        columns: of the same.
+        top: largest value in a map.
+        rows: rows of the usual input map.
+        columns: columns of the usual input map.
     """
     if not _exact_in_float32(q, top):
-        return plain_sums(q, top)
+        return plain_int8_convolution(q, top)
     try:
-        fast = _packed(q, rows, columns)
+        fast = _prepacked(q, rows, columns)
         agrees = _agrees(q, top, rows, columns)
     except (AttributeError, RuntimeError, NotImplementedError, TypeError) as error:
-        say_once("8-bit convolutions", str(error).partition("\n")[0])
-        return plain_sums(q, top)
+        warn_once("8-bit convolution", reason_of(error))
+        return plain_int8_convolution(q, top)
     if not agrees:
-        say_once("8-bit convolutions", "they compute something else")
-        return plain_sums(q, top)
+        warn_once("8-bit convolution", "its results differ")
+        return plain_int8_convolution(q, top)
     return fast
 
 
-def plain_sums(q: Tensor, top: int) -> Convolution:
-    """The same by torch's public operator, in float32 where that holds every sum, else in float64."""
+def plain_int8_convolution(q: Tensor, top: int) -> Convolution:
+    """The reference implementation by torch's public operator, in float32 where every sum is exact, else in float64."""
     kind = torch.float32 if _exact_in_float32(q, top) else torch.float64
     weight = q.to(kind).contiguous(memory_format=torch.channels_last)
     return lambda x: conv2d(x.to(kind), weight, stride=2, padding=1).to(torch.float32)
@@ -171,11 +209,11 @@ def _exact_in_float32(q: Tensor, top: int) -> bool:
 
 
 def _largest_sum(q: Tensor) -> int:
-    """Of any output, where every input is one."""
-    return int(q.abs().flatten(1).sum(dim=1).max())  # torch adds up int8 in int64
+    """The largest absolute sum of any output, where every input is one."""
+    return int(q.abs().flatten(1).sum(dim=1).max())  # torch sums int8 in int64
 
 
-def _packed(q: Tensor, rows: int, columns: int) -> Convolution:
+def _prepacked(q: Tensor, rows: int, columns: int) -> Convolution:
     run: Callable[..., Tensor] = torch.ops.onednn.qconv2d_pointwise.default
     one, zero = torch.ones(q.shape[0]), torch.zeros(q.shape[0], dtype=torch.int32)
     where: tuple[list[int], ...] = ([2, 2], [1, 1], [1, 1])  # stride, padding, dilation
@@ -190,13 +228,13 @@ def _packed(q: Tensor, rows: int, columns: int) -> Convolution:
 
 @torch.inference_mode()
 def _agrees(q: Tensor, top: int, rows: int, columns: int) -> bool:
-    """Whether the private operator is exact: on the largest sums, of both signs, and on random ones; 1 and 3 maps."""
+    """Whether the private operator is exact: largest sums of both signs and random ones, on one map and on three."""
     generator = torch.Generator().manual_seed(0)
     random = torch.randint(-MAX_WEIGHT, MAX_WEIGHT + 1, q.shape, generator=generator, dtype=torch.int8)
     for weight in (torch.full_like(q, MAX_WEIGHT), torch.full_like(q, -MAX_WEIGHT), random, q):
         if not _exact_in_float32(weight, top):
-            continue  # more than these weights can ever sum to
-        fast, plain = _packed(weight, rows, columns), plain_sums(weight, top)
+            continue  # larger than any sum of these weights
+        fast, plain = _prepacked(weight, rows, columns), plain_int8_convolution(weight, top)
         for count in (1, 3):
             x = torch.randint(0, top + 1, (count, q.shape[1], rows, columns), generator=generator, dtype=torch.uint8)
             x[0] = top
@@ -208,7 +246,7 @@ def _agrees(q: Tensor, top: int, rows: int, columns: int) -> bool:
 
 @compiled
 def _scan(
-    found: Array,
+    sums: Array,
     factor: Array,
     offset: Array,
     before: Array,
@@ -217,19 +255,19 @@ def _scan(
     v_th: Any,
     spikes: NDArray[np.uint8],
 ) -> None:  # pragma: no cover (machine code)
-    """As scan._in_place, of currents found * factor + offset; channels vary fastest. Two steps are taken at a time.
+    """The LIF scan of currents sums * factor + offset, channels last; two steps at a time.
 
     Args:
-        found: (T, N).
-        factor: of a block of neurons (M): those of the channels, again and again.
-        offset: of the same.
-        before: potentials (N).
-        after: potentials (N), written.
-        decay: per step.
+        sums: (T, N) integer sums as float32.
+        factor: (M) factors of a block of neurons, the channels repeated.
+        offset: (M) offsets of the same.
+        before: (N) membrane potentials before the first step.
+        after: (N) potentials after the last reset, written.
+        decay: leak per step.
         v_th: firing threshold.
         spikes: (T, N), written.
     """
-    steps, n = found.shape
+    steps, n = sums.shape
     one, none = after.dtype.type(1), after.dtype.type(0)
     even = steps - steps % 2
     for start in range(0, n, factor.size):
@@ -238,8 +276,8 @@ def _scan(
         for i in range(stop - start):
             v_now[i] = v_before[i]
         for t in range(0, even, 2):
-            row, s = found[t, start:stop], spikes[t, start:stop]
-            next_row, next_s = found[t + 1, start:stop], spikes[t + 1, start:stop]
+            row, s = sums[t, start:stop], spikes[t, start:stop]
+            next_row, next_s = sums[t + 1, start:stop], spikes[t + 1, start:stop]
             for i in range(stop - start):
                 u = decay * v_now[i] + (row[i] * factor[i] + offset[i])
                 fires = u - v_th >= none
@@ -249,7 +287,7 @@ def _scan(
                 next_s[i] = np.uint8(fires)
                 v_now[i] = u * (none if fires else one)
         for t in range(even, steps):
-            row, s = found[t, start:stop], spikes[t, start:stop]
+            row, s = sums[t, start:stop], spikes[t, start:stop]
             for i in range(stop - start):
                 u = decay * v_now[i] + (row[i] * factor[i] + offset[i])
                 fires = u - v_th >= none
@@ -261,37 +299,42 @@ def _scan(
 def _gather(
     spikes: NDArray[np.uint8], weights: NDArray[np.int8], factor: Array, offset: Array, currents: Array
 ) -> None:  # pragma: no cover (machine code)
-    """Currents factor * sum + offset, sum = spikes times weights; rows of weights that no spike asks for are not read.
+    """Currents factor * sum + offset, where sum adds the weight rows of the spikes; no other rows are read.
 
-    Sums are of 32 bits and become float32 once, rounded where they are 2**24 or more, as those of float64 would.
+    Sums have 32 bits and are converted to float32 once, rounded from 2**24 on, as float64 sums would be.
 
     Args:
         spikes: (R, I) of 0 and 1.
         weights: (I, F).
-        factor: of the features (F).
-        offset: of the same.
+        factor: (F).
+        offset: (F).
         currents: (R, F), written.
     """
     rows, inputs = spikes.shape
     features = factor.size
     sums_of_rows, part = np.zeros((rows, features), np.int32), np.empty(features, np.int16)
-    asked = np.empty(_GATHERED, np.int64)
+    wanted = np.empty(_GATHERED, np.int64)
     for start in range(0, inputs, _GATHERED):
         stop = min(start + _GATHERED, inputs)
-        for r in range(rows):  # a block's weights stay in the second cache over all rows
+        for r in range(rows):  # a block's weights stay in the second-level cache over all rows
             fired, found = spikes[r, start:stop], 0
             for i in range(stop - start):
-                asked[found] = start + i
+                wanted[found] = start + i
                 found += fired[i]
             for j in range(features):
                 part[j] = 0
             whole = found - found % 4
             for n in range(0, whole, 4):
-                w0, w1, w2, w3 = weights[asked[n]], weights[asked[n + 1]], weights[asked[n + 2]], weights[asked[n + 3]]
+                w0, w1, w2, w3 = (
+                    weights[wanted[n]],
+                    weights[wanted[n + 1]],
+                    weights[wanted[n + 2]],
+                    weights[wanted[n + 3]],
+                )
                 for j in range(features):
                     part[j] += np.int16(w0[j]) + np.int16(w1[j]) + np.int16(w2[j]) + np.int16(w3[j])
             for n in range(whole, found):
-                w0 = weights[asked[n]]
+                w0 = weights[wanted[n]]
                 for j in range(features):
                     part[j] += np.int16(w0[j])
             total = sums_of_rows[r]

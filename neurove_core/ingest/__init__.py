@@ -1,1 +1,1 @@
-"""From a packet's bytes to complete windows of counts."""
+"""A packet's bytes to complete windows of event counts."""

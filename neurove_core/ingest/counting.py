@@ -1,8 +1,7 @@
-"""Binning: events to a window's counts, compiled, beside its reference implementation.
+"""Binning: events to a window's counts, compiled, and its reference implementation.
 
-A kernel is a pure function: state goes in and comes out as a named tuple, arrays are read or filled, nothing is kept.
-numba compiles it on first use, caches it on disk, and runs it without the GIL. The reference (`*_reference`) computes
-the same in plain Python or numpy; tests compare the two bit for bit.
+numba compiles the kernel at first use, caches it on disk, and runs it without the GIL. `count_events_reference`
+computes the same in numpy; tests compare both bit for bit.
 """
 
 from typing import Final
@@ -19,14 +18,14 @@ def count_events(events: Events, start_us: int, bin_us: int, lut: NDArray[np.int
     """Add events to a window's counts, in place, saturating at 255.
 
     Args:
-        events: all with start_us <= t < start_us + n * bin_us, on the sensor of `lut`.
-        start_us: of the window.
-        bin_us: length of one of its n bins.
-        lut: (sensor.height, sensor.width) cell of each pixel, or geometry.OUTSIDE.
+        events: all with start_us <= t < start_us + n * bin_us, ordered by time, on the sensor of `lut`.
+        start_us: start of the window [us].
+        bin_us: length of one of its n bins [us].
+        lut: (sensor.height, sensor.width) cell of each pixel, or geometry.camera.OUTSIDE.
         counts: (2n, H, W), changed.
 
     Returns:
-        how many of the events no cell sees.
+        number of events whose pixel has no cell.
     """
     cells = counts.shape[1] * counts.shape[2]
     return _count(events, start_us, bin_us, lut, cells, counts.reshape(-1))
@@ -35,7 +34,7 @@ def count_events(events: Events, start_us: int, bin_us: int, lut: NDArray[np.int
 def count_events_reference(
     events: Events, start_us: int, bin_us: int, lut: NDArray[np.int32], counts: NDArray[np.uint8]
 ) -> int:
-    """What count_events computes, in plain numpy."""
+    """The reference implementation of count_events, in numpy."""
     cell = lut[events.y, events.x]
     seen = cell != NO_CELL
     channel = 2 * ((events.t - start_us) // bin_us) + (events.p > 0)
@@ -45,16 +44,16 @@ def count_events_reference(
     return int((~seen).sum())
 
 
-_BLOCK: Final = 512  # events whose pixels are numbered together: a loop that the compiler turns into vectors
+_BLOCK: Final = 512  # events whose pixel indices are computed together, in a loop that the compiler vectorises
 
 
 @compiled
 def _count(
     events: Events, start_us: int, bin_us: int, lut: NDArray[np.int32], cells: int, flat: NDArray[np.uint8]
 ) -> int:  # pragma: no cover (machine code)
-    """Bin by bin: its last event by bisection instead of a division per event, then numbered and added in blocks.
+    """Count bin by bin: bisection finds a bin's last event, which saves a division per event; then block by block.
 
-    Cells are looked up one by one as they are added to: vectors that gather them take longer than the loop waits.
+    Cells are looked up one by one while they are incremented; vector gathers were slower.
     """
     t, x, y, p = events.t, events.x, events.y, events.p
     pixels, columns = lut.reshape(-1), np.uint32(lut.shape[1])

@@ -1,8 +1,8 @@
-"""push: events -> complete windows. Half-open, on the sensor's clock, the same however a driver cuts its packets.
+"""push: events to complete windows. Windows are half-open on the sensor's clock and do not depend on packet sizes.
 
-The grid is absolute: a window starts at a whole multiple of its duration on the sensor clock, so a lost first packet
-or a late start changes no later window (decision 2). Events are counted into the open window as they come, so a
-window costs the same memory however many events it has.
+The grid is absolute: a window starts at an integer multiple of its duration on the sensor clock, so a lost first packet
+or a late start changes no later window (decision 2). Events are counted into the open window as they arrive, so a
+window takes the same memory for any number of events.
 """
 
 from typing import NamedTuple
@@ -23,26 +23,26 @@ class Window(NamedTuple):
     start_us: int
     counts: NDArray[np.uint8]  # (2n, H, W), saturating at 255: channel 2i is OFF, 2i + 1 is ON of bin i
     events: int  # of the whole sensor
-    outside: int  # of these, seen by pixels that look past the grid
+    outside: int  # those whose pixel has no cell of the grid
 
 
 class WindowsState(NamedTuple):
-    """What a stream carries between packets: the open window. Its counts go into the next state, not into a copy."""
+    """State of a stream between packets: the open window. The next state takes over its counts without a copy."""
 
-    start_us: int | None = None  # none before the first packet
-    horizon_us: int = 0  # sensor time up to which all events are known; without a meaning before the first packet
-    counts: NDArray[np.uint8] | None = None  # none while the open window is empty
+    start_us: int | None = None  # None before the first packet
+    horizon_us: int = 0  # sensor time up to which all events are known; unused before the first packet
+    counts: NDArray[np.uint8] | None = None  # None while the open window is empty
     events: int = 0
     outside: int = 0
 
 
 class Pushed(NamedTuple):
-    """What came of some events."""
+    """Result of a push."""
 
     windows: list[Window]
     state: WindowsState
-    late_events: int  # of windows that were complete before they came
-    skipped_windows: int  # complete windows left out, for the hole in sensor time was too long
+    late_events: int  # events of windows that were complete before they arrived
+    skipped_windows: int  # windows left out because the gap in sensor time was too long
 
 
 def push(
@@ -56,15 +56,15 @@ def push(
     """Add events to a stream's open window and close every window that is complete.
 
     Args:
-        events: ordered by time, on the sensor of `lut`; columns, or as they lie in a packet, which is the same.
-        horizon_us: sensor time that the driver has reached even if nothing happened, such as the packet's t0_us.
-        state: of the stream; used up by this call.
+        events: ordered by time, on the sensor of `lut`; as columns or in the layout of a packet, with equal results.
+        horizon_us: sensor time that the driver has reached even without events, such as the packet's t0_us.
+        state: state of the stream; do not use it again after this call.
         lut: (sensor.height, sensor.width) from geometry.lookup_table.
         config: length and bins of a window.
-        canonical: the grid.
+        canonical: size of the grid.
 
     Returns:
-        the windows that ended at or before the newest time known, oldest first, and the next state.
+        the windows that end at or before the newest known time, oldest first, and the next state.
     """
     duration = config.duration_us
     first_us, newest_us = horizon_us, horizon_us
@@ -86,9 +86,9 @@ def push(
         events = events.span(inside, events.n)
         windows.append(open_window.close())
         next_us = (events.first_us if events.n else newest_us) // duration * duration
-        hole = (next_us - end_us) // duration
-        if hole > config.max_hole_windows:
-            skipped += hole
+        gap = (next_us - end_us) // duration
+        if gap > config.max_hole_windows:
+            skipped += gap
             end_us = next_us
         open_window = _Open(end_us, WindowsState(), config, canonical)
     open_window.add(events, lut)
@@ -96,7 +96,7 @@ def push(
 
 
 class _Open:
-    """The window that events are being counted into."""
+    """The window into which events are counted."""
 
     def __init__(self, start_us: int, state: WindowsState, config: WindowConfig, canonical: CanonicalConfig) -> None:
         self.start_us, self.counts, self.events, self.outside = start_us, state.counts, state.events, state.outside

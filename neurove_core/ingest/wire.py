@@ -1,7 +1,7 @@
-"""From a packet's bytes to a window's counts without columns in between: the service's way in.
+"""The service's fast path from a packet's bytes to a window's counts, without event columns in between.
 
-`neurove_protocol.decode_packet` and `kernels.count_events` are the plain twin: they refuse the same packets by the same
-sentences and count the same, bit for bit.
+`neurove_protocol.decode_packet` and `counting.count_events` are the reference implementation: they reject the same
+packets with the same error texts and give the same counts, bit for bit.
 """
 
 from functools import lru_cache
@@ -22,11 +22,11 @@ from neurove_protocol.events import (
 )
 from neurove_protocol.keys import is_name
 
-_BLOCK: Final = 512  # as in kernels
+_BLOCK: Final = 512  # as in counting.py
 
 
 def read_packet(data: bytes, limits: PacketLimits = DEFAULT_LIMITS) -> WirePacket:
-    """Read and check an event packet; its events stay where they are.
+    """Read and check an event packet; its events are not copied.
 
     Raises:
         NeuroVEError: as decode_packet.
@@ -39,8 +39,8 @@ def read_packet(data: bytes, limits: PacketLimits = DEFAULT_LIMITS) -> WirePacke
             events = WireEvents(found.t0_us, raw[found.blob :], found.wide, 0, found.n)
             return WirePacket(stream, found.seq, _sensor(found.width, found.height), found.t0_us, events)
     packet = open_packet(data, limits)
-    if not _sound(packet.events.blob, packet.events.wide, packet.sensor.width, packet.sensor.height):
-        decode_packet(data, limits)  # says which event is wrong
+    if not _valid(packet.events.blob, packet.events.wide, packet.sensor.width, packet.sensor.height):
+        decode_packet(data, limits)  # raises an error that names the wrong event
     return packet
 
 
@@ -50,26 +50,26 @@ _sensor = lru_cache(64)(Sensor)
 def count_wire(
     events: WireEvents, start_us: int, bin_us: int, lut: NDArray[np.int32], counts: NDArray[np.uint8]
 ) -> int:
-    """What kernels.count_events does, of events as they lie in a packet.
+    """`counting.count_events` for events in the layout of a packet.
 
     Args:
-        events: all with start_us <= t < start_us + n * bin_us, on the sensor of `lut`.
-        start_us: of the window.
-        bin_us: length of one of its n bins.
-        lut: (sensor.height, sensor.width) cell of each pixel, or geometry.OUTSIDE.
+        events: all with start_us <= t < start_us + n * bin_us, ordered by time, on the sensor of `lut`.
+        start_us: start of the window [us].
+        bin_us: length of one of its n bins [us].
+        lut: (sensor.height, sensor.width) cell of each pixel, or geometry.camera.OUTSIDE.
         counts: (2n, H, W), changed.
 
     Returns:
-        how many of the events no cell sees.
+        number of events whose pixel has no cell.
     """
     t0_us, blob, wide, first, stop = events
     return _count(blob, wide, first, stop, start_us - t0_us, bin_us, lut, counts)
 
 
 class _Found(NamedTuple):
-    """What stands in a packet; places are bytes from its begin."""
+    """The fields of a packet; offsets are in bytes from its start."""
 
-    blob: int  # 0: nothing is known
+    blob: int  # offset of the events; 0 where the packet was not read
     name: int = 0
     name_end: int = 0
     seq: int = 0
@@ -94,7 +94,7 @@ _TO_STREAM, _TO_SEQ, _TO_WIDTH, _TO_HEIGHT, _TO_T0, _TO_N, _TO_FORMAT, _TO_DATA 
 
 @compiled
 def _read(data: NDArray[np.uint8], max_events: int, max_side: int) -> _Found:  # pragma: no cover (machine code)
-    """A sound packet whose fields stand as our encoder writes them; what is otherwise is left to the plain reader."""
+    """Read a valid packet with the field order of our encoder; any other packet is left to the reference reader."""
     nothing = _Found(0, 0, 0, 0, 0, 0, 0, 0, False)
     name = _past(data, 0, _TO_STREAM)
     if name < 0 or not 160 < data[name] < 192:
@@ -114,7 +114,7 @@ def _read(data: NDArray[np.uint8], max_events: int, max_side: int) -> _Found:  #
     most = min(max_side, 1 << 15)
     good = seq >= 0 and 1 <= width <= most and 1 <= height <= most and 0 <= n <= max_events
     good = good and -(1 << 62) <= t0_us < 1 << 62 and size == n * (8 if wide else 6) and size == data.size - blob
-    if blob < 0 or not good or not _sound(data[blob:], wide, width, height):
+    if blob < 0 or not good or not _valid(data[blob:], wide, width, height):
         return nothing
     return _Found(blob, name + 1, name_end, seq, width, height, t0_us, n, wide)
 
@@ -124,7 +124,7 @@ _SIX, _EIGHT = ord("6"), ord("8")
 
 @compiled
 def _past(data: NDArray[np.uint8], at: int, text: NDArray[np.uint8]) -> int:  # pragma: no cover (machine code)
-    """Where the text that must stand at `at` ends, with a byte after it; -1 where another stands there."""
+    """Offset behind the text expected at `at`, which another byte must follow; -1 where there is another text."""
     if at < 0 or at + text.size >= data.size:
         return -1
     for i in range(text.size):
@@ -135,7 +135,7 @@ def _past(data: NDArray[np.uint8], at: int, text: NDArray[np.uint8]) -> int:  # 
 
 @compiled
 def _integer(data: NDArray[np.uint8], at: int) -> tuple[Any, Any]:  # pragma: no cover (machine code)
-    """The msgpack integer at `at` and where it ends; 0 and -1 where there is none below 2**63."""
+    """The msgpack integer at `at` and the offset behind it; 0 and -1 where there is none below 2**63."""
     if at < 0:
         return 0, -1
     head: Any = np.int64(data[at])
@@ -162,7 +162,7 @@ def _integer(data: NDArray[np.uint8], at: int) -> tuple[Any, Any]:  # pragma: no
 
 @compiled
 def _length(data: NDArray[np.uint8], at: int) -> tuple[Any, Any]:  # pragma: no cover (machine code)
-    """How long the msgpack bin at `at` is, and where its bytes begin; 0 and -1 where there is none."""
+    """Length of the msgpack bin at `at` and offset of its bytes; 0 and -1 where there is none."""
     if at < 0 or not 0xC4 <= data[at] <= 0xC6:
         return 0, -1
     size, value = 1 << (np.int64(data[at]) - 0xC4), np.int64(0)
@@ -174,16 +174,16 @@ def _length(data: NDArray[np.uint8], at: int) -> tuple[Any, Any]:  # pragma: no 
 
 
 @compiled
-def _sound(blob: NDArray[np.uint8], wide: bool, width: int, height: int) -> bool:  # pragma: no cover (machine code)
-    """Whether all events of a blob lie on the sensor and none is earlier than the one before it."""
+def _valid(blob: NDArray[np.uint8], wide: bool, width: int, height: int) -> bool:  # pragma: no cover (machine code)
+    """Whether all events of a blob are on the sensor and ordered by time."""
     n = blob.size // (8 if wide else 6)
     if wide:
-        return _sound_columns(blob[: 4 * n].view(np.uint32), blob[4 * n :].view(np.uint16), width, height)
-    return _sound_columns(blob[: 2 * n].view(np.uint16), blob[2 * n :].view(np.uint16), width, height)
+        return _valid_columns(blob[: 4 * n].view(np.uint32), blob[4 * n :].view(np.uint16), width, height)
+    return _valid_columns(blob[: 2 * n].view(np.uint16), blob[2 * n :].view(np.uint16), width, height)
 
 
 @compiled
-def _sound_columns(
+def _valid_columns(
     offset: NDArray[Any], x_and_y: NDArray[np.uint16], width: int, height: int
 ) -> bool:  # pragma: no cover (machine code)
     n = offset.size
@@ -207,7 +207,7 @@ def _count(
     lut: NDArray[np.int32],
     counts: NDArray[np.uint8],
 ) -> int:  # pragma: no cover (machine code)
-    """Events number `first` to `stop` of a blob; `start` is the window's, from the packet's t0_us."""
+    """Count events `first` to `stop` of a blob; `start` is the window's start relative to the packet's t0_us."""
     if wide:
         n = blob.size // 8
         offset, xy = blob[: 4 * n].view(np.uint32)[first:stop], blob[4 * n :].view(np.uint16)
@@ -227,7 +227,7 @@ def _count_columns(
     lut: NDArray[np.int32],
     counts: NDArray[np.uint8],
 ) -> int:  # pragma: no cover (machine code)
-    """As kernels._count."""
+    """As counting._count, on columns of the packet's types."""
     pixels, columns, flat = lut.reshape(-1), np.uint32(lut.shape[1]), counts.reshape(-1)
     cells = counts.shape[1] * counts.shape[2]
     on, rows = np.uint32(cells), np.uint16(0x7FFF)

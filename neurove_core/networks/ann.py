@@ -1,4 +1,4 @@
-"""The equal-size network without spikes, a baseline: convolutions, LSTM and readout as NeuroVE has them."""
+"""A network of equal size without spikes, as a baseline: convolutions, LSTM and readout in NeuroVE's layout."""
 
 import itertools
 from typing import NamedTuple
@@ -7,26 +7,26 @@ import torch
 from torch import Tensor, nn
 
 from neurove_core.config import ModelConfig
-from neurove_core.networks import state as carried
+from neurove_core.networks.state import is_finite
 from neurove_core.spiking.readout import readout_step
 
 
 class AnnState(NamedTuple):
-    """All that streams from window to window, for a batch of B streams."""
+    """State from window to window, for a batch of B streams."""
 
-    h: Tensor  # of the LSTM (L, B, N)
-    c: Tensor  # (L, B, N)
-    readout: Tensor  # potential of the outputs (B, 6n)
+    h: Tensor  # hidden state of the LSTM (L, B, N)
+    c: Tensor  # cell state of the LSTM (L, B, N)
+    readout: Tensor  # potential of the output neurons (B, 6n)
 
     def finite(self) -> bool:
-        """Whether no number of it is nan or infinite."""
-        return carried.finite(self)
+        """Whether every number of the state is finite."""
+        return is_finite(self)
 
 
 class Ann(nn.Module):
-    """As `network.NeuroVE`, with a ReLU for each LIF, and torch's LSTM for the ASLSTM; no other difference.
+    """NeuroVE with a ReLU in place of each LIF and torch's LSTM in place of the ASLSTM.
 
-    What has no counterpart: membranes of the feature extractor, which would be a memory of its own.
+    Differs: the feature extractor has no membranes, so it has no memory of its own.
     """
 
     def __init__(self, config: ModelConfig) -> None:
@@ -47,13 +47,13 @@ class Ann(nn.Module):
         self.kappa_logit = nn.Parameter(torch.tensor(-1.386))  # sigmoid gives 0.2
 
     def initial_state(self, batch: int = 1) -> AnnState:
-        """Every memory of `batch` streams at rest."""
+        """The zero state of `batch` streams."""
         zeros, net = self.readout.weight.new_zeros, self.config.network
         shape = (net.cells, batch, net.hidden)
         return AnnState(zeros(shape), zeros(shape), zeros(batch, 6 * self.bins))
 
     def forward(self, spikes: Tensor, state: AnnState) -> tuple[Tensor, AnnState]:
-        """Velocities of T consecutive windows, and the state after them; see `NeuroVE.forward`."""
+        """Twists of T consecutive windows, and the state after them; see `NeuroVE.forward`."""
         steps, batch = spikes.shape[:2]
         x = spikes.flatten(0, 1).contiguous(memory_format=torch.channels_last)
         for conv, norm in zip(self.convs, self.norms, strict=True):

@@ -1,4 +1,4 @@
-"""From a window's counts to the network's input."""
+"""Spike encoding: a window's event counts to the network's input."""
 
 from typing import Any
 
@@ -14,15 +14,15 @@ def to_spikes(counts: Tensor, encoding: str) -> Tensor:
     """A window's event counts as the network's input, channel 2i OFF and 2i + 1 ON of bin i.
 
     Source: NeuroVE, section III-A, spike encoding.
-    Differs: `log1p` keeps how many events a cell saw, as log(1 + count), and learns better (decision 5);
-    `binary` is the paper's spike: 1 where there was an event.
+    Differs: `log1p` keeps the number of events of a cell, as log(1 + count), and trains better (decision 5).
+    `binary` is the paper's encoding: 1 where there was an event.
 
     Args:
         counts: (..., 2n, H, W) uint8.
-        encoding: of NetworkConfig.
+        encoding: `encoding` of NetworkConfig.
 
     Returns:
-        float32 tensor of the same shape, on the CPU channels last in memory, as the convolution wants it.
+        float32 tensor of the same shape; on the CPU channels last in memory, the fastest layout for the convolution.
     """
     if counts.device.type != "cpu" or counts.dim() < 3 or not counts.is_contiguous() or counts.dtype != torch.uint8:
         return to_spikes_reference(counts, encoding)
@@ -30,14 +30,14 @@ def to_spikes(counts: Tensor, encoding: str) -> Tensor:
 
 
 def to_spikes_reference(counts: Tensor, encoding: str) -> Tensor:
-    """What to_spikes computes, in plain PyTorch."""
+    """The reference implementation of to_spikes, in plain PyTorch."""
     if encoding == "binary":
         return (counts > 0).to(torch.float32)
     return LOG1P.to(counts.device)[counts.to(torch.int64)]
 
 
 def _channels_last(counts: Tensor, table: Tensor) -> Tensor:
-    """Each count's entry of the table."""
+    """The table's entry for each count."""
     *before, channels, rows, columns = counts.shape
     planes = counts.numpy().reshape(-1, channels, rows * columns)
     spikes = np.empty((*before, rows, columns, channels), np.float32)

@@ -1,11 +1,11 @@
-"""The networks that a model may be made of, by the `kind` of its configuration: NeuroVE and its learned baselines.
+"""The kinds of networks, by the `kind` of a model's configuration: NeuroVE and its learned baselines.
 
-All of them speak one protocol, so that training, evaluation and the estimator serve any:
+All have the same interface, so that training, evaluation and the estimator work with any of them:
 
-    network.initial_state(batch) -> state            tensors in named tuples, see `carried`
+    network.initial_state(batch) -> state            tensors in named tuples, see state.py
     network(spikes, state) -> (twists, state)        (T, B, 2n, H, W) -> (T, B, n, 6), in scaled units
 
-The paper's w/o is a NeuroVE with `network.diffusion = false`.
+The paper's variant w/o diffusion is a NeuroVE with `network.diffusion = false`.
 """
 
 from collections.abc import Callable
@@ -22,18 +22,18 @@ Network = NeuroVE | Ann | SnnAng
 State = NetworkState | AnnState | SnnAngState
 
 KINDS: Final[dict[str, Callable[[ModelConfig], Network]]] = {"neurove": NeuroVE, "ann": Ann, "snn-ang": SnnAng}
-"""The classes by the kind of a configuration."""
+"""The class of each kind."""
 
 
 def make(config: ModelConfig) -> Network:
-    """The network of a configuration, its weights drawn anew."""
+    """A new network for a configuration, with random weights."""
     return KINDS[config.kind](config)
 
 
 def fired(state: State) -> dict[str, Tensor]:
-    """Which neurons fired in the step before, by layer; none of a network without spikes.
+    """Which neurons fired in the last step, by layer; empty for a network without spikes.
 
-    The state tells it: the membrane of a neuron of the feature extractor that has just fired is exactly 0.
+    It is derived from the state: the membrane of a neuron of the feature extractor that has just fired is exactly 0.
     """
     membranes = () if isinstance(state, AnnState) else state.membranes
     cells = state.cells if isinstance(state, NetworkState) else ()

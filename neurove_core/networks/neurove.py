@@ -8,8 +8,8 @@ from torch import Tensor, nn
 from torch.nn.functional import conv2d, linear
 
 from neurove_core.config import ModelConfig
-from neurove_core.networks import state as carried
 from neurove_core.networks.quantisation import rounded, rounded_input
+from neurove_core.networks.state import is_finite
 from neurove_core.spiking.alif import diffuse
 from neurove_core.spiking.aslstm import ASLSTM, ASLSTMState
 from neurove_core.spiking.lif import LIFParams, LIFState, lif_scan
@@ -17,22 +17,22 @@ from neurove_core.spiking.readout import readout_step
 
 
 class NetworkState(NamedTuple):
-    """All that streams from window to window, for a batch of B streams."""
+    """State from window to window, for a batch of B streams."""
 
     membranes: tuple[LIFState, ...]  # one per block of the feature extractor, (B, C, H, W)
     cells: tuple[ASLSTMState, ...]  # one per ASLSTM layer, (B, N)
-    readout: Tensor  # potential of the output neurons (B, 6n), and of those of the spread after them, where it has any
+    readout: Tensor  # potential of the output neurons (B, 6n), followed by those of the spread where there is one
 
     def finite(self) -> bool:
-        """Whether no number of it is nan or infinite."""
-        return carried.finite(self)
+        """Whether every number of the state is finite."""
+        return is_finite(self)
 
 
 class SpikingBlock(nn.Module):
     """Convolution of stride 2, threshold-dependent batch norm (tdBN, Zheng 2021), LIF.
 
     Differs: tdBN's factor v_th is the initial value of the norm's learnable weight, which spans the same functions.
-    With `int8` the convolution's weights are rounded to 8 bits, in training too (decision 38).
+    With `int8` the convolution's weights are rounded to 8 bits, also in training (decision 38).
     """
 
     def __init__(self, inputs: int, outputs: int, lif: LIFParams, *, int8: bool = False) -> None:
@@ -46,7 +46,9 @@ class SpikingBlock(nn.Module):
     def forward(self, spikes: Tensor, state: LIFState) -> tuple[Tensor, LIFState]:
         """(T, B, C, H, W) to (T, B, C', H', W'); the norm's statistics run over time and batch together."""
         steps, batch = spikes.shape[:2]
-        frames = spikes.flatten(0, 1).contiguous(memory_format=torch.channels_last)  # a convolution's own order on CPUs
+        frames = spikes.flatten(0, 1).contiguous(
+            memory_format=torch.channels_last
+        )  # the fastest layout for convolutions on CPUs
         if self._int8:
             current = self.norm(conv2d(frames, rounded(self.conv.weight), stride=2, padding=1))
         else:
@@ -57,8 +59,8 @@ class SpikingBlock(nn.Module):
 class NeuroVE(nn.Module):
     """The network of paper Fig. 2: one time step per window, 2n channels in, n twists out, all state streamed.
 
-    Its outputs are in the bundle's scaled units; Estimator turns them into m/s and rad/s. In int8 the weights of its
-    convolutions and of its projection are rounded to 8 bits, in training too (decision 38).
+    Its outputs are in the bundle's scaled units; Estimator converts them to m/s and rad/s. In int8 the weights of its
+    convolutions and of its projection are rounded to 8 bits, also in training (decision 38).
     """
 
     def __init__(self, config: ModelConfig) -> None:
@@ -93,14 +95,14 @@ class NeuroVE(nn.Module):
         else:
             self.register_buffer("d_space", d_space, persistent=False)
         self.readout = nn.Linear(net.hidden, 6 * self.bins)
-        self.spread: nn.Linear | None = None  # more output neurons: how far off each axis may be, see add_spread
+        self.spread: nn.Linear | None = None  # more output neurons, for the uncertainty of each axis; see add_spread
         self.kappa_logit = nn.Parameter(torch.tensor(-1.386))  # sigmoid gives 0.2
 
     def add_spread(self, rows: int = 6) -> nn.Linear:
-        """Give the network output neurons for the spread of its errors, at 0; returns them.
+        """Add output neurons for the spread of the errors, with zero weights, and return them.
 
-        They leak as those of the velocity and see what those see, and no answer depends on them. Their potentials, one
-        row for each axis, are log sigma of the newest window in units of the bundle's scale: see `log_sigma`.
+        They have the leak and the input of the velocity outputs, and no twist depends on them. Their potentials, one
+        row for each axis, are log sigma of the newest window in units of the bundle's scale; see `log_sigma`.
         """
         self.spread = nn.Linear(self.readout.in_features, rows)
         nn.init.zeros_(self.spread.weight)
@@ -108,11 +110,11 @@ class NeuroVE(nn.Module):
         return self.spread
 
     def log_sigma(self, state: NetworkState) -> Tensor | None:
-        """Potentials (B, rows) of the spread after the window that led to this state; None without a spread."""
+        """Log sigma (B, rows) of the window that led to this state; None without a spread."""
         return None if self.spread is None else state.readout[:, 6 * self.bins :]
 
     def outputs(self) -> tuple[Tensor, Tensor]:
-        """Weight (R, N) and bias (R) of all output neurons, R = 6n and the rows of the spread."""
+        """Weight (R, N) and bias (R) of all output neurons; R is 6n plus the rows of the spread."""
         if self.spread is None:
             return self.readout.weight, self.readout.bias
         both = self.readout, self.spread
@@ -128,7 +130,7 @@ class NeuroVE(nn.Module):
         return sizes
 
     def initial_state(self, batch: int = 1) -> NetworkState:
-        """Every membrane and memory of `batch` streams at rest."""
+        """The zero state of `batch` streams."""
         zeros = self.readout.weight.new_zeros
         membranes = tuple(
             LIFState(zeros(batch, channels, rows, columns).contiguous(memory_format=torch.channels_last))
@@ -141,13 +143,13 @@ class NeuroVE(nn.Module):
         return [cell for cell in self.cells if isinstance(cell, ASLSTM)]
 
     def forward(self, spikes: Tensor, state: NetworkState) -> tuple[Tensor, NetworkState]:
-        """Velocities of T consecutive windows, and the state after them.
+        """Twists of T consecutive windows, and the state after them.
 
-        Source: NeuroVE, section III-A to III-D: layer by layer, each over all time steps.
+        Source: NeuroVE, section III-A to III-D, computed layer by layer, each over all time steps.
 
         Args:
             spikes: (T, B, 2n, H, W) from encoding.to_spikes.
-            state: of these B streams, from initial_state or the call before.
+            state: state of these B streams, from initial_state or the previous call.
 
         Returns:
             twists (T, B, n, 6) in scaled units: vx vy vz wx wy wz, one per bin; and the next state.

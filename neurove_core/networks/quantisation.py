@@ -1,4 +1,4 @@
-"""Rounding of weights and input to 8 bits, for networks whose bundle asks for int8 (decision 38)."""
+"""Rounding of weights and input to 8 bits, for networks with precision int8 (decision 38)."""
 
 from typing import Final, NamedTuple
 
@@ -6,27 +6,27 @@ import torch
 from torch import Tensor
 
 LEVELS: Final = 32
-"""Of the input per unit; log1p of a saturated count, 5.5, becomes 177."""
+"""Steps of the input per unit; log1p of a saturated count, 5.5, becomes 177."""
 
-
-MAX_WEIGHT: Final = 127  # of a weight
+MAX_WEIGHT: Final = 127
+"""Largest absolute value of a rounded weight, in steps."""
 
 
 class Quantised(NamedTuple):
-    """Weights as whole numbers."""
+    """Weights as integers with a step for each output channel."""
 
-    q: Tensor  # (C', C, 3, 3) of a convolution, (F, I) of the projection, int8
+    q: Tensor  # int8: (C', C, 3, 3) of a convolution, (F, I) of the projection
     step: Tensor  # (C') float32, positive: weight = q * step
 
 
 def quantised(weight: Tensor) -> Quantised:
-    """The nearest multiples of a step per output channel, which is its largest weight / 127."""
+    """Round weights to the nearest multiple of a step per output channel: its largest absolute weight / 127."""
     whole, step = _multiples(weight)
     return Quantised(whole.to(torch.int8), step)
 
 
 def rounded(weight: Tensor) -> Tensor:
-    """The weights that `quantised` stands for, in float32; gradients pass as if nothing were rounded."""
+    """The values of `quantised` weights, in float32; gradients pass through unchanged (straight-through estimator)."""
     whole, step = _multiples(weight)
     return weight + whole.mul_(_by_output(step, weight)).sub_(weight.detach())  # in place: a projection may be large
 
@@ -42,10 +42,10 @@ def _by_output(step: Tensor, weight: Tensor) -> Tensor:
 
 
 def rounded_input(spikes: Tensor) -> Tensor:
-    """The input in steps of 1 / LEVELS."""
+    """The input rounded to steps of 1 / LEVELS."""
     return codes(spikes).to(spikes.dtype) / LEVELS
 
 
 def codes(spikes: Tensor) -> Tensor:
-    """The input as whole numbers, uint8, layout kept."""
+    """The input in steps of 1 / LEVELS, as uint8 in the same memory layout."""
     return (spikes * LEVELS).round_().clamp_(0, 255).to(torch.uint8)

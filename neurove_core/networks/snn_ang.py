@@ -1,4 +1,4 @@
-"""SNN-ANG, a baseline of the paper: spiking convolutions, a mean over the image, leaky outputs; no recurrent cell.
+"""SNN-ANG, a baseline of the paper: spiking convolutions, global average pooling, leaky outputs; no recurrent cell.
 
 Source: Gehrig, Shrestha, Mouritzen, Scaramuzza, Event-Based Angular Velocity Regression with Spiking Networks
 (ICRA 2020): five convolutions of 3x3 with 16, 32, 64, 128 and 256 channels and strides 2, 2, 2, 2, 1, thresholds and
@@ -14,40 +14,41 @@ import torch
 from torch import Tensor, nn
 
 from neurove_core.config import ModelConfig
-from neurove_core.networks import state as carried
+from neurove_core.networks.state import is_finite
 from neurove_core.spiking.lif import LIFParams, LIFState, lif_scan
 from neurove_core.spiking.readout import readout_step
 
 CHANNELS: Final = (16, 32, 64, 128, 256)
-"""Of its five layers."""
+"""Channels of its five layers."""
 
 THRESHOLDS: Final = (0.27, 0.25, 0.30, 0.40, 0.40)
 TAU_STEPS: Final = (2.0, 2.0, 4.0, 4.0, 4.0)
 OUTPUT_TAU_STEPS: Final = 8.0
-"""Its time constants in its steps of 1 ms; layers beyond the fifth are like the fifth."""
+"""Time constants of the paper in its time steps of 1 ms; layers after the fifth use those of the fifth."""
 
-_STRIDED: Final = 4  # so many layers halve the image
+_STRIDED: Final = 4  # number of layers that halve the image
 
 
 class SnnAngState(NamedTuple):
-    """All that streams from window to window, for a batch of B streams."""
+    """State from window to window, for a batch of B streams."""
 
     membranes: tuple[LIFState, ...]  # one per layer, (B, C, H, W)
-    readout: Tensor  # potential of the outputs (B, 6n)
+    readout: Tensor  # potential of the output neurons (B, 6n)
 
     def finite(self) -> bool:
-        """Whether no number of it is nan or infinite."""
-        return carried.finite(self)
+        """Whether every number of the state is finite."""
+        return is_finite(self)
 
 
 class SnnAng(nn.Module):
-    """SNN-ANG on the input of NeuroVE, and with its outputs; of the network's configuration it takes `channels`.
+    """SNN-ANG with the input and the outputs of NeuroVE. Of the network configuration it uses `channels`.
 
-    Differs from the paper, so that one recipe and one budget train all networks: one step per window, as ours, and its
-    time constants count in steps; LIF with a hard reset for its SRM neurons (whose double exponential and refractory
-    kernel of 1 to 4 ms have no meaning between windows of 50 ms); tdBN before each layer, without which nothing learns
-    in this many updates, and a border of zeros; our surrogate gradient, as wide as each threshold; linear velocity
-    beside the angular one. State goes on from window to window instead of beginning anew every 100 ms.
+    Differs: so that one recipe and one budget train all networks, this network has one step per window, as ours, and
+    its time constants count these steps; LIF neurons with a hard reset in place of SRM neurons (whose double
+    exponential and refractory kernel of 1 to 4 ms have no meaning between windows of 50 ms); tdBN before each layer,
+    without which nothing learns in this many updates, and zero padding; our surrogate gradient, as wide as each
+    threshold; linear velocity in addition to angular velocity; state that continues from window to window instead of
+    a reset every 100 ms.
     """
 
     def __init__(self, config: ModelConfig) -> None:
@@ -72,13 +73,13 @@ class SnnAng(nn.Module):
         self.readout = nn.Linear(net.channels[-1], 6 * self.bins)
 
     def initial_state(self, batch: int = 1) -> SnnAngState:
-        """Every membrane of `batch` streams at rest."""
+        """The zero state of `batch` streams."""
         zeros = self.readout.weight.new_zeros
         membranes = tuple(LIFState(zeros(batch, *size)) for size in self._sizes)
         return SnnAngState(membranes, zeros(batch, 6 * self.bins))
 
     def forward(self, spikes: Tensor, state: SnnAngState) -> tuple[Tensor, SnnAngState]:
-        """Velocities of T consecutive windows, and the state after them; see `NeuroVE.forward`."""
+        """Twists of T consecutive windows, and the state after them; see `NeuroVE.forward`."""
         steps, batch = spikes.shape[:2]
         membranes = []
         for conv, norm, lif, membrane in zip(self.convs, self.norms, self._lif, state.membranes, strict=True):

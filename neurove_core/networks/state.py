@@ -1,4 +1,4 @@
-"""What a network carries from window to window: tensors in named tuples, nested in whatever way."""
+"""Functions of network states: tensors in named tuples, nested to any depth, that continue from window to window."""
 
 import math
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ S = TypeVar("S")
 
 
 def tensors_of(state: Any) -> Iterator[Tensor]:
-    """All tensors of a state, in its order.
+    """All tensors of a state, in order.
 
     >>> from neurove_core.spiking.lif import LIFState
     >>> [float(one) for one in tensors_of((LIFState(torch.tensor(1.0)), torch.tensor(2.0)))]
@@ -24,16 +24,16 @@ def tensors_of(state: Any) -> Iterator[Tensor]:
         yield from tensors_of(part)
 
 
-def finite(state: Any) -> bool:
-    """Whether no number of a state is nan or infinite."""
+def is_finite(state: Any) -> bool:
+    """Whether every number of a state is finite."""
     if all(math.isfinite(tensor.sum().item()) for tensor in tensors_of(state)):
-        return True  # one of either makes any sum so, and a sum costs a third of a look at each number
+        return True  # nan or inf makes a sum so, and a sum costs a third of a test of each number
     return all(bool(torch.isfinite(tensor).all()) for tensor in tensors_of(state))
 
 
 def detached(state: S) -> S:
-    """The state without its past: gradients do not flow into the chunk before."""
+    """The state without its gradient history: gradients do not flow into the previous chunk."""
     if isinstance(state, Tensor):
         return state.detach()  # type: ignore[return-value]  # S is Tensor here
-    parts = [detached(part) for part in state]  # type: ignore[attr-defined]  # a tuple, by what a state is
+    parts = [detached(part) for part in state]  # type: ignore[attr-defined]  # a state is a tuple
     return type(state)(*parts) if hasattr(state, "_fields") else type(state)(parts)  # type: ignore[call-arg]  # tuples

@@ -1,4 +1,13 @@
-"""ALIF: LIF neurons with astrocyte diffusion across layers and across time; Eq. (2), (3), (6)."""
+"""ALIF neurons: LIF with astrocyte diffusion across layers and across time.
+
+    J(i, j) = D (V_i - V_j)                                            Eq. (2); with V_j = 0: J = D V_i
+    v = decay v' + f(spikes_before + d_space v_before) + d_time v'     membrane potential before the reset
+    s = [v >= v_th];  v <- v (1 - s)
+
+Source: NeuroVE, Eq. (2), Eq. (3): tau dV/dt = -(V - V_rest) + R (I + J), and its iterative form, Eq. (6a) to (6c):
+V(t+1) = (1 - S) V + f(X + D V_i), S = H(V). J across time, J(t-1, t) = D V(t-1), is that of Eq. (9).
+Differs: the leak `decay` is kept, which Eq. (6a) drops; so D is the only difference from LIF (decision 4).
+"""
 
 import math
 from collections.abc import Callable
@@ -13,10 +22,10 @@ from neurove_core.spiking.surrogate import Surrogate
 
 
 class ALIFParams(NamedTuple):
-    """A LIF population with the two astrocyte diffusions of the paper, each a coefficient or one per neuron."""
+    """Constants of an ALIF population; each diffusion is one coefficient, or one for each neuron."""
 
     lif: LIFParams
-    d_space: Tensor | float  # D of J = D V_i: from the neurons of the layer before, inside f (Eq. 6a)
+    d_space: Tensor | float  # D of J = D V_i: from the neurons of the previous layer, inside f (Eq. 6a)
     d_time: Tensor | float = 0.0  # D of J(t-1, t) = D V(t-1): from the same neuron one step ago (Eq. 9)
 
 
@@ -27,17 +36,17 @@ def alif_step(
     params: ALIFParams,
     f: Callable[[Tensor], Tensor],
 ) -> tuple[Tensor, LIFState]:
-    """One time step of an ALIF population fed by the layer before it.
+    """One time step of an ALIF population with input from the previous layer.
 
     Source: NeuroVE, Eq. (6): V <- (1 - S) V + f(X + D V_i), S = [V >= v_th].
-    Differs: keeps the leak that Eq. (6) simplifies away, so that D is its only difference to LIF (decision 4).
+    Differs: the leak is kept, see the module (decision 4).
 
     Args:
-        spikes_before: X, spikes of the layer before (B, M).
+        spikes_before: X, spikes of the previous layer (B, M).
         v_before: V_i, its membrane potentials at this step (B, M).
-        state: of this population (B, N).
-        params: thresholds, leak, diffusion.
-        f: the operator from M to N, linear or convolution.
+        state: state of this population (B, N).
+        params: threshold, leak and diffusion.
+        f: the operator from M to N, a linear map or a convolution.
 
     Returns:
         spikes (B, N) and the next state.
@@ -47,12 +56,12 @@ def alif_step(
 
 
 def alif_potential(current: Tensor, state: LIFState, params: ALIFParams) -> Tensor:
-    """The membrane potential V of an ALIF population before it fires; current is f(X + D V_i) (Eq. 6a)."""
+    """The membrane potential v of an ALIF population before the reset; current is f(X + D V_i) of Eq. (6a)."""
     return params.lif.decay * state.v + current + params.d_time * state.v
 
 
 def diffuse(spikes: Tensor, v: Tensor, d: Tensor | float) -> Tensor:
-    """X + D V: what the next layer receives, spikes and the potential that diffuses beside them (Eq. 2, 6a)."""
+    """X + D V, the input of the next layer: spikes plus the potential that diffuses (Eq. 2, 6a)."""
     return spikes + d * v
 
 
@@ -62,17 +71,17 @@ class ALIF(nn.Module):
     Source: NeuroVE, Eq. (6), as alif_step; across time J(t-1, t) of Eq. (9).
 
     Args:
-        inputs: I, width of the layer before.
+        inputs: I, width of the previous layer.
         hidden: N, number of neurons.
         decay: 1 - dt/tau per step, 0 to below 1; the literal leakless Eq. (6a) is the limit 1.
         v_th: firing threshold.
-        d_space: initial D of J = D V_i, one per neuron of the layer before.
+        d_space: initial D of J = D V_i, one per neuron of the previous layer.
         d_time: initial D of J(t-1, t) = D V(t-1) of the same neuron, one per neuron.
-        surrogate: of the spike's gradient.
-        surrogate_width: of the same, in units of the potential.
+        surrogate: kind of the spike's surrogate gradient.
+        surrogate_width: width of the surrogate, in units of the potential.
 
     Raises:
-        InvalidField: a value is out of its bound.
+        InvalidField: a value is out of its bounds.
     """
 
     def __init__(
@@ -90,7 +99,7 @@ class ALIF(nn.Module):
         super().__init__()
         require_shape_of_layer("ALIF", inputs=inputs, hidden=hidden)
         require(0 <= d_space < math.inf, "ALIF", "d_space", d_space, "must be at least 0 and finite")
-        require(0 <= d_time < 1, "ALIF", "d_time", d_time, "must be at least 0 and below 1, for it acts as a leak")
+        require(0 <= d_time < 1, "ALIF", "d_time", d_time, "must be at least 0 and below 1, because it acts as a leak")
         self.hidden = hidden
         self.lif = lif_params("ALIF", decay, v_th, surrogate, surrogate_width)
         self.f = nn.Linear(inputs, hidden)
@@ -98,23 +107,23 @@ class ALIF(nn.Module):
         self.d_time = nn.Parameter(torch.full((hidden,), float(d_time)))
 
     def params(self) -> ALIFParams:
-        """The layer's constants and diffusions, for alif_step; f is the layer's `f`."""
+        """The constants and diffusions for alif_step; f is the layer's `f`."""
         return ALIFParams(self.lif, self.d_space, self.d_time)
 
     def initial_state(self, batch: int) -> LIFState:
-        """Everything at rest."""
+        """The zero state."""
         return LIFState(self.f.weight.new_zeros(batch, self.hidden))
 
     def forward(self, x: Tensor, state: LIFState, v_before: Tensor | None = None) -> tuple[NeuronSteps, LIFState]:
         """Scan a sequence to spikes and potentials of all steps, and the last state.
 
         Args:
-            x: X, spikes of the layer before, or plain input (T, B, I).
-            state: from initial_state or the call before.
-            v_before: V_i, potentials of the layer before (T, B, I), NeuronSteps.v; None where there is no such layer.
+            x: X, spikes of the previous layer, or an external input (T, B, I).
+            state: from initial_state or the previous call.
+            v_before: V_i, potentials of the previous layer (T, B, I), NeuronSteps.v; None where there is no such layer.
 
         Raises:
-            InvalidField: x or v_before is no sequence of this width, or the state is not of its batch.
+            InvalidField: x or v_before is not a sequence of this width, or the state has another batch size.
         """
         require_sequence("ALIF", x, self.f.in_features, state, self.hidden)
         if v_before is not None:

@@ -1,4 +1,14 @@
-"""ASLSTM, SLSTM and the readout: parameters, state, one step, and the same over a sequence (paper section III-C)."""
+"""ASLSTM cells: spiking LSTM cells whose output stage is an ALIF neuron.
+
+    i, f, g, o = W_x x + W_v v' + b                                   input of the gates
+    c = sigmoid(f) c' + sigmoid(i) tanh(g);  h = sigmoid(o) tanh(c)   long-term memory, hidden value
+    v = alpha (1 - s') h + f(x) + d_time v'                           membrane potential; f(x) is linear
+    s = [v >= v_th]                                                   spike
+
+Source: NeuroVE, section III-C, Eq. (7) and (9): A(h, x, v') = alpha (1 - s') h + f(x + J(t-1, t)).
+Differs: gates and f have a bias. J(t-1, t) = d_time v' is added outside f, because x and v differ in width (decision
+4). No gradient flows through the reset (1 - s').
+"""
 
 from typing import NamedTuple
 
@@ -17,7 +27,7 @@ from neurove_core.spiking.surrogate import Surrogate, spike
 
 
 class ASLSTMState(NamedTuple):
-    """What a layer of N cells carries to the next step."""
+    """State of a layer of N cells."""
 
     c: Tensor  # long-term memory (B, N)
     v: Tensor  # membrane potential before the reset (B, N)
@@ -25,12 +35,12 @@ class ASLSTMState(NamedTuple):
 
 
 class ASLSTMParams(NamedTuple):
-    """Weights of one layer; rows of w_x and b are the input, forget, cell, output gate, then f."""
+    """Weights of one layer; the rows of w_x and b are input, forget, cell and output gate, then f."""
 
     w_x: Tensor  # (5N, I)
-    w_v: Tensor  # (4N, N): the gates see the membrane potential
+    w_v: Tensor  # (4N, N): from the membrane potential to the gates
     b: Tensor  # (5N)
-    d_time: Tensor  # (N): diffusion from the same neuron one step ago; zeros without it
+    d_time: Tensor  # (N): diffusion from the same neuron one step ago; zeros without diffusion
     alpha: float
     v_th: float
     surrogate: Surrogate = "rectangular"
@@ -38,18 +48,15 @@ class ASLSTMParams(NamedTuple):
 
 
 def aslstm_step(x: Tensor, state: ASLSTMState, params: ASLSTMParams) -> ASLSTMState:
-    """One time step of an ASLSTM layer; the state that comes out holds its answer, spikes s and potentials v.
+    """One time step of an ASLSTM layer; the returned state has its output, spikes s and potentials v.
 
-    Source: NeuroVE, Eq. (7) and (9):
-        c = sigmoid(f) c' + sigmoid(i) tanh(g);  h = sigmoid(o) tanh(c)
-        v = alpha (1 - s') h + f(x + J(t-1, t));  s = [v >= v_th]
-    Differs: gates and f have a bias; J(t-1, t) = d_time v' is added beside f, for x and v differ in width (decision
-    4); the gradient through the reset (1 - s') is cut.
+    Source: NeuroVE, Eq. (7) and (9).
+    Differs: see the module (decision 4).
 
     Args:
         x: input (B, I); for a layer above another, diffuse(s, v, D) of the one below.
-        state: of the step before.
-        params: of this layer.
+        state: state of the step before.
+        params: weights of this layer.
     """
     from_x = torch.nn.functional.linear(x, params.w_x, params.b)
     width = state.c.shape[-1]
@@ -62,7 +69,9 @@ def aslstm_step(x: Tensor, state: ASLSTMState, params: ASLSTMParams) -> ASLSTMSt
 
 
 class ASLSTM(nn.Module):
-    """One layer of N ASLSTM cells with learnable weights and per-neuron diffusion, state in and out.
+    """One layer of N ASLSTM cells with learnable weights and diffusion per neuron, state in and out.
+
+    Source: NeuroVE, Eq. (7) and (9), as aslstm_step.
 
     Args:
         inputs: I, width of the input.
@@ -70,11 +79,11 @@ class ASLSTM(nn.Module):
         alpha: share of h in the membrane, 0 to 1.
         v_th: firing threshold.
         diffusion: False gives the paper's ASLSTM-w/o: D = 0 everywhere.
-        surrogate: of the spike's gradient.
-        surrogate_width: of the same.
+        surrogate: kind of the spike's surrogate gradient.
+        surrogate_width: width of the surrogate, in units of the potential.
 
     Raises:
-        InvalidField: a value is out of its bound.
+        InvalidField: a value is out of its bounds.
     """
 
     d_time: Tensor
@@ -105,11 +114,11 @@ class ASLSTM(nn.Module):
         self._constants = (alpha, v_th, surrogate, surrogate_width)
 
     def params(self) -> ASLSTMParams:
-        """The layer's weights, for aslstm_step."""
+        """The weights for aslstm_step."""
         return ASLSTMParams(self.w_x, self.w_v, self.b, self.d_time, *self._constants)
 
     def initial_state(self, batch: int) -> ASLSTMState:
-        """Everything at rest."""
+        """The zero state."""
         zeros = self.w_x.new_zeros(batch, self.hidden)
         return ASLSTMState(zeros, zeros, zeros)
 
@@ -117,7 +126,7 @@ class ASLSTM(nn.Module):
         """Scan a sequence: x (T, B, I) to the states of all steps, each field (T, B, N), and the last one.
 
         Raises:
-            InvalidField: x is no sequence of this width, or the state is not of its batch.
+            InvalidField: x is not a sequence of this width, or the state has another batch size.
         """
         params = self.params()
         require_sequence("ASLSTM", x, params.w_x.shape[1], state, self.hidden)

@@ -1,4 +1,4 @@
-"""What layers of neurons and cells share: drawn weights, a step over a sequence, and what is refused."""
+"""Shared parts of the layers: random weights, a step repeated over a sequence, and checks of arguments."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -17,7 +17,7 @@ ParamsT = TypeVar("ParamsT")
 def scan_of(
     step: Callable[[Tensor, StateT, ParamsT], StateT], x: Tensor, state: StateT, params: ParamsT
 ) -> tuple[StateT, StateT]:
-    """A step over a sequence (T, B, I): the states of all steps, each field (T, B, N), and the last one."""
+    """Repeat a step over a sequence (T, B, I): the states of all steps, each field (T, B, N), and the last one."""
     steps = []
     for x_t in x:
         state = step(x_t, state, params)
@@ -27,7 +27,7 @@ def scan_of(
 
 
 def drawn_weights(hidden: int, *shape: int) -> nn.Parameter:
-    """Weights of a layer of N neurons, uniform within 1 / sqrt(N) of 0."""
+    """Random weights of a layer of N neurons, uniform between -1 / sqrt(N) and 1 / sqrt(N)."""
     bound = hidden**-0.5
     return nn.Parameter(torch.empty(shape).uniform_(-bound, bound))
 
@@ -39,7 +39,7 @@ def require(ok: bool, what: str, field: str, value: object, bound: str) -> None:
 
 
 def require_threshold(what: str, v_th: float, surrogate: str, surrogate_width: float) -> None:
-    """A finite threshold above 0, a known surrogate and a finite width above 0, or InvalidField."""
+    """Raise InvalidField unless threshold and width are finite and above 0 and the surrogate is known."""
     require(0 < v_th < math.inf, what, "v_th", v_th, "must be above 0 and finite")
     known = SURROGATES
     require(surrogate in known, what, "surrogate", surrogate, f"must be one of {', '.join(known)}")
@@ -47,19 +47,19 @@ def require_threshold(what: str, v_th: float, surrogate: str, surrogate_width: f
 
 
 def require_shape_of_layer(what: str, **widths: int) -> None:
-    """Numbers of inputs and neurons of at least 1, or InvalidField."""
+    """Raise InvalidField unless each width is at least 1."""
     for name, width in widths.items():
         require(width >= 1, what, name, width, "must be at least 1")
 
 
 def require_width(what: str, x: Tensor, inputs: int) -> None:
-    """An input (..., I) of the layer's width, or InvalidField."""
-    if x.shape[-1:] != (inputs,):  # no call, no text, in the usual case: this runs once per step
+    """Raise InvalidField unless the input (..., I) has the layer's width."""
+    if x.shape[-1:] != (inputs,):  # without a call in the usual case, because this runs once per step
         raise InvalidField(what, "x.shape", tuple(x.shape), f"its last axis must be {inputs} wide")
 
 
 def require_sequence(what: str, x: Tensor, inputs: int, state: Sequence[Tensor], hidden: int) -> None:
-    """A sequence (T, B, I) of at least one step, and a state (B, N) that goes with it, or InvalidField."""
+    """Raise InvalidField unless x is a sequence (T, B, I) of at least one step and the state is (B, N)."""
     bound = f"must be (T, B, {inputs}), T at least 1"
     require(x.dim() == 3 and x.shape[0] >= 1 and x.shape[2] == inputs, what, "x.shape", tuple(x.shape), bound)
     want = (x.shape[1], hidden)

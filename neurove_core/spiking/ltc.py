@@ -1,4 +1,13 @@
-"""LTC: liquid time-constant spiking neurons (Yin 2023), a baseline of the paper."""
+"""LTC: liquid time-constant spiking neurons, a baseline of the paper.
+
+    d = W_x x + W_s s' + b                  input current
+    a = sigmoid(W_a [d, m'] + b_a)          inverse time constant, 0 to 1
+    u = m' + (d - m') a                     membrane potential before the reset
+    s = [u >= v_th];  m = u (1 - s)         spike, and the potential after the reset
+
+Source: Yin 2023, the baseline LTC of NeuroVE, section IV-B.
+Differs: fires at u >= v_th, as all neurons here (Yin: u > v_th). No gradient flows through the reset.
+"""
 
 from typing import NamedTuple
 
@@ -18,12 +27,12 @@ from neurove_core.spiking.surrogate import Surrogate, spike
 
 
 class LTCParams(NamedTuple):
-    """Weights of a population of N liquid time-constant spiking neurons (Yin 2023)."""
+    """Weights of a population of N liquid time-constant spiking neurons."""
 
     w_x: Tensor  # (N, I)
     w_s: Tensor  # (N, N): the population's own spikes of the step before
     b: Tensor  # (N)
-    w_a: Tensor  # (N, 2N): of the time constant, first N columns for d, then N for m
+    w_a: Tensor  # (N, 2N): weights of the time constant, N columns for d, then N for m
     b_a: Tensor  # (N)
     v_th: float = 0.5
     surrogate: Surrogate = "rectangular"
@@ -31,24 +40,22 @@ class LTCParams(NamedTuple):
 
 
 class LTCState(NamedTuple):
-    """What a population of liquid time-constant neurons carries to the next step."""
+    """State of a population of liquid time-constant neurons."""
 
     m: Tensor  # membrane potential after the reset (B, N)
     s: Tensor  # spikes (B, N)
 
 
 def ltc_step(x: Tensor, state: LTCState, params: LTCParams) -> LTCState:
-    """One time step of an LTC population; the state that comes out holds its spikes s.
+    """One time step of an LTC population; the returned state has its spikes s.
 
-    Source: Yin 2023, the baseline LTC of NeuroVE, section IV-B:
-        d = W [x, s'] + b;  a = sigmoid(W_a [d, m'] + b_a);  u = m' + (d - m') a
-        s = [u >= v_th];  m = u (1 - s)
-    Differs: fires at u >= v_th, as all neurons here (Yin: u > v_th); the gradient through the reset is cut.
+    Source: Yin 2023, the baseline LTC of NeuroVE, section IV-B.
+    Differs: see the module.
 
     Args:
         x: input (B, I).
-        state: of the step before; zeros at the start.
-        params: of the whole population.
+        state: state of the step before; zeros at the start.
+        params: weights of the population.
 
     Raises:
         InvalidField: x is not I wide.
@@ -70,11 +77,11 @@ class LTC(nn.Module):
         inputs: I, width of the input.
         hidden: N, number of neurons.
         v_th: firing threshold; 0.5 is Yin's.
-        surrogate: of the spike's gradient.
-        surrogate_width: of the same, in units of the potential.
+        surrogate: kind of the spike's surrogate gradient.
+        surrogate_width: width of the surrogate, in units of the potential.
 
     Raises:
-        InvalidField: a value is out of its bound.
+        InvalidField: a value is out of its bounds.
     """
 
     def __init__(
@@ -98,11 +105,11 @@ class LTC(nn.Module):
         self._constants = (v_th, surrogate, surrogate_width)
 
     def params(self) -> LTCParams:
-        """The layer's weights, for ltc_step."""
+        """The weights for ltc_step."""
         return LTCParams(self.w_x, self.w_s, self.b, self.w_a, self.b_a, *self._constants)
 
     def initial_state(self, batch: int) -> LTCState:
-        """Everything at rest."""
+        """The zero state."""
         zeros = self.w_x.new_zeros(batch, self.hidden)
         return LTCState(zeros, zeros)
 
@@ -110,7 +117,7 @@ class LTC(nn.Module):
         """Scan a sequence: x (T, B, I) to the states of all steps, each field (T, B, N), and the last one.
 
         Raises:
-            InvalidField: x is no sequence of this width, or the state is not of its batch.
+            InvalidField: x is not a sequence of this width, or the state has another batch size.
         """
         params = self.params()
         require_sequence("LTC", x, params.w_x.shape[1], state, self.hidden)

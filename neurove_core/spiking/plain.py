@@ -1,4 +1,4 @@
-"""The switch between the fused path and the reference implementation."""
+"""The switch between the compiled path and the reference implementation, plain PyTorch."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,7 +9,7 @@ _PLAIN: ContextVar[bool] = ContextVar("plain", default=False)
 
 @contextmanager
 def plain() -> Iterator[None]:
-    """Inside this, nothing is fused: each step is plain PyTorch, the reference that the fast path is held against."""
+    """Run the body without compiled code: each step is plain PyTorch, the reference of the fast path."""
     token = _PLAIN.set(True)
     try:
         yield
@@ -18,5 +18,5 @@ def plain() -> Iterator[None]:
 
 
 def is_plain() -> bool:
-    """Whether the caller runs inside `plain()`."""
+    """Whether the caller runs inside `plain()`, in this thread or task."""
     return _PLAIN.get()

@@ -1,4 +1,10 @@
-"""The output neurons O; Eq. (8)."""
+"""The output neurons O: a leaky membrane without a reset, whose potential is the network's output.
+
+    y = kappa y' + f(z),  z = x + J,  0 < kappa < 1         f is linear; z comes from alif.diffuse
+
+Source: NeuroVE, Eq. (8): O(v, x) = kappa v + f(x + J(t-1, t)).
+Differs: v of the equation is the output neuron's own potential y', read at every step (decision 4).
+"""
 
 import math
 
@@ -9,17 +15,20 @@ from neurove_core.spiking.layers import require, require_sequence, require_shape
 
 
 def readout_step(z: Tensor, y: Tensor, weight: Tensor, bias: Tensor, kappa: Tensor | float) -> Tensor:
-    """The output neurons O: a leaky membrane without a reset, whose potential is the answer.
+    """One time step of the output neurons.
 
-    Source: NeuroVE, Eq. (8): y = kappa y' + f(x + J), 0 < kappa < 1, with z = x + J from diffuse.
-    Differs: v of the equation is the output neuron's own potential y', read at every step (decision 4).
+    Source: NeuroVE, Eq. (8).
+    Differs: see the module (decision 4).
 
     Args:
-        z: (B, N).
+        z: spikes plus diffusing potential of the layer below (B, N).
         y: potential of the step before (B, K).
         weight: (K, N).
         bias: (K).
         kappa: leak per step.
+
+    Returns:
+        potential of this step (B, K).
     """
     return kappa * y + torch.nn.functional.linear(z, weight, bias)
 
@@ -35,7 +44,7 @@ class Readout(nn.Module):
         kappa: initial leak per step, between 0 and 1.
 
     Raises:
-        InvalidField: a value is out of its bound.
+        InvalidField: a value is out of its bounds.
     """
 
     def __init__(self, inputs: int, outputs: int, *, kappa: float = 0.2) -> None:
@@ -47,18 +56,18 @@ class Readout(nn.Module):
 
     @property
     def kappa(self) -> Tensor:
-        """The leak per step, between 0 and 1 whatever the training does to its logit."""
+        """The leak per step, between 0 and 1 for any value of its logit."""
         return torch.sigmoid(self.kappa_logit)
 
     def initial_state(self, batch: int) -> Tensor:
-        """Potentials at rest (B, K)."""
+        """Zero potentials (B, K)."""
         return self.f.weight.new_zeros(batch, self.f.out_features)
 
     def forward(self, z: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
-        """Scan a sequence: z = diffuse(s, v, D) of the layer below (T, B, N) to potentials (T, B, K), and the last.
+        """Scan a sequence: z = diffuse(s, v, D) of the layer below (T, B, N) to potentials (T, B, K), and the last one.
 
         Raises:
-            InvalidField: z is no sequence of this width, or y is not of its batch.
+            InvalidField: z is not a sequence of this width, or y has another batch size.
         """
         require_sequence("Readout", z, self.f.in_features, (y,), self.f.out_features)
         kappa, answers = self.kappa, []

@@ -1,4 +1,14 @@
-"""SLSTM: spiking LSTM cells (Henkes 2024), a baseline of the paper."""
+"""SLSTM: spiking LSTM cells, a baseline of the paper.
+
+    i, f, g, o = W_x x + W_v v' + b                                   input of the gates
+    c = sigmoid(f) c' + sigmoid(i) tanh(g);  h = sigmoid(o) tanh(c)   long-term memory, hidden value
+    v = h - v_th s'                                                   membrane potential
+    s = [v >= v_th]                                                   spike
+
+Source: Henkes 2024, the baseline SLSTM of NeuroVE, section IV-B.
+Differs: no gradient flows through the reset v_th s'. snnTorch 1.0.0 starts from a zero state at every step where inputs
+and hidden sizes differ; this cell never does.
+"""
 
 from typing import NamedTuple
 
@@ -17,18 +27,18 @@ from neurove_core.spiking.surrogate import Surrogate, spike
 
 
 class SLSTMState(NamedTuple):
-    """What a layer of N spiking LSTM cells carries to the next step."""
+    """State of a layer of N spiking LSTM cells."""
 
     c: Tensor  # long-term memory (B, N)
-    v: Tensor  # membrane potential (B, N), after the subtraction of the last spike, before that of this one
+    v: Tensor  # membrane potential (B, N), after the last spike is subtracted and before this one is
     s: Tensor  # spikes (B, N)
 
 
 class SLSTMParams(NamedTuple):
-    """Weights of one layer; rows of w_x, w_v and b are the input, forget, cell and output gate, as in ASLSTMParams."""
+    """Weights of one layer; rows of w_x, w_v and b are input, forget, cell and output gate, as in ASLSTMParams."""
 
     w_x: Tensor  # (4N, I)
-    w_v: Tensor  # (4N, N): the gates see the membrane potential
+    w_v: Tensor  # (4N, N): from the membrane potential to the gates
     b: Tensor  # (4N)
     v_th: Tensor | float  # one for all, or one per neuron (N)
     surrogate: Surrogate = "rectangular"
@@ -36,17 +46,15 @@ class SLSTMParams(NamedTuple):
 
 
 def slstm_step(x: Tensor, state: SLSTMState, params: SLSTMParams) -> SLSTMState:
-    """One time step of an SLSTM layer; the state that comes out holds its answer, spikes s and potentials v.
+    """One time step of an SLSTM layer; the returned state has its output, spikes s and potentials v.
 
-    Source: Henkes 2024, the baseline SLSTM of NeuroVE, section IV-B; gates i, f, g, o from x and v':
-        c = sigmoid(f) c' + sigmoid(i) tanh(g);  h = sigmoid(o) tanh(c);  v = h - v_th s';  s = [v >= v_th]
-    Differs: the gradient through the reset v_th s' is cut; snnTorch 1.0.0 begins from a zero state at every step
-    where inputs and hidden sizes differ, this cell never does.
+    Source: Henkes 2024, the baseline SLSTM of NeuroVE, section IV-B.
+    Differs: see the module.
 
     Args:
         x: input (B, I).
-        state: of the step before.
-        params: of this layer.
+        state: state of the step before.
+        params: weights of this layer.
 
     Raises:
         InvalidField: x is not I wide.
@@ -62,15 +70,17 @@ def slstm_step(x: Tensor, state: SLSTMState, params: SLSTMParams) -> SLSTMState:
 class SLSTM(nn.Module):
     """One layer of N spiking LSTM cells with learnable weights, state in and out.
 
+    Source: Henkes 2024, as slstm_step.
+
     Args:
         inputs: I, width of the input.
         hidden: N, number of cells.
         v_th: firing threshold; h stays below 1, so a cell with a threshold of 1 or more never fires.
-        surrogate: of the spike's gradient.
-        surrogate_width: of the same.
+        surrogate: kind of the spike's surrogate gradient.
+        surrogate_width: width of the surrogate, in units of the potential.
 
     Raises:
-        InvalidField: a value is out of its bound.
+        InvalidField: a value is out of its bounds.
     """
 
     def __init__(
@@ -92,11 +102,11 @@ class SLSTM(nn.Module):
         self._constants = (v_th, surrogate, surrogate_width)
 
     def params(self) -> SLSTMParams:
-        """The layer's weights, for slstm_step."""
+        """The weights for slstm_step."""
         return SLSTMParams(self.w_x, self.w_v, self.b, *self._constants)
 
     def initial_state(self, batch: int) -> SLSTMState:
-        """Everything at rest."""
+        """The zero state."""
         zeros = self.w_x.new_zeros(batch, self.hidden)
         return SLSTMState(zeros, zeros, zeros)
 
@@ -104,7 +114,7 @@ class SLSTM(nn.Module):
         """Scan a sequence: x (T, B, I) to the states of all steps, each field (T, B, N), and the last one.
 
         Raises:
-            InvalidField: x is no sequence of this width, or the state is not of its batch.
+            InvalidField: x is not a sequence of this width, or the state has another batch size.
         """
         params = self.params()
         require_sequence("SLSTM", x, params.w_x.shape[1], state, self.hidden)

@@ -1,4 +1,13 @@
-"""spike: Heaviside step forward, a surrogate gradient backward (paper Eq. 6c and the sentence below it; Wu 2018)."""
+"""The spike function: a Heaviside step in the forward pass, a surrogate gradient in the backward pass.
+
+    s = [u >= 0],  u = v - v_th                             forward
+    ds/du = 1/width where |u| < width/2, else 0             rectangular (Wu 2018, h1)
+    ds/du = max(0, 1 - |u|/width) / width                   triangle
+    ds/du = (1/width) / (1 + (pi u / width)^2)              arctan
+
+Source: NeuroVE, Eq. (6b) and (6c), and the sentence below them about the surrogate; Wu 2018.
+Differs: the paper names no width; each surrogate here has area 1 over u.
+"""
 
 import math
 from typing import Any, Literal, get_args
@@ -26,11 +35,7 @@ class _Spike(torch.autograd.Function):
 
 
 def surrogate_gradient(u: Tensor, kind: Surrogate, width: float) -> Tensor:
-    """The stand-in for the derivative of the step at u; each kind has area 1 over u.
-
-    `rectangular`: 1/width where |u| < width/2 (Wu 2018, h1). `triangle`: max(0, 1 - |u|/width)/width.
-    `arctan`: (1/width) / (1 + (pi u / width)^2).
-    """
+    """The surrogate of the step's derivative at u; each kind has area 1 over u. The module has the equations."""
     if kind == "rectangular":
         return (u.abs() < width / 2).to(u.dtype) / width
     if kind == "triangle":
@@ -39,12 +44,12 @@ def surrogate_gradient(u: Tensor, kind: Surrogate, width: float) -> Tensor:
 
 
 def spike(u: Tensor, kind: Surrogate = "rectangular", width: float = 1.0) -> Tensor:
-    """1 where u >= 0, else 0; its gradient is the surrogate's.
+    """1 where u >= 0, else 0; its gradient is the surrogate gradient.
 
     Source: NeuroVE, Eq. (6b, 6c), with u = V - V_th.
 
     Raises:
-        InvalidField: the surrogate is unknown.
+        InvalidField: the kind of surrogate is unknown.
 
     >>> spike(torch.tensor([-0.1, 0.0, 0.1]))
     tensor([0., 1., 1.])

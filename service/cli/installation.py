@@ -79,14 +79,14 @@ def check_engine() -> Check:
         return Check("fast path", f"unknown: {', '.join(missing)} not installed", "info")
     from neurove_core import models
     from neurove_core.engine.engine import Engine
-    from neurove_core.engine.vectors import multiplies_bytes
+    from neurove_core.engine.vectors import has_byte_products
     from neurove_core.networks.neurove import NeuroVE
 
     network = models.find(models.DEFAULT).network
     if not isinstance(network, NeuroVE):
         return Check("fast path", "none: the built-in model is no NeuroVE network", "info")
     precision = network.config.network.precision
-    int8 = f"int8 models {'with' if multiplies_bytes() else 'without'} VNNI"
+    int8 = f"int8 models {'with' if has_byte_products() else 'without'} VNNI"
     if precision == "int8":
         return Check("fast path", int8, "ok")
     if Engine(network).reads_counts:

@@ -168,7 +168,7 @@ class Change:
         self._report("priming", f"{len(self._plan.streams(canary))} streams")
         plan = self._plan.current
         promoted = plan.phase == "canary"
-        if not plan.active.estimator.cuts_like(candidate.estimator):
+        if not plan.active.estimator.has_same_windows(candidate.estimator):
             if not promoted:
                 self._start_cold(candidate, canary)
             return

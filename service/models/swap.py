@@ -69,7 +69,7 @@ def prime(
 
 def _worker_primes(serving: Serving, stream: StreamView) -> bool:
     lane = stream.lanes.serving_lane
-    return stream.flowing and lane is not None and lane.estimator.cuts_like(serving.estimator)
+    return stream.flowing and lane is not None and lane.estimator.has_same_windows(serving.estimator)
 
 
 def _is_primed(serving: Serving, stream: StreamView, *, late: bool) -> bool:

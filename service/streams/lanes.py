@@ -72,7 +72,7 @@ class Lanes:
             the lane; None if the stream has no state yet, or if the windows of the model differ.
         """
         lane, optics = self.serving_lane, self._optics
-        if lane is None or optics is None or not lane.estimator.cuts_like(serving.estimator):
+        if lane is None or optics is None or not lane.estimator.has_same_windows(serving.estimator):
             return None
         return prime(self.history, serving, optics, pace, before)
 
@@ -106,7 +106,7 @@ class Lanes:
         """
         lane, standby = self.serving_lane, self.standby
         assert lane is not None, "call assign first"
-        pushed = self._unanswered or lane.estimator.cut(packet.events, lane.state, packet.t0_us)
+        pushed = self._unanswered or lane.estimator.to_windows(packet.events, lane.state, packet.t0_us)
         lane.state = lane.state._replace(windows=pushed.state)
         try:
             answers = lane.follow(pushed.windows, checked=standby is not None)
@@ -160,7 +160,7 @@ class Lanes:
         """Let another model serve from here on; the old model has answered all earlier windows."""
         new = self._lane(roles.serving, packet)
         self.serving_lane = new
-        if new.estimator.cuts_like(old.estimator):
+        if new.estimator.has_same_windows(old.estimator):
             new.state = new.state._replace(windows=old.state.windows)
             return 0
         open_us = old.state.windows.start_us
@@ -179,7 +179,7 @@ class Lanes:
                 self.run_standby()
             if not standby.stopped:
                 return standby.lane
-        if not self.serving_lane.estimator.cuts_like(serving.estimator):
+        if not self.serving_lane.estimator.has_same_windows(serving.estimator):
             return (
                 _cold_lane(serving, packet, optics)
                 if self.serving_lane.next_us is not None
@@ -208,13 +208,13 @@ class Lanes:
         assert self._optics is not None
         if old.estimator is wanted.estimator:
             lane, replayed = old, list[PackedWindow]()
-        elif not self.serving_lane.estimator.cuts_like(wanted.estimator):
+        elif not self.serving_lane.estimator.has_same_windows(wanted.estimator):
             return Standby(self._lane(wanted, packet), same_windows=False)
         elif (offered := self.history.take_offered(wanted)) is not None:
             lane, replayed = offered, self.history.ring.after(offered.state.end_us)
         else:
             lane, replayed = zero_lane(wanted, self._optics), self.history.newest_for(wanted)
-        same_windows = lane.estimator.cuts_like(self.serving_lane.estimator)
+        same_windows = lane.estimator.has_same_windows(self.serving_lane.estimator)
         if same_windows:
             lane.state = lane.state._replace(windows=WindowsState())
         return Standby(lane, same_windows=same_windows, replayed=replayed)

@@ -66,6 +66,6 @@ class Standby:
             return self.lane.follow([oldest.window()], checked=True)
         self._backlog_events -= oldest.events.n
         state = self.lane.state
-        pushed = self.lane.estimator.cut(oldest.events, state, oldest.t0_us)
+        pushed = self.lane.estimator.to_windows(oldest.events, state, oldest.t0_us)
         self.lane.state = state._replace(windows=pushed.state)
         return self.lane.follow(pushed.windows, checked=True)

@@ -126,7 +126,7 @@ def state_bytes(sensor: Sensor, grid: CanonicalConfig) -> int:
     events = draw(10e6, sensor, duration_us / 1e6)
     for number in range(settings.ring_windows + 2):
         shift_us = number * duration_us
-        pushed = estimator.cut(events._replace(t=events.t + shift_us), state, shift_us)
+        pushed = estimator.to_windows(events._replace(t=events.t + shift_us), state, shift_us)
         _, state = estimator.follow(pushed.windows, state._replace(windows=pushed.state))
         for window in pushed.windows:
             ring.append(pack(window))

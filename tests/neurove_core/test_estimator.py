@@ -264,7 +264,7 @@ def test_push_is_cut_and_then_follow(estimator):
     packets = windows_of_events(6)
     whole, state, estimates = feed(estimator, packets), estimator.initial_state(SENSOR), []
     for events in packets:
-        pushed = estimator.cut(events, state, int(events.t[0]))
+        pushed = estimator.to_windows(events, state, int(events.t[0]))
         answers, state = estimator.follow(pushed.windows, state._replace(windows=pushed.state))
         estimates += answers
     assert_same_estimates(estimates, whole.estimates)
@@ -275,7 +275,7 @@ def cut_all(estimator, packets):
     """Every window that packets complete."""
     state, windows = estimator.initial_state(SENSOR), []
     for events in packets:
-        pushed = estimator.cut(events, state, int(events.t[0]))
+        pushed = estimator.to_windows(events, state, int(events.t[0]))
         state, windows = state._replace(windows=pushed.state), windows + pushed.windows
     return windows
 
@@ -283,7 +283,7 @@ def cut_all(estimator, packets):
 def test_another_model_that_cuts_alike_follows_the_same_windows_as_if_it_had_cut_them_itself(estimator):
     other = Estimator(make_bundle(seed=7, network=CONFIG.network.model_copy(update={"hidden": 5, "diffusion": False})))
     packets = windows_of_events(5)
-    assert other.cuts_like(estimator)
+    assert other.has_same_windows(estimator)
     own = feed(other, packets)
     estimates, state = other.follow(cut_all(estimator, packets), other.initial_state(SENSOR))
     assert_same_estimates(estimates, own.estimates)
@@ -309,7 +309,7 @@ def test_windows_after_a_hole_are_followed_from_rest(estimator):
     ids=["bins", "duration", "grid", "field_of_view"],
 )
 def test_models_that_cut_or_see_otherwise_are_told_apart(estimator, change):
-    assert not Estimator(make_bundle(seed=3, **change)).cuts_like(estimator)
+    assert not Estimator(make_bundle(seed=3, **change)).has_same_windows(estimator)
 
 
 def arrays_of(value) -> list[np.ndarray]:

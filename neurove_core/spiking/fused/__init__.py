@@ -1,1 +1,1 @@
-"""The compiled forms of the neurons and cells in the folder above."""
+"""Compiled forms of the neurons and cells in the folder above."""

@@ -1,15 +1,15 @@
-"""Sigmoid and tanh of whole arrays, in place, for the fused loops of recurrence.py and engine.py."""
+"""Sigmoid and tanh of arrays, in place, for the compiled loops of recurrence.py and engine/cells.py."""
 
 import numba
 import numpy as np
 
 fused = numba.njit(nogil=True, cache=True, fastmath={"contract", "reassoc", "nsz", "arcp"})
-"""Compiles a loop whose rounding may depend on the machine: sums may be reordered, products fused with sums."""
+"""Compile a loop whose rounding may depend on the machine: sums may be reordered, multiplications fused with sums."""
 
 
 @fused
 def sigmoid(values, scale, fast):  # type: ignore[no-untyped-def]  # compiled for its arguments
-    """Values <- 1 / (1 + exp(-scale * values)), in place; `fast` is float32 by a polynomial that vectorises."""
+    """Values <- 1 / (1 + exp(-scale * values)), in place; `fast` is for float32, by a polynomial that vectorises."""
     one = values.dtype.type(1)
     flat = values.reshape(-1)
     n = flat.size
@@ -38,7 +38,7 @@ def sigmoid(values, scale, fast):  # type: ignore[no-untyped-def]  # compiled fo
 
 @fused
 def tanh(values, fast):  # type: ignore[no-untyped-def]  # compiled for its arguments
-    """Take the tanh of all values, in place; `fast` as in sigmoid."""
+    """Replace each value by its tanh; `fast` as in sigmoid."""
     flat = values.reshape(-1)
     one = values.dtype.type(1)
     two = values.dtype.type(2)

@@ -1,12 +1,12 @@
-"""The fused path of a two-layer spiking recurrent network: a whole sequence forward and backward in machine code.
+"""Compiled forward and backward pass of a two-layer spiking recurrent network over a whole sequence.
 
-The network is the one of the paper's regression experiment: two layers of cells (ASLSTM, SLSTM or LTC), a leaky
-readout, one number in and one out per step; or in a closed loop, where the answer is the next input. `cells.py` and
-`neurons.py` hold the plain form of each layer; tests compare answers, spikes and, in float64, every gradient with
-autograd through it.
+The network is that of the paper's regression experiment: two layers of cells (ASLSTM, SLSTM or LTC), a leaky readout,
+one number in and one out per step, or a closed loop, where the output is the next input. The reference implementation
+of each layer is in `aslstm.py`, `slstm.py` and `ltc.py`; tests compare outputs, spikes and, in float64, every gradient
+with autograd through it.
 
-Layouts: B rows of a batch, T steps, H units, I inputs, G = 5H (ASLSTM: input, forget, cell, output gate, f), 4H (SLSTM:
-the gates) or H (LTC: d). All arrays are contiguous and of one type, float32 or float64.
+Layouts: B batch, T steps, H units, I inputs, G = 5H (ASLSTM: input, forget, cell, output gate, f), 4H (SLSTM: the
+gates) or H (LTC: d). All arrays are contiguous and of one type, float32 or float64.
 """
 
 from typing import Any, NamedTuple
@@ -36,7 +36,7 @@ __all__ = [
 
 
 class LayerWeights(NamedTuple):
-    """One layer; what its kind does not use is of size 0."""
+    """Weights of one layer; arrays that its kind does not use have size 0."""
 
     w_x: Array  # (I, G) from the input
     w_r: Array  # (H, 4H) from the potential to the gates; LTC: (H, H) from the spikes
@@ -44,13 +44,13 @@ class LayerWeights(NamedTuple):
     d_time: Array  # (H) ASLSTM: diffusion from the same neuron one step ago
     w_a: Array  # (2H, H) LTC: from (d, m) to the time constants
     b_a: Array  # (H) LTC
-    d_space: Array  # (H) diffusion to what is above: z = s_weight * s + d_space * v
+    d_space: Array  # (H) diffusion to the next layer: z = s_weight * s + d_space * v
     v_th: Array  # (H) firing thresholds
-    s_weight: Array  # (1) 1 where spikes go up, 0 where only potentials do; not learned, its gradient stays 0
+    s_weight: Array  # (1) 1 where spikes go to the next layer, 0 where only potentials do; not learned, gradient 0
 
 
 class Weights(NamedTuple):
-    """The network."""
+    """Weights of the network."""
 
     first: LayerWeights
     second: LayerWeights
@@ -60,15 +60,15 @@ class Weights(NamedTuple):
 
 
 class Constants(NamedTuple):
-    """What is not learned."""
+    """Constants that are not learned."""
 
     alpha: float  # ASLSTM: share of h in the potential
-    width: float  # of the rectangular surrogate, in units of the potential
-    damping: float = 1.0  # area under the surrogate; below 1 gradients through many spikes die out instead of exploding
+    width: float  # width of the rectangular surrogate, in units of the potential
+    damping: float = 1.0  # area under the surrogate; below 1, gradients through many spikes vanish instead of exploding
 
 
 class LayerState(NamedTuple):
-    """What a layer carries: c is unused by LTC, whose v is m."""
+    """State of a layer; LTC does not use c, and its v is m."""
 
     c: Array  # (B, H)
     v: Array  # (B, H)
@@ -76,7 +76,7 @@ class LayerState(NamedTuple):
 
 
 class State(NamedTuple):
-    """What the network carries."""
+    """State of the network."""
 
     first: LayerState
     second: LayerState
@@ -84,21 +84,21 @@ class State(NamedTuple):
 
 
 class LayerTape(NamedTuple):
-    """What a layer's forward pass leaves for its backward pass; row t of c, v, s is the state before step t."""
+    """Values of a layer's forward pass for the backward pass; row t of c, v, s is the state before step t."""
 
     u: Array  # (T, B, I) input
-    gates: Array  # (T, B, G) activations: sigmoid and tanh taken; ASLSTM's last H are f; LTC: d
+    gates: Array  # (T, B, G) gates after sigmoid and tanh; ASLSTM's last H are f; LTC: d
     q: Array  # (T, B, 4H) scratch of the recurrent product; LTC: (T, B, 2H) is (d, m')
     c: Array  # (T + 1, B, H)
     tc: Array  # (T, B, H) tanh(c); LTC: a
     v: Array  # (T + 1, B, H); LTC: m after the reset
-    pre: Array  # (T, B, H) potential that is compared with the threshold
+    pre: Array  # (T, B, H) potential before the reset
     s: Array  # (T + 1, B, H)
-    z: Array  # (T, B, H) what goes up
+    z: Array  # (T, B, H) output to the next layer
 
 
 class Tape(NamedTuple):
-    """A forward pass."""
+    """Values of a forward pass."""
 
     first: LayerTape
     second: LayerTape
@@ -106,13 +106,13 @@ class Tape(NamedTuple):
 
 
 def weights_like(weights: Weights) -> Weights:
-    """Zeros in the shape of some weights: gradients are gathered in these."""
+    """Zeros in the shape of some weights, for their gradients."""
     first, second = (LayerWeights(*(np.zeros_like(array) for array in layer)) for layer in weights[:2])
     return Weights(first, second, *(np.zeros_like(array) for array in weights[2:]))
 
 
 def initial_state(batch: int, hidden: int, dtype: Any) -> State:
-    """Everything at rest."""
+    """The zero state."""
 
     def zeros() -> Array:
         return np.zeros((batch, hidden), dtype)
@@ -125,14 +125,14 @@ def forward(kind: int, weights: Weights, constants: Constants, x: Array, state: 
 
     Args:
         kind: ASLSTM, SLSTM or LTC.
-        weights: of the network.
+        weights: weights of the network.
         constants: alpha, surrogate width.
-        x: (T, B) inputs; from step `free_from` on they are not read.
-        state: before the first step.
-        free_from: from this step on the input is the answer of the step before; T for none, at least 1.
+        x: (T, B) inputs; not read from step `free_from` on.
+        state: state before the first step.
+        free_from: from this step on, at least 1, the input is the previous output; T for an open loop.
 
     Returns:
-        the tape: its y[1:] are the answers, (T, B).
+        the tape; its y[1:] are the outputs, (T, B).
     """
     steps, batch = x.shape
     tape = Tape(
@@ -154,16 +154,17 @@ def backward(
     free_from: int,
     grad_s: tuple[float, float] = (0.0, 0.0),
 ) -> Weights:
-    """Gradients of all weights; the state before the first step is taken as given.
+    """Gradients of all weights; the initial state is a constant.
 
     Args:
         kind: as in forward.
         weights: as in forward.
         constants: as in forward.
-        tape: of forward; used up by this call.
-        grad_y: (T, B) gradient of the loss by the answers.
+        tape: from forward; overwritten by this call.
+        grad_y: (T, B) gradient of the loss with respect to the outputs.
         free_from: as in forward.
-        grad_s: gradient of the loss by each single spike of the first and of the second layer, as of a rate.
+        grad_s: gradient of the loss with respect to each spike of the first and of the second layer, such as that of a
+            firing rate.
     """
     grads = weights_like(weights)
     pull = np.array(grad_s, grad_y.dtype)

@@ -1,6 +1,6 @@
-"""The machine code of `recurrence`: steps of the layers, forward and backward. See there for layouts and meaning.
+"""Compiled kernels of recurrence.py: steps of the layers, forward and backward. recurrence.py explains the layouts.
 
-Compiled by numba on first use for the arrays it gets, and cached on disk.
+numba compiles them at first use for the types of the arguments and caches them on disk.
 """
 
 from typing import Any, Final, NamedTuple
@@ -33,7 +33,7 @@ def _lstm_step(kind, w, constants, tape, t, fast):  # type: ignore[no-untyped-de
             for j in range(gates.shape[1]):
                 gates[b, j] += w.b[j]
     np.dot(tape.v[t], w.w_r, q)
-    # three of the four gates are sigmoids and the cell gate a tanh, which is 2 sigmoid(2 x) - 1: one pass for all
+    # three gates are sigmoids, the cell gate is a tanh, which is 2 sigmoid(2 x) - 1: one pass for all four
     for b in range(batch):
         for j in range(4 * hidden):
             q[b, j] += gates[b, j]
@@ -119,7 +119,7 @@ def _layer_step(kind, w, constants, tape, t, fast):  # type: ignore[no-untyped-d
 
 @fused
 def forward_steps(kind, weights, constants, x, tape, free_from, fast):  # type: ignore[no-untyped-def]  # as above
-    """Fill the tape from its row 0 on; see `recurrence.forward`."""
+    """Fill the tape from its row 0; see `recurrence.forward`."""
     steps, batch = x.shape
     for t in range(steps):
         for b in range(batch):
@@ -135,7 +135,7 @@ def forward_steps(kind, weights, constants, x, tape, free_from, fast):  # type: 
 
 
 class _Carry(NamedTuple):
-    """Gradients on their way back from step t + 1 to step t."""
+    """Gradients that flow from step t + 1 back to step t."""
 
     c: Array
     v: Array
@@ -144,9 +144,9 @@ class _Carry(NamedTuple):
 
 @fused
 def _layer_back(kind, w, w_x_t, w_r_t, w_a_t, constants, tape, t, dz, carry, du, dq, grads, pull):  # type: ignore[no-untyped-def]  # as above
-    """Gradient of one step of one layer: from dz of what went up to du of its input.
+    """Gradient of one step of one layer, from dz of its output to du of its input.
 
-    What the weights' gradients are made of stays in the tape (gates and q): one large product gathers it at the end.
+    The terms of the weights' gradients stay in the tape (gates and q); `_gather` sums them with one large product.
     """
     batch, hidden = tape.tc.shape[1:]
     one, none = w.b.dtype.type(1), w.b.dtype.type(0)
@@ -163,7 +163,7 @@ def _layer_back(kind, w, w_x_t, w_r_t, w_a_t, constants, tape, t, dz, carry, du,
             if kind == LTC:
                 dm = dv * (one - s) + from_spike
                 d, a, m = gates[b, j], tape.tc[t, b, j], tape.v[t, b, j]
-                tape.pre[t, b, j] = dm * (d - m) * a * (one - a)  # of the time constant's argument
+                tape.pre[t, b, j] = dm * (d - m) * a * (one - a)  # gradient of the time constant's argument
                 gates[b, j] = dm * a
                 carry.v[b, j] = dm * (one - a)
                 continue
@@ -199,7 +199,7 @@ def _layer_back(kind, w, w_x_t, w_r_t, w_a_t, constants, tape, t, dz, carry, du,
         for b in range(batch):
             for j in range(4 * hidden):
                 dq[b, j] = gates[b, j]
-        dv_before = tape.pre[t]  # its values are used up: room for the product
+        dv_before = tape.pre[t]  # its values are no longer needed: memory for the product
         np.dot(dq, w_r_t, dv_before)
         for b in range(batch):
             for j in range(hidden):
@@ -209,7 +209,7 @@ def _layer_back(kind, w, w_x_t, w_r_t, w_a_t, constants, tape, t, dz, carry, du,
 
 @fused
 def _gather(kind, tape, grads):  # type: ignore[no-untyped-def]  # as above
-    """Weight gradients of a layer over all steps and rows at once."""
+    """Weight gradients of a layer, over all steps and rows at once."""
     steps, batch, inputs = tape.u.shape
     hidden = tape.tc.shape[2]
     rows = steps * batch
@@ -242,7 +242,7 @@ def _carry(batch, hidden, like):  # type: ignore[no-untyped-def]  # as above
 
 @fused
 def backward_steps(kind, weights, constants, tape, grad_y, grads, free_from, pull):  # type: ignore[no-untyped-def]  # as above
-    """Add to the gradients, from the tape's last step to its first; see `recurrence.backward`."""
+    """Add up the gradients from the tape's last step to its first; see `recurrence.backward`."""
     steps, batch = grad_y.shape
     hidden = weights.w_out.size
     first, second = weights.first, weights.second

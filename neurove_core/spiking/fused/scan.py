@@ -1,9 +1,10 @@
-"""A population of LIF neurons over all its time steps in one pass: what `neurons.lif_scan` runs on a CPU.
+"""A population of LIF neurons over all its time steps in one compiled pass: `lif.lif_scan` on a CPU.
 
-Step after step, plain PyTorch sends every membrane potential to memory and back some ten times per step. Here a block
-of neurons stays in the cache for all T steps; currents are read once and spikes written once. For the backward pass the
-rectangular surrogate leaves one byte per neuron and step, any other how far the potential was from the threshold.
-`neurons.lif_scan_reference` is the plain form; tests compare spikes and potentials bit for bit, and gradients.
+Plain PyTorch moves every membrane potential to memory and back about ten times per step. Here a block of neurons stays
+in the cache for all T steps, currents are read once and spikes are written once. For the backward pass the rectangular
+surrogate stores one byte per neuron and step, any other surrogate the distance of the potential from the threshold.
+`lif.lif_scan_reference` is the reference implementation; tests compare spikes and potentials bit for bit, and the
+gradients.
 """
 
 import math
@@ -21,14 +22,14 @@ from neurove_core.spiking.surrogate import Surrogate
 
 Array = NDArray[Any]  # float32 or float64
 
-FIRED: Final = 1  # bits of a code: the neuron fired in this step
-NEAR: Final = 2  # its potential lay in the surrogate's window
+FIRED: Final = 1  # bit of a code: the neuron fired in this step
+NEAR: Final = 2  # bit of a code: its potential was within the surrogate's width
 
-_BLOCK: Final = 1024  # neurons whose potentials stay in the first cache over all steps
+_BLOCK: Final = 1024  # neurons whose potentials stay in the first-level cache over all steps
 
 
 def fits(currents: Tensor, v: Tensor) -> bool:
-    """Whether the fused scan takes these: on the CPU, float32 or float64 alike, one current per neuron, not empty."""
+    """Whether the compiled scan accepts these: on the CPU, both float32 or float64, not empty, of matching shapes."""
     return (
         currents.device.type == "cpu"
         and currents.dtype in (torch.float32, torch.float64)
@@ -45,12 +46,12 @@ def scan(
     """A LIF population over a sequence.
 
     Args:
-        currents: (T, ...) as `fits` wants them; answered in the layout that they come in, channels last too.
-        v: potentials after the reset of the step before (...).
-        decay: per step.
+        currents: (T, ...), accepted by `fits`; the result has the same memory layout.
+        v: (...) potentials after the reset of the step before.
+        decay: leak per step.
         v_th: firing threshold.
-        width: of the surrogate, in units of the potential.
-        surrogate: what the gradient of a spike is taken for.
+        width: width of the surrogate, in units of the potential.
+        surrogate: kind of the surrogate gradient.
 
     Returns:
         spikes (T, ...) of 0 and 1, and the potentials after the last reset.
@@ -63,12 +64,12 @@ def scan(
 
 
 def scan_in_place(maps: Tensor, v: Tensor, decay: float, v_th: float) -> tuple[Tensor, Tensor]:
-    """The same for maps of a convolution, without gradients: their memory becomes that of the spikes.
+    """The same for maps of a convolution, without gradients; the spikes overwrite the currents.
 
     Args:
-        maps: currents (T * B, C, H, W), channels last, float32 or float64; used up.
-        v: potentials after the reset of the step before (B, C, H, W), left as they are.
-        decay: per step.
+        maps: currents (T * B, C, H, W), channels last, float32 or float64; overwritten.
+        v: potentials after the reset of the step before (B, C, H, W); not changed.
+        decay: leak per step.
         v_th: firing threshold.
 
     Returns:
@@ -102,7 +103,7 @@ class _Scan(torch.autograd.Function):
 
 
 class _GradedScan(torch.autograd.Function):
-    """The same for a surrogate that is no window: its height depends on how far a potential is from the threshold."""
+    """The same for surrogates whose height depends on the distance of the potential from the threshold."""
 
     @staticmethod
     def forward(
@@ -127,10 +128,10 @@ class _GradedScan(torch.autograd.Function):
 def _back(
     kernel: Callable[..., None], ctx: Any, grads: tuple[Tensor, ...], *constants: float, **flags: bool
 ) -> tuple[Tensor, Tensor]:
-    """Gradients by the currents and by the potentials of the start, by a kernel that reads the tape of ctx."""
+    """Gradients with respect to the currents and the initial potentials; the kernel reads the tape of ctx."""
     (tape,) = ctx.saved_tensors
     by_spikes = _rows(grads[0], ctx.channels_last)
-    by_v = _flat(grads[1], ctx.channels_last).clone()  # becomes the gradient by v of the start
+    by_v = _flat(grads[1], ctx.channels_last).clone()  # becomes the gradient of the initial potentials
     by_currents = torch.empty_like(by_spikes)
     kind = by_spikes.numpy().dtype.type
     kernel(by_spikes.numpy(), tape.numpy(), by_currents.numpy(), by_v.numpy(), *map(kind, constants), *flags.values())
@@ -153,12 +154,12 @@ def _run(
 
 
 def _is_channels_last(x: Tensor) -> bool:
-    """Whether channels, the third axis from the end, vary fastest in memory."""
+    """Whether the channels, the third axis from the end, vary fastest in memory."""
     return x.dim() >= 4 and not x.is_contiguous() and x.movedim(-3, -1).is_contiguous()
 
 
 def _rows(x: Tensor, channels_last: bool) -> Tensor:
-    """(T, ...) as (T, N) in the order of memory; a copy only where memory has another order."""
+    """(T, ...) as (T, N) in memory order; copied only where the memory has another order."""
     return (x.movedim(-3, -1) if channels_last else x).contiguous().view(x.shape[0], -1)
 
 
@@ -167,7 +168,7 @@ def _flat(x: Tensor, channels_last: bool) -> Tensor:
 
 
 def _shaped(x: Tensor, shape: torch.Size, channels_last: bool) -> Tensor:
-    """What `_rows` and `_flat` undid."""
+    """The inverse of `_rows` and `_flat`."""
     if not channels_last:
         return x.view(shape)
     *before, channels, rows, columns = shape

@@ -1,4 +1,4 @@
-"""The engine computes what its plain form computes, and what the network computes up to the norms' rounding."""
+"""The engine equals its plain form, and it equals the network up to the rounding of the folded norms."""
 
 import logging
 from itertools import chain
@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from neurove_core.engine import convolution
 from neurove_core.engine.engine import Engine
+from neurove_core.engine.fallback import forget_warnings
 from neurove_core.models import bundle
 from neurove_core.networks.neurove import NetworkState, NeuroVE
 from neurove_core.spiking.plain import plain
@@ -39,7 +39,7 @@ def tensors_of(state: NetworkState) -> list[Tensor]:
 
 
 def assert_fire_alike(state: NetworkState, expected: NetworkState) -> None:
-    """Every membrane equal bit for bit; the cells' spikes equal, all else of them to the rounding of long sums."""
+    """Membranes and spikes of the cells are equal bit for bit; other cell values up to the rounding of long sums."""
     for membrane, other in zip(state.membranes, expected.membranes, strict=True):
         assert torch.equal(membrane.v, other.v)
         assert 0 < (other.v == 0).double().mean() < 1
@@ -64,17 +64,17 @@ def test_spikes_of_the_engine_and_of_its_plain_form_are_equal_bit_for_bit(seed, 
 
 @each_shape
 @torch.no_grad()
-def test_folding_the_norms_moves_answers_by_rounding_and_hardly_a_spike(config):
+def test_folding_the_norms_changes_answers_by_rounding_only_and_few_spikes(config):
     network, spikes = make_network(config), make_spikes(config, batch=2)
     twists, state = Engine(network)(spikes, network.initial_state(2))
     expected, expected_state = network(spikes, network.initial_state(2))
     for membrane, other in zip(state.membranes, expected_state.membranes, strict=True):
-        assert ((membrane.v == 0) != (other.v == 0)).double().mean() < 5e-3  # one spike that flips moves others
+        assert ((membrane.v == 0) != (other.v == 0)).double().mean() < 5e-3  # one spike that flips changes others
     torch.testing.assert_close(twists[0], expected[0], rtol=1e-4, atol=1e-5)  # later ones depend on the spikes above
 
 
 @torch.no_grad()
-def test_a_stream_may_go_over_from_the_network_to_the_engine_and_back():
+def test_a_stream_may_switch_between_network_and_engine():
     network, spikes = make_network(SHIPPED), make_spikes(SHIPPED)
     engine = Engine(network)
     whole, last = engine(spikes, network.initial_state(1))
@@ -104,7 +104,7 @@ def test_window_by_window_equals_the_whole_sequence(config):
 
 @each_shape
 @torch.no_grad()
-def test_a_spread_is_the_same_in_the_engine_in_its_plain_form_and_in_the_network_and_moves_no_answer(config):
+def test_a_spread_is_the_same_in_engine_plain_form_and_network_and_changes_no_answer(config):
     network, spikes = make_network(config), make_spikes(config, batch=2)
     without, _ = Engine(network)(spikes, network.initial_state(2))
     torch.nn.init.normal_(network.add_spread().weight, generator=torch.Generator().manual_seed(5))
@@ -129,17 +129,17 @@ def test_the_layout_of_the_input_does_not_matter():
     assert torch.equal(engine(laid_out, network.initial_state(1))[0], expected)
 
 
-def test_running_an_engine_changes_neither_the_state_it_was_given_nor_its_input():
+def test_an_engine_changes_neither_its_input_nor_the_state_it_receives():
     network, spikes = make_network(SMALL), make_spikes(SMALL)
     engine = Engine(network)
-    _, carried = engine(spikes[:3], network.initial_state(1))
-    before = [tensor.clone() for tensor in (*tensors_of(carried), spikes)]
-    once, again = engine(spikes[3:], carried)[0], engine(spikes[3:], carried)[0]
+    _, given = engine(spikes[:3], network.initial_state(1))
+    before = [tensor.clone() for tensor in (*tensors_of(given), spikes)]
+    once, again = engine(spikes[3:], given)[0], engine(spikes[3:], given)[0]
     assert torch.equal(once, again)
-    assert all(torch.equal(a, b) for a, b in zip((*tensors_of(carried), spikes), before, strict=True))
+    assert all(torch.equal(a, b) for a, b in zip((*tensors_of(given), spikes), before, strict=True))
 
 
-def test_an_engine_is_of_its_own_weights_and_does_not_see_the_network_change():
+def test_an_engine_copies_its_weights_and_ignores_later_changes_of_the_network():
     network, spikes = make_network(SMALL), make_spikes(SMALL)
     engine = Engine(network)
     expected, _ = engine(spikes, network.initial_state(1))
@@ -148,7 +148,7 @@ def test_an_engine_is_of_its_own_weights_and_does_not_see_the_network_change():
     assert torch.equal(engine(spikes, network.initial_state(1))[0], expected)
 
 
-def test_a_membrane_that_is_not_finite_stays_in_the_state_where_a_check_finds_it():
+def test_a_membrane_that_is_not_finite_stays_in_the_state_so_that_a_check_finds_it():
     network = make_network(SMALL)
     spikes = make_spikes(SMALL)
     spikes[0, 0, 0, 0, 0] = float("nan")
@@ -156,9 +156,7 @@ def test_a_membrane_that_is_not_finite_stays_in_the_state_where_a_check_finds_it
 
 
 @pytest.mark.parametrize("broken", ["missing", "raises", "wrong"])
-def test_where_the_packed_convolution_cannot_be_trusted_the_plain_one_serves_and_it_is_said_once(
-    broken, monkeypatch, caplog
-):
+def test_where_the_prepacked_convolution_fails_the_plain_one_is_used_with_one_warning(broken, monkeypatch, caplog):
     operators = torch.ops.mkldnn
     network, spikes = make_network(SMALL), make_spikes(SMALL)
     expected, _ = Engine(network)(spikes, network.initial_state(1))
@@ -175,20 +173,20 @@ def test_where_the_packed_convolution_cannot_be_trusted_the_plain_one_serves_and
 
     if broken != "missing":
         Operators._convolution_pointwise = Broken
-    convolution.forget_warnings()
+    forget_warnings()
     monkeypatch.setattr(torch.ops, "mkldnn", Operators)
     with caplog.at_level(logging.WARNING):
         engine = Engine(network)
     twists, _ = engine(spikes, network.initial_state(1))
     torch.testing.assert_close(twists, expected, rtol=1e-3, atol=1e-4)
     assert len(caplog.records) == 1
-    assert "packed convolutions are off" in caplog.text
+    assert "form=prepacked convolution" in caplog.text
 
 
-def test_a_state_that_training_left_with_its_gradient_is_taken_over_all_the_same():
+def test_a_state_from_training_with_a_gradient_is_accepted():
     network, spikes = make_network(SMALL).requires_grad_(), make_spikes(SMALL)
-    _, carried = network(spikes[:2], network.initial_state(1))
-    assert carried.membranes[0].v.requires_grad
-    twists, state = Engine(network)(spikes[2:], carried)
+    _, given = network(spikes[:2], network.initial_state(1))
+    assert given.membranes[0].v.requires_grad
+    twists, state = Engine(network)(spikes[2:], given)
     assert torch.isfinite(twists).all()
     assert state.finite()

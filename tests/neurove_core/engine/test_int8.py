@@ -1,4 +1,4 @@
-"""An int8 network fires and projects in 8-bit integers as in float32, bit for bit, and learns through the rounding."""
+"""An int8 network fires and projects in 8-bit integers as in float32, bit for bit, and trains through the rounding."""
 
 import logging
 
@@ -6,9 +6,11 @@ import pytest
 import torch
 
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from neurove_core.engine import convolution, int8
+from neurove_core.engine import int8
 from neurove_core.engine.encoding import to_codes
 from neurove_core.engine.engine import Engine
+from neurove_core.engine.fallback import forget_warnings
+from neurove_core.engine.int8 import Int8Layer, Int8Projection, int8_convolution, plain_int8_convolution
 from neurove_core.estimator import Estimator
 from neurove_core.models import bundle
 from neurove_core.networks import quantisation
@@ -49,7 +51,7 @@ def test_spikes_in_8_bits_equal_those_of_float32_bit_for_bit(seed, batch, config
 
 
 @torch.no_grad()
-def test_the_engine_answers_as_the_network_does_that_training_sees():
+def test_the_engine_answers_as_the_network_in_training_does():
     network, spikes = network_of(SHIPPED), draw(SHIPPED)
     answer, expected = (
         Engine(network)(spikes[:1], network.initial_state(1)),
@@ -63,7 +65,7 @@ def test_the_engine_answers_as_the_network_does_that_training_sees():
 @pytest.mark.parametrize("steps", [1, 2, 5])
 @pytest.mark.parametrize("seed", range(3))
 def test_window_after_window_fires_and_projects_as_in_float32_bit_for_bit(seed, steps):
-    """Calls of odd and even lengths, whose state goes on; the first of zeros, the third with every cell at its most."""
+    """Calls of odd and even lengths with a continued state; the first input is zero, the third has maximal values."""
     engine, projection = Engine(network_of(SHIPPED, seed)), projection_of(64 * 5 * 6, 128, seed)
     states = [network_of(SHIPPED, seed).initial_state(2) for _ in range(2)]
     for turn in range(5):
@@ -84,18 +86,18 @@ def test_window_after_window_fires_and_projects_as_in_float32_bit_for_bit(seed, 
             assert torch.equal(one.s, other.s)
 
 
-def projection_of(inputs: int, features: int, seed: int = 0, *, q: torch.Tensor | None = None) -> int8.Projection:
+def projection_of(inputs: int, features: int, seed: int = 0, *, q: torch.Tensor | None = None) -> Int8Projection:
     generator = torch.Generator().manual_seed(seed)
     if q is None:
         q = torch.randint(-127, 128, (features, inputs), generator=generator, dtype=torch.int8)
     step, factor, offset = torch.rand(3, features, generator=generator)
-    return int8.Projection(int8.Layer(quantisation.Quantised(q, step), factor / 100, offset - 0.5))
+    return Int8Projection(Int8Layer(quantisation.Quantised(q, step), factor / 100, offset - 0.5))
 
 
 @pytest.mark.parametrize("inputs", [1, 255, 256, 257, 700, 25_344])
 @pytest.mark.parametrize("features", [1, 13, 64])
 @pytest.mark.parametrize("share", [0, 0.15, 1], ids=["no spike", "spikes", "all fire"])
-def test_the_projection_adds_up_as_float32_does_bit_for_bit(inputs, features, share):
+def test_the_projection_equals_float32_bit_for_bit(inputs, features, share):
     projection = projection_of(inputs, features, seed=inputs)
     for rows in (1, 3, 8):
         spikes = (torch.rand(rows, inputs, generator=torch.Generator().manual_seed(rows)) < share).to(torch.uint8)
@@ -108,7 +110,7 @@ def test_the_projection_adds_up_as_float32_does_bit_for_bit(inputs, features, sh
 @pytest.mark.parametrize("inputs", [1000, 132_104, 132_105], ids=["few", "largest below 2**24", "above"])
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_the_largest_sums_of_a_projection_are_exact(inputs, sign):
-    """All weights at their most and every input firing: 16-bit sums of a block must not wrap, nor float32 round."""
+    """All weights are maximal and every input fires: 16-bit sums of a block must not wrap, nor may float32 round."""
     projection = projection_of(inputs, 3, q=torch.full((3, inputs), sign * 127, dtype=torch.int8))
     at_zero = projection(torch.zeros(1, inputs, dtype=torch.uint8))  # the offset
     found = projection(torch.ones(2, inputs, dtype=torch.uint8))
@@ -117,7 +119,7 @@ def test_the_largest_sums_of_a_projection_are_exact(inputs, sign):
 
 
 @pytest.mark.parametrize("shape", [(5, 4, 3, 3), (5, 36)], ids=["convolution", "projection"])
-def test_weights_move_by_half_a_step_at_most_and_rounding_again_changes_nothing(shape):
+def test_rounding_moves_weights_by_at_most_half_a_step_and_is_idempotent(shape):
     by_row = (-1, *[1] * (len(shape) - 1))
     weight = torch.randn(shape) * torch.tensor([1e-3, 1.0, 50.0, 0.0, 1.0]).view(by_row)
     rounded, step = quantisation.rounded(weight), quantisation.quantised(weight).step
@@ -126,7 +128,7 @@ def test_weights_move_by_half_a_step_at_most_and_rounding_again_changes_nothing(
 
 
 @pytest.mark.parametrize("shape", [(5, 4, 3, 3), (5, 36)], ids=["convolution", "projection"])
-def test_gradients_pass_the_rounding_as_if_it_were_not_there(shape):
+def test_gradients_pass_through_the_rounding_unchanged(shape):
     weight = torch.randn(shape, requires_grad=True)
     pull = torch.randn(shape)
     quantisation.rounded(weight).backward(pull)
@@ -134,8 +136,8 @@ def test_gradients_pass_the_rounding_as_if_it_were_not_there(shape):
 
 
 @torch.no_grad()
-def test_training_sees_the_projection_that_runs():
-    """Moved by a third of a step, its weights are rounded to what they were; an unrounded network answers otherwise."""
+def test_training_uses_the_rounded_projection():
+    """Weights moved by a third of a step are rounded back; a network without rounding answers differently."""
     for precision, moves in (("int8", False), ("float32", True)):
         config = SMALL.model_copy(update={"network": SMALL.network.model_copy(update={"precision": precision})})
         network, spikes = network_of(config), draw(config)
@@ -149,7 +151,7 @@ def test_training_sees_the_projection_that_runs():
 
 
 @pytest.mark.parametrize("encoding", ["binary", "log1p"])
-def test_counts_become_the_codes_of_their_spikes_and_a_network_may_be_given_either(encoding):
+def test_counts_become_the_codes_of_their_spikes_and_a_network_accepts_both(encoding):
     counts = torch.arange(256, dtype=torch.uint8).repeat(2, 16).reshape(1, 1, 4, 32, 64)[..., :14, :19].contiguous()
     found, spikes = to_codes(counts, encoding), to_spikes(counts, encoding)
     assert torch.equal(found, quantisation.codes(spikes))
@@ -163,27 +165,28 @@ def test_counts_become_the_codes_of_their_spikes_and_a_network_may_be_given_eith
 def test_the_largest_sums_are_exact(top):
     q = torch.full((4, 58 if top == 255 else 200, 3, 3), 127, dtype=torch.int8)
     x = torch.full((2, q.shape[1], 9, 7), top, dtype=torch.uint8).contiguous(memory_format=torch.channels_last)
-    found = int8.sums(q, top, 9, 7)(x)
+    found = int8_convolution(q, top, 9, 7)(x)
     assert found[0, 0, 2, 2] == 9 * q.shape[1] * 127 * top
-    assert torch.equal(found, int8.plain_sums(q, top)(x))
+    assert torch.equal(found, plain_int8_convolution(q, top)(x))
 
 
 @pytest.mark.parametrize("wrong", ["missing", "other sums"])
-def test_without_fast_8_bit_products_plain_ones_give_the_same_and_it_is_said_once(monkeypatch, caplog, wrong):
+def test_without_fast_8_bit_products_the_plain_form_gives_the_same_with_one_warning(monkeypatch, caplog, wrong):
     spikes, network = draw(SMALL), network_of(SMALL)
     expected = Engine(network)(spikes, network.initial_state(1))[0]
 
     def broken(q, rows, columns):
         if wrong == "missing":
             raise AttributeError("no such operator")
-        return lambda x: int8.plain_sums(q, 255)(x) + 1
+        return lambda x: plain_int8_convolution(q, 255)(x) + 1
 
-    convolution.forget_warnings()
-    monkeypatch.setattr(int8, "_packed", broken)
+    forget_warnings()
+    caplog.clear()  # a machine without 8-bit products has warned already
+    monkeypatch.setattr(int8, "_prepacked", broken)
     with caplog.at_level(logging.WARNING):
         engine = Engine(network)
     assert torch.equal(engine(spikes, network.initial_state(1))[0], expected)
-    assert [record.getMessage().startswith("8-bit convolutions are off") for record in caplog.records] == [True]
+    assert ["form=8-bit convolution " in record.getMessage() for record in caplog.records] == [True]
 
 
 def test_an_int8_bundle_is_saved_loaded_and_serves_a_stream(tmp_path):

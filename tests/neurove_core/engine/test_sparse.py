@@ -1,4 +1,4 @@
-"""What is summed over those that fired alone equals what is summed over all, bit for bit."""
+"""Sums over the neurons that fired equal the sums over all neurons, bit for bit."""
 
 import logging
 
@@ -7,9 +7,11 @@ import pytest
 import torch
 
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from neurove_core.engine import convolution, sparse, spike_lists
-from neurove_core.engine.encoding import to_counts
+from neurove_core.engine import convolution, spike_lists
+from neurove_core.engine.encoding import to_count_input
 from neurove_core.engine.engine import Engine
+from neurove_core.engine.fallback import forget_warnings
+from neurove_core.engine.sparse import ListConvolution, SparseLayer, sparse_extractor
 from neurove_core.models import bundle
 from neurove_core.networks.encoding import to_spikes
 from neurove_core.spiking.fused import scan
@@ -34,14 +36,14 @@ def layer_of(inputs, outputs, rows, columns, seed=0):
     generator = torch.Generator().manual_seed(seed)
     weight = torch.randn(outputs, inputs, 3, 3, generator=generator) / (3 * inputs**0.5)
     bias = torch.randn(outputs, generator=generator) / 4
-    return sparse.Layer(weight, bias, convolution.convolution(weight, bias, rows, columns), rows, columns)
+    return SparseLayer(weight, bias, convolution.convolution(weight, bias, rows, columns), rows, columns)
 
 
 def fire_over(layer, spikes, v):
     """Spikes and potentials of a layer over a list."""
     cells = np.ascontiguousarray(v.numpy().transpose(0, 2, 3, 1))
-    fired, after = sparse.OverList(layer)(spike_lists.listed(spikes), cells, np.float32(DECAY), np.float32(V_TH))
-    return spike_lists.maps_of(fired), torch.from_numpy(after.transpose(0, 3, 1, 2))
+    fired, after = ListConvolution(layer)(spike_lists.to_list(spikes), cells, np.float32(DECAY), np.float32(V_TH))
+    return spike_lists.to_maps(fired), torch.from_numpy(after.transpose(0, 3, 1, 2))
 
 
 @pytest.mark.parametrize("share", [0, 0.02, 0.15, 0.39, 0.6, 1])
@@ -59,8 +61,8 @@ def fire_over(layer, spikes, v):
     ],
 )
 @torch.inference_mode()
-def test_a_layer_over_a_list_fires_as_the_dense_one_bit_for_bit(inputs, outputs, rows, columns, share):
-    """Short lists and long ones, which are convolved dense: where a large map mostly fires."""
+def test_a_layer_over_a_spike_list_fires_as_the_dense_one_bit_for_bit(inputs, outputs, rows, columns, share):
+    """Short lists, and long ones, which are convolved dense."""
     layer = layer_of(inputs, outputs, rows, columns)
     size = (outputs, (rows + 1) // 2, (columns + 1) // 2)
     for steps, batch in ((1, 1), (3, 1), (1, 3), (2, 2)):
@@ -73,28 +75,28 @@ def test_a_layer_over_a_list_fires_as_the_dense_one_bit_for_bit(inputs, outputs,
 
 
 @pytest.mark.parametrize("share", [0, 0.15, 1])
-def test_a_list_holds_what_its_maps_hold(share):
+def test_a_spike_list_and_its_maps_convert_into_each_other(share):
     maps = spikes_of(3, 5, 4, 7, share)
-    fired = spike_lists.listed(maps)
-    assert torch.equal(spike_lists.maps_of(fired), maps)
-    assert fired.found == int(maps.sum())
+    fired = spike_lists.to_list(maps)
+    assert torch.equal(spike_lists.to_maps(fired), maps)
+    assert fired.total == int(maps.sum())
     assert fired.starts.size == 3 * 4 * 7 + 1
 
 
 @pytest.mark.parametrize("share", [0, 0.15, 1], ids=["no spike", "spikes", "all fire"])
 @pytest.mark.parametrize("size", [(16, 1, 1), (256, 9, 11), (700, 1, 3), (1, 5, 7)])
 @pytest.mark.parametrize("features", [16, 80, 256])
-def test_each_map_is_projected_as_alone_and_summed_in_the_order_of_its_neurons(features, size, share):
+def test_the_projection_of_a_map_is_summed_in_the_order_of_its_neurons_in_any_batch(features, size, share):
     channels, rows, columns = size
     generator = torch.Generator().manual_seed(1)
     weight, bias = torch.randn(features, channels * rows * columns, generator=generator), torch.randn(features)
-    extractor = sparse.extractor([layer_of(4, 16, 5, 5)], (weight, bias), LIF)
+    extractor = sparse_extractor([layer_of(4, 16, 5, 5)], (weight, bias), LIF)
     assert extractor is not None
     maps = spikes_of(4, *size, share)
-    found = torch.from_numpy(extractor.project(spike_lists.listed(maps)))
+    found = torch.from_numpy(extractor.project(spike_lists.to_list(maps)))
     assert found.shape == (4, features)
     for index in range(4):
-        alone = torch.from_numpy(extractor.project(spike_lists.listed(maps[index : index + 1])))
+        alone = torch.from_numpy(extractor.project(spike_lists.to_list(maps[index : index + 1])))
         assert torch.equal(alone, found[index : index + 1])
         expected = bias.clone()
         for place in maps[index].permute(1, 2, 0).flatten().nonzero():
@@ -102,16 +104,16 @@ def test_each_map_is_projected_as_alone_and_summed_in_the_order_of_its_neurons(f
         assert torch.equal(found[index], expected)
 
 
-def test_widths_that_suit_no_vector_are_left_to_the_dense_layers():
+def test_widths_that_are_no_multiple_of_a_vector_use_the_dense_layers():
     layers, wide = [layer_of(4, 16, 5, 5), layer_of(16, 24, 3, 3)], (torch.zeros(32, 24 * 2 * 2), torch.zeros(32))
-    assert sparse.extractor(layers, wide, LIF) is None
+    assert sparse_extractor(layers, wide, LIF) is None
     layers[1] = layer_of(16, 32, 3, 3)
-    assert sparse.extractor(layers, (torch.zeros(13, 32 * 2 * 2), torch.zeros(13)), LIF) is None
-    assert sparse.extractor(layers, (torch.zeros(32, 32 * 2 * 2), torch.zeros(32)), LIF) is not None
+    assert sparse_extractor(layers, (torch.zeros(13, 32 * 2 * 2), torch.zeros(13)), LIF) is None
+    assert sparse_extractor(layers, (torch.zeros(32, 32 * 2 * 2), torch.zeros(32)), LIF) is not None
 
 
-@pytest.mark.parametrize("what", ["rounds otherwise", "is not finite", "raises"])
-def test_where_the_dense_layer_computes_something_else_it_serves_and_it_is_said_once(what, caplog):
+@pytest.mark.parametrize("what", ["rounds differently", "is not finite", "raises"])
+def test_where_the_dense_layer_differs_it_is_used_with_one_warning(what, caplog):
     first, layer = layer_of(4, 16, 5, 5), layer_of(16, 32, 3, 3)
     if what == "is not finite":
         layer.weight[3, 4, 1, 1] = float("nan")
@@ -122,13 +124,13 @@ def test_where_the_dense_layer_computes_something_else_it_serves_and_it_is_said_
             raise RuntimeError("no such primitive")
         return convolution.plain_convolution(weight.flip(1), bias)(x.flip(1))
 
-    convolution.forget_warnings()
+    forget_warnings()
     with caplog.at_level(logging.WARNING):
         for _ in range(2):
             layers = [first, layer._replace(dense=reordered)]
-            assert sparse.extractor(layers, (torch.zeros(16, 128), torch.zeros(16)), LIF) is None
+            assert sparse_extractor(layers, (torch.zeros(16, 128), torch.zeros(16)), LIF) is None
     assert len(caplog.records) == 1
-    assert "convolutions over spikes alone are off" in caplog.text
+    assert "form=convolutions over spike lists" in caplog.text
 
 
 def network_of(seed=0):
@@ -157,7 +159,7 @@ def test_whole_windows_of_few_and_of_many_spikes_fire_as_in_plain_steps_bit_for_
             assert torch.equal(cell.s, other_cell.s)
 
 
-def test_streams_together_answer_as_each_alone_bit_for_bit():
+def test_streams_in_one_batch_answer_as_each_alone_bit_for_bit():
     engine, starts = Engine(network_of()), [network_of().initial_state(1) for _ in range(3)]
     spikes = torch.poisson(torch.full((1, 3, 4, 14, 19), 0.4), generator=torch.Generator().manual_seed(2)).log1p()
     for b, (twists, state) in enumerate(engine.together(spikes, starts)):
@@ -180,27 +182,27 @@ def test_maps_that_do_not_fit_the_network_are_refused(wrong):
         engine(torch.ones(shape.get(wrong, (1, 2, 4, 14, 19))), start)
 
 
-def test_a_number_that_is_not_finite_stays_in_the_state_where_a_check_finds_it():
+def test_a_number_that_is_not_finite_stays_in_the_state_so_that_a_check_finds_it():
     spikes = torch.ones(2, 1, 4, 14, 19)
     spikes[0, 0, 0, 0, 0] = float("nan")
     assert not Engine(network_of())(spikes, network_of().initial_state(1))[1].finite()
 
 
-def test_running_changes_neither_the_state_that_was_given_nor_the_input():
+def test_a_call_changes_neither_the_state_it_receives_nor_the_input():
     engine, spikes = Engine(network_of()), torch.ones(3, 2, 4, 14, 19)
-    _, carried = engine(spikes, network_of().initial_state(2))
-    before = [carried.readout.clone(), *(membrane.v.clone() for membrane in carried.membranes), spikes.clone()]
-    once, again = engine(spikes, carried)[0], engine(spikes, carried)[0]
+    _, given = engine(spikes, network_of().initial_state(2))
+    before = [given.readout.clone(), *(membrane.v.clone() for membrane in given.membranes), spikes.clone()]
+    once, again = engine(spikes, given)[0], engine(spikes, given)[0]
     assert torch.equal(once, again)
-    after = [carried.readout, *(membrane.v for membrane in carried.membranes), spikes]
+    after = [given.readout, *(membrane.v for membrane in given.membranes), spikes]
     assert all(torch.equal(one, other) for one, other in zip(before, after, strict=True))
 
 
 @pytest.mark.parametrize("rate", [0.0, 0.4, 40.0, 300.0])
 @pytest.mark.parametrize("size", [(9, 8), (14, 19), (12, 16), (11, 47)])
 @pytest.mark.parametrize("name", ["log1p", "binary"])
-def test_counts_answer_as_the_spikes_that_they_stand_for_bit_for_bit(name, size, rate):
-    """Window after window and several at once, alone and together; rows shorter and longer than a vector."""
+def test_counts_give_the_same_answers_as_their_spikes_bit_for_bit(name, size, rate):
+    """Single windows and several at once, single streams and batches; rows shorter and longer than a vector."""
     network = SMALL.network.model_copy(update={"encoding": name})
     grid = CanonicalConfig(height=size[0], width=size[1])
     config = SMALL.model_copy(update={"network": network, "canonical": grid})
@@ -210,14 +212,14 @@ def test_counts_answer_as_the_spikes_that_they_stand_for_bit_for_bit(name, size,
     for steps in (1, 3, 1):
         drawn = torch.poisson(torch.full((steps, 2, 4, *size), rate), generator=torch.Generator().manual_seed(steps))
         counts = drawn.clamp(max=255).to(torch.uint8)
-        found, states[0] = engine(to_counts(counts, name), states[0])
+        found, states[0] = engine(to_count_input(counts, name), states[0])
         expected, states[1] = engine(to_spikes(counts, name), states[1])
         assert torch.equal(found, expected)
         for one, other in zip(states[0].membranes, states[1].membranes, strict=True):
             assert torch.equal(one.v, other.v)
     starts = [network.initial_state(1) for _ in range(2)]
-    for b, (twists, _) in enumerate(engine.together(to_counts(counts, name), starts)):
+    for b, (twists, _) in enumerate(engine.together(to_count_input(counts, name), starts)):
         assert torch.equal(twists, engine(to_spikes(counts[:, b : b + 1], name), starts[b])[0])
     with plain():
-        plainly = [engine(give(counts, name), states[0])[0] for give in (to_counts, to_spikes)]
+        plainly = [engine(give(counts, name), states[0])[0] for give in (to_count_input, to_spikes)]
     assert torch.equal(*plainly)

@@ -1,4 +1,4 @@
-"""In whole numbers, what is summed over those that fired alone equals what is summed over all, bit for bit."""
+"""In 8-bit integers, sums over the neurons that fired equal the sums over all neurons, bit for bit."""
 
 import logging
 
@@ -7,8 +7,17 @@ import pytest
 import torch
 
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from neurove_core.engine import convolution, int8, sparse_int8, spike_lists
+from neurove_core.engine import spike_lists
 from neurove_core.engine.engine import Engine
+from neurove_core.engine.fallback import forget_warnings
+from neurove_core.engine.int8 import Int8Layer, Int8Projection, int8_convolution, plain_int8_convolution
+from neurove_core.engine.sparse_int8 import (
+    Int8DenseConvolution,
+    Int8ListConvolution,
+    SparseInt8Layer,
+    first_convolution,
+    sparse_int8_extractor,
+)
 from neurove_core.models import bundle
 from neurove_core.networks import quantisation
 from neurove_core.spiking.lif import LIFParams, LIFState, lif_scan_reference
@@ -30,7 +39,7 @@ def layer_of(inputs, outputs, rows, columns, top=1, *, q=None, seed=0):
         q = torch.randint(-127, 128, (outputs, inputs, 3, 3), generator=generator, dtype=torch.int8)
     factor, offset = torch.rand(2, outputs, generator=generator)
     factor = (factor + 0.1) / (100 * inputs**0.5 * top)
-    return sparse_int8.Layer(q, factor, offset - 0.5, int8.sums(q, top, rows, columns), rows, columns)
+    return SparseInt8Layer(q, factor, offset - 0.5, int8_convolution(q, top, rows, columns), rows, columns)
 
 
 def maps_of(count, channels, rows, columns, share, top=1, seed=0):
@@ -40,7 +49,7 @@ def maps_of(count, channels, rows, columns, share, top=1, seed=0):
 
 def expected_of(layer, maps, v, top=1):
     """Spikes and potentials by torch's public operators."""
-    found = int8.plain_sums(layer.q, top)(maps)
+    found = plain_int8_convolution(layer.q, top)(maps)
     currents = found * layer.factor.view(-1, 1, 1) + layer.offset.view(-1, 1, 1)
     spikes, after = lif_scan_reference(currents.view(-1, *v.shape), LIFState(v), LIF)
     return spikes.flatten(0, 1), after.v
@@ -48,7 +57,7 @@ def expected_of(layer, maps, v, top=1):
 
 def assert_fires_alike(found, expected):
     fired, after = found
-    assert torch.equal(spike_lists.maps_of(fired), expected[0])
+    assert torch.equal(spike_lists.to_maps(fired), expected[0])
     assert torch.equal(torch.from_numpy(after.transpose(0, 3, 1, 2)), expected[1])
 
 
@@ -66,20 +75,20 @@ SIZES = [
 @pytest.mark.parametrize("share", [0, 0.02, 0.15, 0.44, 0.6, 1])
 @pytest.mark.parametrize(("inputs", "outputs", "rows", "columns"), SIZES)
 @torch.inference_mode()
-def test_a_layer_over_a_list_fires_as_the_plain_one_bit_for_bit(inputs, outputs, rows, columns, share):
-    """Short lists and long ones, which are convolved dense: where a large map mostly fires."""
+def test_a_layer_over_a_spike_list_fires_as_the_plain_one_bit_for_bit(inputs, outputs, rows, columns, share):
+    """Short lists, and long ones, which are convolved dense."""
     layer = layer_of(inputs, outputs, rows, columns)
     for steps, batch in ((1, 1), (3, 1), (1, 3), (2, 2)):
         maps = maps_of(steps * batch, inputs, rows, columns, share, seed=steps)
         v = torch.rand(batch, outputs, (rows + 1) // 2, (columns + 1) // 2) - 0.3
         cells = np.ascontiguousarray(v.numpy().transpose(0, 2, 3, 1))
         expected = expected_of(layer, maps, v)
-        over = sparse_int8.OverList(layer)
-        assert_fires_alike(over(spike_lists.listed(maps), cells, *CONSTANTS), expected)
-        assert_fires_alike(over.over_list(spike_lists.listed(maps), cells, *CONSTANTS), expected)
+        over = Int8ListConvolution(layer)
+        assert_fires_alike(over(spike_lists.to_list(maps), cells, *CONSTANTS), expected)
+        assert_fires_alike(over.over_list(spike_lists.to_list(maps), cells, *CONSTANTS), expected)
 
 
-@pytest.mark.parametrize("how", ["as this machine does", "dense"])
+@pytest.mark.parametrize("how", ["chosen for this machine", "dense"])
 @pytest.mark.parametrize("share", [0, 0.15, 1])
 @pytest.mark.parametrize(
     ("inputs", "outputs", "rows", "columns"),
@@ -88,7 +97,7 @@ def test_a_layer_over_a_list_fires_as_the_plain_one_bit_for_bit(inputs, outputs,
 @torch.inference_mode()
 def test_the_first_layer_fires_as_the_plain_one_bit_for_bit(inputs, outputs, rows, columns, share, how):
     layer = layer_of(inputs, outputs, rows, columns, top=255)
-    over = sparse_int8.OverDense(layer) if how == "dense" else sparse_int8.over_codes(layer)
+    over = Int8DenseConvolution(layer) if how == "dense" else first_convolution(layer)
     for steps, batch in ((1, 1), (3, 1), (1, 3), (2, 2)):
         maps = maps_of(steps * batch, inputs, rows, columns, share, top=255, seed=steps)
         v = torch.rand(batch, outputs, (rows + 1) // 2, (columns + 1) // 2) - 0.3
@@ -100,31 +109,31 @@ def test_the_first_layer_fires_as_the_plain_one_bit_for_bit(inputs, outputs, row
 @pytest.mark.parametrize("inputs", [28, 29, 64, 200])
 @torch.inference_mode()
 def test_the_largest_sums_are_exact(inputs, sign):
-    """All weights at their most and all fire: more than 16 bits hold from 29 channels on."""
+    """All weights are maximal and all neurons fire: from 29 channels on the sums exceed 16 bits."""
     q = torch.full((16, inputs, 3, 3), sign * 127, dtype=torch.int8)
     v = np.zeros((2, 4, 3, 16), np.float32)
-    for top, over in ((1, sparse_int8.OverList), (255, sparse_int8.over_codes)):
+    for top, over in ((1, Int8ListConvolution), (255, first_convolution)):
         if 9 * inputs * 127 * top >= 1 << 24:
             continue
         layer = layer_of(inputs, 16, 7, 5, top, q=q)
         maps = torch.full((2, inputs, 7, 5), top, dtype=torch.uint8)
-        given = spike_lists.listed(maps) if top == 1 else maps.numpy()
+        given = spike_lists.to_list(maps) if top == 1 else maps.numpy()
         assert_fires_alike(over(layer)(given, v, *CONSTANTS), expected_of(layer, maps, torch.zeros(2, 16, 4, 3), top))
 
 
 @pytest.mark.parametrize("share", [0, 0.15, 1], ids=["no spike", "spikes", "all fire"])
 @pytest.mark.parametrize("size", [(16, 1, 1), (256, 9, 11), (700, 1, 3), (1, 5, 7)])
 @pytest.mark.parametrize("features", [13, 16, 80, 256])
-def test_who_fired_is_projected_as_its_maps_are_bit_for_bit(features, size, share):
-    """13 suit no vector: the list is read as maps."""
+def test_a_spike_list_is_projected_as_its_maps_are_bit_for_bit(features, size, share):
+    """13 is no multiple of a vector: the list is converted to maps."""
     inputs = size[0] * size[1] * size[2]
     generator = torch.Generator().manual_seed(0)
     q = torch.randint(-127, 128, (features, inputs), generator=generator, dtype=torch.int8)
     step, factor, offset = torch.rand(3, features, generator=generator)
-    projection = int8.Projection(int8.Layer(quantisation.Quantised(q, step), factor, offset))
+    projection = Int8Projection(Int8Layer(quantisation.Quantised(q, step), factor, offset))
     maps = maps_of(4, *size, share)
     rows = maps.permute(0, 2, 3, 1).flatten(1)
-    found = projection(spike_lists.listed(maps))
+    found = projection(spike_lists.to_list(maps))
     assert torch.equal(found, projection(rows))
     with plain():
         assert torch.equal(found, projection(rows))
@@ -132,33 +141,33 @@ def test_who_fired_is_projected_as_its_maps_are_bit_for_bit(features, size, shar
 
 def test_the_largest_sums_of_a_projection_over_a_list_are_exact():
     q = torch.cat([torch.full((8, 132_105), 127), torch.full((8, 132_105), -127)]).to(torch.int8)
-    projection = int8.Projection(int8.Layer(quantisation.Quantised(q, torch.ones(16)), torch.ones(16), torch.zeros(16)))
+    projection = Int8Projection(Int8Layer(quantisation.Quantised(q, torch.ones(16)), torch.ones(16), torch.zeros(16)))
     maps = torch.ones(2, 132_105, 1, 1, dtype=torch.uint8)
-    assert torch.equal(projection(spike_lists.listed(maps)), projection(maps.flatten(1)))
+    assert torch.equal(projection(spike_lists.to_list(maps)), projection(maps.flatten(1)))
 
 
-def test_widths_that_suit_no_vector_are_left_to_the_dense_layers():
+def test_widths_that_are_no_multiple_of_a_vector_use_the_dense_layers():
     first = layer_of(4, 16, 5, 5, top=255)
-    assert sparse_int8.extractor([first, layer_of(16, 24, 3, 3)], LIF) is None
-    assert sparse_int8.extractor([first, layer_of(16, 32, 3, 3)], LIF) is not None
+    assert sparse_int8_extractor([first, layer_of(16, 24, 3, 3)], LIF) is None
+    assert sparse_int8_extractor([first, layer_of(16, 32, 3, 3)], LIF) is not None
 
 
-@pytest.mark.parametrize("what", ["sums otherwise", "raises"])
-def test_where_the_dense_layer_computes_something_else_it_serves_and_it_is_said_once(what, caplog):
+@pytest.mark.parametrize("what", ["sums differently", "raises"])
+def test_where_the_dense_layer_differs_it_is_used_with_one_warning(what, caplog):
     first, layer = layer_of(4, 16, 5, 5, top=255), layer_of(16, 32, 3, 3)
 
-    def otherwise(x):
+    def different(x):
         if what == "raises":
             raise RuntimeError("no such primitive")
-        return int8.plain_sums(layer.q, 1)(x) + 1
+        return plain_int8_convolution(layer.q, 1)(x) + 1
 
-    convolution.forget_warnings()
-    caplog.clear()  # a machine without 8-bit products has said so of `first`
+    forget_warnings()
+    caplog.clear()  # a machine without 8-bit products has warned about `first`
     with caplog.at_level(logging.WARNING):
         for _ in range(2):
-            assert sparse_int8.extractor([first, layer._replace(dense=otherwise)], LIF) is None
+            assert sparse_int8_extractor([first, layer._replace(dense=different)], LIF) is None
     assert len(caplog.records) == 1
-    assert "8-bit convolutions over spikes alone are off" in caplog.text
+    assert "form=8-bit convolutions over spike lists" in caplog.text
 
 
 def network_of(seed=0):
@@ -187,7 +196,7 @@ def test_whole_windows_of_few_and_of_many_spikes_fire_as_in_plain_steps_bit_for_
             assert torch.equal(cell.s, other_cell.s)
 
 
-def test_streams_together_answer_as_each_alone_bit_for_bit():
+def test_streams_in_one_batch_answer_as_each_alone_bit_for_bit():
     engine, starts = Engine(network_of()), [network_of().initial_state(1) for _ in range(3)]
     spikes = torch.poisson(torch.full((1, 3, 6, 14, 19), 0.4), generator=torch.Generator().manual_seed(2)).log1p()
     for b, (twists, state) in enumerate(engine.together(spikes, starts)):

@@ -53,7 +53,7 @@ def test_the_twists_are_those_for_the_events_of_a_camera():
     sensor = Sensor(CONFIG.canonical.width, CONFIG.canonical.height)
     events = make_events(3_000, duration_us=50_000, sensor=sensor)
     state = estimator.initial_state(sensor)
-    counts = np.stack([window.counts for window in estimator.cut(events, state, 50_000).windows])
+    counts = np.stack([window.counts for window in estimator.to_windows(events, state, 50_000).windows])
     seen = estimator.push(events, estimator.initial_state(sensor), 50_000)
     want = np.stack([estimate.twists for estimate in seen.estimates])
     np.testing.assert_array_equal(self_test.answers(estimator, counts), want)

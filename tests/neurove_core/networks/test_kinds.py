@@ -159,7 +159,7 @@ def test_streams_answered_together_are_those_answered_alone(kind):
 
 @pytest.mark.parametrize("kind", ["ann", "snn-ang"])
 def test_a_baseline_in_int8_is_refused(kind):
-    with pytest.raises(ValueError, match=f"network.precision='int8': kind='{kind}' has float32 alone"):
+    with pytest.raises(ValueError, match=f"network.precision='int8': kind='{kind}' supports float32 only"):
         ModelConfig(kind=kind, network=NetworkConfig(precision="int8"))
 
 

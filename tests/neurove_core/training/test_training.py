@@ -81,7 +81,7 @@ def test_a_sequence_has_the_counts_of_the_service_and_the_truth_of_each_bin():
     windows = []
     none = Events.from_columns([], [], [], [])
     for events, horizon_us in [*((chunk, 0) for chunk in simulation.chunks()), (none, 500_000)]:
-        pushed = estimator.cut(events, state, horizon_us)
+        pushed = estimator.to_windows(events, state, horizon_us)
         state = state._replace(windows=pushed.state)
         windows += pushed.windows
     np.testing.assert_array_equal(np.stack([window.counts for window in windows]), sequence.counts)
