@@ -65,7 +65,7 @@ def test_several_streams_are_answered_as_each_alone(kind):
                 torch.testing.assert_close(one, another, rtol=1e-4, atol=1e-5)
 
 
-def test_neurove_has_a_fast_runner_and_a_baseline_runs_as_it_is():
+def test_neurove_has_a_fast_runner_and_a_baseline_a_plain_one():
     assert isinstance(runner_of(network_of(config_of())), FastRunner)
     assert isinstance(runner_of(network_of(config_of().model_copy(update={"kind": "ann"}))), PlainRunner)
 
