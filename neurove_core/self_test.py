@@ -11,7 +11,7 @@ from neurove_core.models.golden import TOLERANCE, Golden
 from neurove_protocol import Events, Sensor
 from neurove_protocol.errors import BadModel
 
-_INT8_GREW: Final = "; an int8 model made before the projection was int8 too may give other estimates (decision 38)"
+_INT8_GREW: Final = "; an int8 model made before the projection was in int8 too may give other estimates (decision 38)"
 
 _AXES: Final = ("vx", "vy", "vz", "wx", "wy", "wz")
 

@@ -76,7 +76,7 @@ class Engine:
             self._params = [copied_params(cell.params()) for cell in cells]
             self._d_space = network.d_space.detach().clone()
         inside = self._project if isinstance(self._project, Folded) and self._sparse is None else None
-        self._features_inside = inside.bias.numel() if inside else 0  # of a projection that `run_cells` computes itself
+        self._features_inside = inside.bias.numel() if inside else 0  # of a projection in `run_cells`
         self._weights = flattened_weights(inside, self._params, self._d_space, self._readout)
         self._constants = np.array([net.alpha, net.v_th, self._kappa], np.float32)
 
@@ -128,9 +128,8 @@ class Engine:
         answers = []
         for b, state in enumerate(states):
             twists, cells, y = (self._plain_cells if is_plain() else self._fused_cells)(rows[b : b + 1], 1, state)
-            own = tuple(
-                LIFState(membrane.v[b : b + 1].clone()) for membrane in membranes
-            )  # a view would keep the memory of all streams
+            # cloned, because a view would keep the memory of all streams
+            own = tuple(LIFState(membrane.v[b : b + 1].clone()) for membrane in membranes)
             answers.append((twists, NetworkState(own, cells, y)))
         return answers
 

@@ -40,9 +40,9 @@ from neurove_core.engine.tiles import LANES, tile_of
 from neurove_core.spiking.lif import LIFParams, LIFState
 
 _MANY: Final = 0.4
-"""Share of spikes above which a map is convolved dense: with AVX-512 both take as long there (with AVX2 at 0.7)."""
+"""Share of spikes above which a map is convolved dense: with AVX-512 a large map takes equally long (AVX2: 0.7)."""
 
-_FEW: Final = 1 << 14  # with fewer spikes the list is always faster than starting a dense convolution
+_FEW: Final = 1 << 14  # with fewer spikes the list is faster than the start of a dense convolution of a small map
 
 
 _CHUNK: Final = 512  # inputs of the projection whose weights, 512 KiB for 256 features, stay in the second-level cache

@@ -220,8 +220,8 @@ def convolve_list(
 ) -> int:  # pragma: no cover (machine code)
     """Convolution of a spike list with int8 weights, 3x3, stride 2, zero padding of 1, followed by one LIF step.
 
-    The kernel first writes the weight rows of all spikes under it into one array. One long loop over this array
-    mispredicts its end once, where a loop for each kernel row would do so three times.
+    The weight rows of all spikes under the kernel are first written into one array. One long loop then adds them,
+    because a processor mispredicts the ends of short loops.
 
     Args:
         like: tuple whose length is the number of vectors in a tile.

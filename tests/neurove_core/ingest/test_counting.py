@@ -1,4 +1,4 @@
-"""The compiled binning kernel counts what its plain reference counts, bit for bit."""
+"""The compiled counting kernel equals its reference implementation, bit for bit."""
 
 import numpy as np
 import pytest
@@ -31,14 +31,14 @@ def assert_agree(events: Events, start_us: int, lut: np.ndarray, fill: int = 0) 
 
 
 @given(seed=st.integers(0, 2**32), n=st.integers(0, 3_000), start_us=st.integers(-(1 << 60), 1 << 60))
-def test_the_compiled_kernel_counts_what_the_reference_counts(seed, n, start_us):
+def test_the_compiled_kernel_counts_as_the_reference_does(seed, n, start_us):
     events = make_events(n, seed=seed, start_us=start_us, duration_us=BINS * BIN_US)
     assert_agree(events, start_us, random_lut(seed))
 
 
 @pytest.mark.parametrize("fill", [0, 200, 254, 255])
 def test_both_saturate_at_255_and_never_wrap_around(fill):
-    lut = np.zeros((SENSOR.height, SENSOR.width), np.int32)  # every pixel looks into one cell
+    lut = np.zeros((SENSOR.height, SENSOR.width), np.int32)  # every pixel maps to one cell
     _, counts = assert_agree(make_events(4_000, duration_us=BINS * BIN_US), 0, lut, fill)
     assert (counts[:, 0, 0] == 255).all()
     assert (counts.reshape(2 * BINS, -1)[:, 1:] == fill).all()
@@ -51,7 +51,7 @@ def test_a_cell_counts_exactly_up_to_255(n, expected):
     assert int(counts[1, 0, 0]) == int(counts.sum()) == expected
 
 
-def test_an_event_that_no_cell_sees_is_counted_as_outside_and_changes_nothing():
+def test_an_event_without_a_cell_is_counted_as_outside_and_changes_nothing():
     blind = np.full((SENSOR.height, SENSOR.width), OUTSIDE, np.int32)
     outside, counts = assert_agree(make_events(500, duration_us=BINS * BIN_US), 0, blind)
     assert outside == 500

@@ -1,4 +1,4 @@
-"""Windows: the same however packets are cut, half-open on an absolute grid, and every event accounted for."""
+"""Windows: independent of packet sizes, half-open on an absolute grid, and every event is accounted for."""
 
 import itertools
 import pickle
@@ -63,7 +63,7 @@ def whole(events: Events) -> Packet:
 
 
 def cut_at_random(events: Events, seed: int) -> list[Packet]:
-    """The events in packets of any length, a tick between some of them, cuts also between equal timestamps."""
+    """The events in packets of any length, some with a tick in between; packets may end between equal timestamps."""
     rng = np.random.default_rng(seed)
     cuts = [0, *np.sort(rng.integers(1, events.n, 40)).tolist(), events.n]
     packets = []
@@ -77,7 +77,7 @@ def cut_at_random(events: Events, seed: int) -> list[Packet]:
 
 
 def expected_windows(events: Events, lut: NDArray[np.int32]) -> list[Window]:
-    """Every window before that of the last event, by the definition: no packets, no state."""
+    """Every window before that of the last event, directly by the definition, without packets and state."""
     number = events.t // CONFIG.duration_us
     windows = []
     for k in range(int(number[0]), int(number[-1])):
@@ -96,7 +96,7 @@ def assert_same_windows(got: list[Window], want: list[Window]) -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_windows_do_not_depend_on_how_the_driver_cuts_packets(seed):
+def test_windows_do_not_depend_on_packet_sizes(seed):
     events = make_events(2_000, seed=seed, start_us=-35_000, duration_us=120_000)
     events = events._replace(t=events.t // 500 * 500)  # about eight events share each timestamp
     cut = run(cut_at_random(events, seed), HALF_BLIND)
@@ -105,7 +105,7 @@ def test_windows_do_not_depend_on_how_the_driver_cuts_packets(seed):
     assert (cut.late, cut.skipped) == (0, 0)
 
 
-def test_windows_do_not_depend_on_one_packet_for_each_event():
+def test_windows_are_the_same_with_one_packet_for_each_event():
     events = make_events(300, seed=1, duration_us=60_000)
     single = [Packet(events.span(i, i + 1), int(events.t[i])) for i in range(events.n)]
     assert_same_windows(run(single).windows, expected_windows(events, LUT))
@@ -119,7 +119,7 @@ def test_an_event_at_the_start_of_a_window_is_in_it_and_one_at_its_end_is_not(st
 
 
 @pytest.mark.parametrize("k", range(CONFIG.bins))
-def test_an_event_at_the_edge_of_a_bin_is_the_first_of_that_bin_and_one_before_the_last_of_the_bin_before(k):
+def test_an_event_at_the_start_of_a_bin_is_in_it_and_one_before_is_in_the_previous_bin(k):
     edge_us = 30_000 + k * CONFIG.bin_us
     (window,) = run([at(edge_us, edge_us + CONFIG.bin_us - 1), tick(40_000)]).windows
     assert window.counts.sum(axis=(1, 2)).tolist() == [2 if channel == 2 * k + 1 else 0 for channel in range(10)]
@@ -139,7 +139,7 @@ def test_a_window_is_complete_as_soon_as_its_end_is_reached_and_not_before(newes
 
 
 @given(k=st.integers(-(10**6), 10**6))
-def test_the_grid_is_absolute_a_shift_by_whole_windows_shifts_the_windows_and_nothing_else(k):
+def test_the_grid_is_absolute_so_a_shift_by_whole_windows_only_shifts_the_windows(k):
     events = make_events(400, seed=3, start_us=1_234, duration_us=45_000)
     shift_us = k * CONFIG.duration_us
     shifted = run([whole(events._replace(t=events.t + shift_us))]).windows
@@ -147,7 +147,7 @@ def test_the_grid_is_absolute_a_shift_by_whole_windows_shifts_the_windows_and_no
 
 
 @pytest.mark.parametrize("lost", [1, 100, 350])
-def test_a_lost_beginning_changes_no_later_window(lost):
+def test_a_lost_first_packet_changes_no_later_window(lost):
     events = make_events(1_000, seed=4, start_us=-25_000, duration_us=60_000)
     full, cut = run([whole(events)]).windows, run([whole(events.span(lost, events.n))]).windows
     assert len(cut) > 2
@@ -156,7 +156,7 @@ def test_a_lost_beginning_changes_no_later_window(lost):
 
 @pytest.mark.parametrize("as_one_packet", [True, False])
 @pytest.mark.parametrize("hole", range(6))
-def test_a_hole_of_up_to_max_hole_windows_gives_empty_windows_and_a_longer_one_is_skipped_and_counted(
+def test_a_gap_of_up_to_max_hole_windows_gives_empty_windows_and_a_longer_one_is_skipped_and_counted(
     hole, as_one_packet
 ):
     after_us = (hole + 1) * 10_000 + 17
@@ -172,20 +172,20 @@ def test_a_hole_of_up_to_max_hole_windows_gives_empty_windows_and_a_longer_one_i
     assert all(not w.counts.any() for w in result.windows if w.events == 0)
 
 
-def test_a_hole_at_negative_times_is_measured_like_any_other():
+def test_a_gap_at_negative_times_is_measured_like_any_other():
     result = run([at(-95_000), at(-5_000), tick(0)])
     assert [w.start_us for w in result.windows] == [-100_000, -10_000]
     assert result.skipped == 8
 
 
-def test_silence_is_no_hole_while_the_driver_ticks():
+def test_silence_is_no_gap_while_the_driver_sends_ticks():
     ticks = [tick(us) for us in range(20_000, 200_000, 20_000)]
     result = run([at(5), *ticks, at(200_000)])
     assert [w.start_us for w in result.windows] == list(range(0, 200_000, 10_000))
     assert result.skipped == 0
 
 
-def test_a_tick_after_a_long_hole_skips_it_as_an_event_would():
+def test_a_tick_after_a_long_gap_skips_it_as_an_event_would():
     by_tick, by_event = run([at(5), tick(100_000)]), run([at(5), at(100_000)])
     assert_same_windows(by_tick.windows, by_event.windows)
     assert (by_tick.skipped, by_tick.state.start_us) == (by_event.skipped, by_event.state.start_us) == (9, 100_000)
@@ -206,7 +206,7 @@ def test_an_older_event_of_the_open_window_is_not_late():
     assert (result.late, result.windows[0].events) == (0, 2)
 
 
-def test_time_that_was_reached_once_is_not_forgotten():
+def test_the_newest_time_is_kept_after_an_older_packet():
     result = run([tick(5_000), tick(19_999), at(12_000), tick(15_000)])
     assert (result.state.horizon_us, result.state.start_us) == (19_999, 10_000)
 
@@ -217,7 +217,7 @@ def test_before_the_first_packet_there_is_no_window_and_the_first_tick_opens_one
 
 
 @pytest.mark.parametrize("horizon_us", [5_000, 25_000, 31_000])
-def test_the_first_window_is_that_of_the_first_event_or_of_the_packets_own_time_whichever_is_earlier(horizon_us):
+def test_the_first_window_contains_the_first_event_or_the_packet_time_whichever_is_earlier(horizon_us):
     result = run([Packet(events_at(25_000), horizon_us), tick(40_000)])
     assert result.windows[0].start_us == min(20_000, horizon_us // 10_000 * 10_000)
     assert (sum(window.events for window in result.windows), result.late) == (1, 0)
@@ -226,10 +226,10 @@ def test_the_first_window_is_that_of_the_first_event_or_of_the_packets_own_time_
 def test_memory_does_not_grow_with_the_events_of_an_open_window():
     few, many = (run([whole(make_events(n, seed=5, duration_us=9_000))] * 20).state for n in (100, 10_000))
     assert (few.events, many.events) == (2_000, 200_000)
-    assert len(pickle.dumps(many)) <= len(pickle.dumps(few)) + 16  # longer numbers, nothing else
+    assert len(pickle.dumps(many)) <= len(pickle.dumps(few)) + 16  # only the numbers are longer
 
 
-def test_a_closed_window_is_never_changed_again():
+def test_a_closed_window_never_changes():
     events = make_events(3_000, seed=6, duration_us=80_000)
     state, closed = WindowsState(), []
     for packet in cut_at_random(events, 6):
@@ -242,7 +242,7 @@ def test_a_closed_window_is_never_changed_again():
 
 
 @given(data=st.data())
-def test_every_event_pushed_is_in_a_window_or_open_or_late_and_every_window_adds_up(data):
+def test_every_event_is_in_a_window_or_in_the_open_one_or_late_and_counts_are_consistent(data):
     packets = []
     for seed in range(data.draw(st.integers(1, 12), "packets")):
         start_us = data.draw(st.integers(-60_000, 60_000), "start")
@@ -263,7 +263,7 @@ def test_every_event_pushed_is_in_a_window_or_open_or_late_and_every_window_adds
     assert len(starts) + result.skipped == span
 
 
-def test_events_at_pixels_that_look_past_the_grid_are_outside_and_counted_nowhere_else():
+def test_events_at_pixels_without_a_cell_are_outside_and_in_no_count():
     events = Events.from_columns([1, 2, 3], [10, 50, 11], [5, 5, 5], [1, 1, 0])
     (window,) = run([whole(events), tick(10_000)], HALF_BLIND).windows
     assert (window.events, window.outside, int(window.counts.sum())) == (3, 2, 1)

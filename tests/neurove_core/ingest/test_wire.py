@@ -1,4 +1,4 @@
-"""The service's way from bytes to counts refuses, reads and counts what the plain one does, bit for bit."""
+"""The fast path from bytes to counts rejects, reads and counts as the reference does, bit for bit."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -35,7 +35,7 @@ HALF_BLIND = np.where(np.arange(SENSOR.width) < SENSOR.width // 2, OUTSIDE, LUT)
 def outcome(
     read: Callable[[bytes, PacketLimits], Packet], data: bytes, limits: PacketLimits = DEFAULT_LIMITS
 ) -> object:
-    """The packet as plain values, or the error that was raised."""
+    """The packet as plain values, or the error that reading it raises."""
     try:
         packet = read(data, limits)
     except NeuroVEError as error:
@@ -51,7 +51,7 @@ def assert_read_alike(data: bytes, limits: PacketLimits = DEFAULT_LIMITS) -> Non
 
 @bounded
 @given(packets(), st.sampled_from([None, "soa8"]))
-def test_any_packet_is_read_as_the_plain_reader_reads_it(packet: EventPacket, blob_format: str | None) -> None:
+def test_any_packet_is_read_as_by_the_reference_reader(packet: EventPacket, blob_format: str | None) -> None:
     assert_read_alike(encode_packet(packet, blob_format))
 
 
@@ -66,7 +66,7 @@ def test_names_of_every_length_are_read(stream: str) -> None:
     assert_read_alike(encode_packet(make_packet(3, stream=stream)))
 
 
-def test_a_packet_whose_fields_stand_in_another_order_or_with_others_is_read_too() -> None:
+def test_a_packet_with_fields_in_another_order_or_with_extra_fields_is_read() -> None:
     fields = EVENT_PACKET.fields()
     assert_read_alike(pack(dict(reversed(fields.items()))))
     assert_read_alike(pack({"new": {"x": 1}, **fields}))
@@ -78,28 +78,28 @@ def test_a_packet_whose_fields_stand_in_another_order_or_with_others_is_read_too
     "value",
     [None, True, -1, 0, 1, 2, 5, 399, 401, 1 << 15, 1 << 62, (1 << 64) - 1, -(1 << 63), 1.0, "soa8", "", b"", []],
 )
-def test_any_field_is_refused_by_the_same_sentence(name: str, value: object) -> None:
+def test_a_wrong_field_is_rejected_with_the_same_error_text(name: str, value: object) -> None:
     fields = EVENT_PACKET.fields()
     assert_read_alike(pack(fields | {name: value}), LIMITS)
     assert_read_alike(pack({key: kept for key, kept in fields.items() if key != name}), LIMITS)
 
 
 @pytest.mark.parametrize("stream", ["", ".", "a/b", "a b", "\u4e8b", "@x", "-x"])
-def test_a_bad_name_is_refused_by_the_same_sentence(stream: str) -> None:
+def test_a_bad_name_is_rejected_with_the_same_error_text(stream: str) -> None:
     assert_read_alike(pack(EVENT_PACKET.fields() | {"stream": stream}))
 
 
 @pytest.mark.parametrize("wide", [False, True])
 @pytest.mark.parametrize("index", [0, 1, 4])
 @pytest.mark.parametrize(("x", "y", "back_us"), [(346, 0, 0), (0, 260, 0), (65_535, 32_767, 0), (0, 0, 7)])
-def test_an_event_that_is_wrong_is_named_alike(wide: bool, index: int, x: int, y: int, back_us: int) -> None:
+def test_a_wrong_event_is_named_in_the_same_error_text(wide: bool, index: int, x: int, y: int, back_us: int) -> None:
     events = [(10 + i, 345, 259, i % 2) for i in range(5)]
     events[index] = (events[index][0] - back_us, x, y, 1)
     changed = {"n": 5, "format": "soa8" if wide else "soa6", "data": soa(events, wide=wide)}
     assert_read_alike(pack(EVENT_PACKET.fields() | changed))
 
 
-def test_every_truncation_and_every_flipped_bit_is_read_alike() -> None:
+def test_every_truncation_and_every_flipped_bit_gives_the_same_result() -> None:
     data = EVENT_PACKET.bytes()
     for size in range(len(data)):
         assert_read_alike(data[:size])
@@ -109,20 +109,22 @@ def test_every_truncation_and_every_flipped_bit_is_read_alike() -> None:
     assert_read_alike(data + b"\0")
 
 
-def test_a_packet_beyond_the_caps_is_refused_alike() -> None:
+def test_a_packet_above_the_limits_is_rejected_in_the_same_way() -> None:
     data = encode_packet(make_packet(50))
     for limits in (PacketLimits(max_events=49), PacketLimits(max_side_px=63), PacketLimits(max_events=0)):
         assert_read_alike(data, limits)
 
 
-def test_the_events_of_a_packet_stay_where_they_are() -> None:
+def test_the_events_of_a_packet_are_not_copied() -> None:
     data = encode_packet(make_packet(1_000))
     assert np.shares_memory(read_packet(data).events.blob, np.frombuffer(data, np.uint8))
 
 
 @bounded
 @given(packets(), st.integers(-5, 70_000), st.integers(-3, 20), st.integers(-3, 20))
-def test_events_on_the_wire_are_cut_as_columns_are(packet: EventPacket, after_us: int, first: int, stop: int) -> None:
+def test_events_in_packet_layout_are_split_as_columns_are(
+    packet: EventPacket, after_us: int, first: int, stop: int
+) -> None:
     events, lying = packet.events, open_packet(encode_packet(packet)).events
     assert lying.n == events.n
     assert lying.before(packet.t0_us + after_us) == events.before(packet.t0_us + after_us)
@@ -141,7 +143,7 @@ def test_events_on_the_wire_are_cut_as_columns_are(packet: EventPacket, after_us
     blob_format=st.sampled_from(FORMATS),
     fill=st.sampled_from([0, 254]),
 )
-def test_counts_are_those_of_the_columns_bit_for_bit(count, seed, n, start_us, blob_format, fill) -> None:
+def test_counts_equal_those_of_the_columns_bit_for_bit(count, seed, n, start_us, blob_format, fill) -> None:
     events = make_events(n, seed=seed, start_us=start_us, duration_us=3_000)
     lut = np.random.default_rng(seed).integers(OUTSIDE, 42, (SENSOR.height, SENSOR.width), np.int32)
     t0_us = start_us - int(seed % 1_000)
@@ -168,10 +170,10 @@ def run(given: list[EventPacket], *, from_wire: bool, lut: np.ndarray) -> list[P
 
 @pytest.mark.parametrize("lut", [LUT, HALF_BLIND])
 @pytest.mark.parametrize("seed", range(5))
-def test_windows_and_what_is_told_of_losses_are_the_same_from_wire_and_from_columns(seed: int, lut: np.ndarray) -> None:
+def test_windows_and_losses_are_the_same_from_packet_layout_and_from_columns(seed: int, lut: np.ndarray) -> None:
     rng = np.random.default_rng(seed)
     given = make_packets(60, first_seq=seed, start_us=-30_000, step_us=1_500, n=150)
-    order = np.argsort(np.arange(60) + rng.normal(0, 1.5, 60))  # some come late
+    order = np.argsort(np.arange(60) + rng.normal(0, 1.5, 60))  # some arrive late
     given = [given[i] for i in order if rng.random() > 0.1]  # some are lost
     given += make_packets(3, start_us=900_000, n=0) + make_packets(9, start_us=950_000, step_us=90_000)
     for plain, wire in zip(*(run(given, from_wire=from_wire, lut=lut) for from_wire in (False, True)), strict=True):

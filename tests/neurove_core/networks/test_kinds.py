@@ -1,4 +1,4 @@
-"""The learned baselines keep NeuroVE's protocol: what streams, what learns and what a bundle says holds for each."""
+"""The learned baselines have NeuroVE's interface: streaming, training and bundles work for each kind."""
 
 import copy
 from dataclasses import replace
@@ -46,7 +46,7 @@ def spikes_of(config: ModelConfig, batch: int = BATCH) -> torch.Tensor:
 
 @each_kind
 @torch.no_grad()
-def test_window_by_window_equals_the_whole_sequence_and_streams_stay_apart(kind):
+def test_window_by_window_equals_the_whole_sequence_and_streams_are_independent(kind):
     config = config_of(kind)
     network, spikes = bundle.untrained(0, config).network.double(), spikes_of(config).double()
     whole, last = network(spikes, network.initial_state(BATCH))
@@ -63,7 +63,7 @@ def test_window_by_window_equals_the_whole_sequence_and_streams_stay_apart(kind)
 
 
 @each_kind
-def test_every_parameter_learns_and_a_detached_state_has_no_past(kind):
+def test_every_parameter_has_a_gradient_and_a_detached_state_has_no_history(kind):
     config = config_of(kind, surrogate_width=4.0)
     network = bundle.untrained(0, config).network.train()
     twists, state = network(spikes_of(config), network.initial_state(BATCH))
@@ -77,7 +77,7 @@ def test_every_parameter_learns_and_a_detached_state_has_no_past(kind):
 
 
 @each_kind
-def test_a_state_with_a_nan_is_told_apart(kind):
+def test_a_state_with_a_nan_is_detected(kind):
     state = kinds.make(config_of(kind)).initial_state(2)
     assert state.finite()
     for tensor in carried.tensors_of(state):
@@ -103,7 +103,7 @@ def test_a_bundle_keeps_its_kind_and_serves(kind, tmp_path):
     assert set(told["firing_rate_by_layer"]) == layers[kind]
 
 
-def test_a_bundle_of_one_kind_is_none_of_another():
+def test_a_bundle_of_one_kind_does_not_load_as_another():
     data = bundle.untrained(2, config_of("ann")).to_bytes()
     for other in ("neurove", "snn-ang"):
         text = data.replace(b'\\"kind\\":\\"ann\\"', b'\\"kind\\":\\"' + other.encode() + b'\\"')
@@ -118,7 +118,7 @@ def test_the_ann_has_the_size_of_neurove_within_a_tenth():
 
 
 @torch.no_grad()
-def test_an_ann_sees_no_past_but_in_its_lstm_and_its_readout():
+def test_an_ann_has_memory_only_in_its_lstm_and_its_readout():
     config = config_of("ann")
     network, spikes = bundle.untrained(0, config).network, spikes_of(config, 1)
     _, state = network(spikes[:1], network.initial_state(1))
@@ -132,7 +132,7 @@ def test_the_outputs_of_snn_ang_leak_and_never_fire():
     network = bundle.untrained(0, config).network
     network.readout.bias.zero_()
     for norm in network.norms:
-        norm.bias.fill_(-9.0)  # nobody fires
+        norm.bias.fill_(-9.0)  # no neuron fires
     state = network.initial_state(1)._replace(readout=torch.full((1, 30), 5.0))
     answers, _ = network(spikes_of(config, 1), state)
     leak = np.exp(-1 / OUTPUT_TAU_STEPS)
@@ -148,7 +148,7 @@ def test_snn_ang_halves_its_image_four_times_and_no_more():
 
 
 @each_kind
-def test_streams_answered_together_are_those_answered_alone(kind):
+def test_streams_answered_in_one_batch_equal_those_answered_alone(kind):
     estimator, sensor = Estimator(bundle.untrained(2, config_of(kind))), Sensor(22, 16)
     seen = [make_events(2_000, sensor=sensor, duration_us=120_000, seed=seed) for seed in range(3)]
     pushes = [Push(events, estimator.initial_state(sensor), 120_000) for events in seen]
@@ -158,14 +158,14 @@ def test_streams_answered_together_are_those_answered_alone(kind):
 
 
 @pytest.mark.parametrize("kind", ["ann", "snn-ang"])
-def test_a_baseline_in_int8_is_refused(kind):
+def test_a_baseline_in_int8_is_rejected(kind):
     with pytest.raises(ValueError, match=f"network.precision='int8': kind='{kind}' supports float32 only"):
         ModelConfig(kind=kind, network=NetworkConfig(precision="int8"))
 
 
 @each_kind
 @torch.no_grad()
-def test_norms_that_ranks_share_take_the_place_of_each_kind_s_own(kind):
+def test_shared_norms_of_ranks_replace_the_norms_of_each_kind(kind):
     config = config_of(kind)
     own = bundle.untrained(0, config).network.train()
     shared = copy.deepcopy(own)
@@ -187,7 +187,7 @@ def test_a_baseline_has_no_uncertainty(kind, tmp_path):
 
 
 @each_kind
-def test_each_kind_trains_from_one_recipe_and_goes_on_exactly(kind, tmp_path):
+def test_each_kind_trains_from_one_recipe_and_resumes_exactly(kind, tmp_path):
     config = TrainingConfig(
         name="tiny",
         model=config_of(kind),

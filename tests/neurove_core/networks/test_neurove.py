@@ -1,4 +1,4 @@
-"""NeuroVE: its state streams, streams stay apart, and every parameter learns."""
+"""NeuroVE: state continues between calls, streams are independent, and every parameter learns."""
 
 from itertools import chain
 
@@ -24,7 +24,7 @@ def make_config(width: int = 19, height: int = 14, diffusion: bool = True, **net
 
 
 def make_network(config: ModelConfig, seed: int = 0) -> NeuroVE:
-    """In evaluation mode and float64, its norms settled, so that its neurons fire."""
+    """A network in evaluation mode and float64, with adapted norms, so that its neurons fire."""
     return bundle.untrained(seed, config).network.double()
 
 
@@ -62,7 +62,7 @@ def test_window_by_window_equals_the_whole_sequence(seed, diffusion):
     for cell, other_cell in zip(end.cells, last.cells, strict=True):
         assert torch.equal(cell.s, other_cell.s)
     for membrane, other_membrane in zip(end.membranes, last.membranes, strict=True):
-        fired = membrane.v == 0  # reset just now
+        fired = membrane.v == 0  # just reset
         assert torch.equal(fired, other_membrane.v == 0)
         assert 0 < fired.double().mean() < 1
     for one, other in zip(tensors_of(end), tensors_of(last), strict=True):
@@ -88,7 +88,7 @@ def test_streams_in_a_batch_do_not_leak_into_each_other(diffusion):
 
 @pytest.mark.parametrize("part", ["membranes", "cells", "readout"])
 @torch.no_grad()
-def test_every_part_of_the_carried_state_matters_to_the_next_answer(part):
+def test_every_part_of_the_state_affects_the_next_answer(part):
     config = make_config()
     network, spikes = make_network(config), make_spikes(config, steps=2)
     rest = network.initial_state(BATCH)
@@ -99,7 +99,7 @@ def test_every_part_of_the_carried_state_matters_to_the_next_answer(part):
 
 
 @torch.no_grad()
-def test_running_a_network_changes_neither_the_state_it_was_given_nor_the_network():
+def test_a_call_changes_neither_the_state_it_receives_nor_the_network():
     config = make_config()
     network, spikes = make_network(config), make_spikes(config)
     _, carried = network(spikes[:3], network.initial_state(BATCH))
@@ -123,7 +123,7 @@ def test_every_parameter_gets_a_finite_gradient_when_training_on_log_counts(surr
         assert parameter.grad.any(), name
 
 
-def test_the_gradient_reaches_back_through_the_windows_and_through_every_part_of_a_carried_state():
+def test_the_gradient_flows_back_through_windows_and_every_part_of_the_state():
     config = make_config()
     network, spikes = make_network(config), make_spikes(config).requires_grad_()
     _, carried = network(spikes[:3], network.initial_state(BATCH))
@@ -137,7 +137,7 @@ def test_the_gradient_reaches_back_through_the_windows_and_through_every_part_of
     assert all(gradient.any() for gradient in by_state)
 
 
-def test_the_form_without_diffusion_has_no_diffusion_parameters_and_is_otherwise_the_same():
+def test_without_diffusion_there_are_no_diffusion_parameters_and_all_others_stay():
     network, without = NeuroVE(make_config()), NeuroVE(make_config(diffusion=False))
     diffusion = {"d_space", "cells.0.d_time", "cells.1.d_time"}
     assert network.state_dict().keys() - without.state_dict().keys() == diffusion
@@ -146,7 +146,7 @@ def test_the_form_without_diffusion_has_no_diffusion_parameters_and_is_otherwise
 
 
 @torch.no_grad()
-def test_the_form_without_diffusion_answers_as_a_network_whose_diffusion_is_zero():
+def test_without_diffusion_answers_equal_those_with_zero_diffusion():
     network, without = make_network(make_config()), make_network(make_config(diffusion=False))
     without.load_state_dict(network.state_dict(), strict=False)
     spikes = make_spikes(make_config())
@@ -172,7 +172,7 @@ def test_map_sizes_are_those_of_the_real_maps_for_odd_and_even_grids(width, heig
 
 
 @torch.no_grad()
-def test_the_answer_of_each_bin_follows_from_the_readout_in_the_order_of_bins_and_axes():
+def test_the_readout_is_split_into_bins_and_axes_in_order():
     config = make_config()
     network, spikes = make_network(config), make_spikes(config)
     twists, state = network(spikes, network.initial_state(BATCH))
@@ -181,7 +181,7 @@ def test_the_answer_of_each_bin_follows_from_the_readout_in_the_order_of_bins_an
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), -float("inf")])
-def test_a_state_is_finite_only_if_every_number_of_it_is(value):
+def test_a_state_is_finite_only_if_every_number_is(value):
     network = NeuroVE(make_config())
     assert network.initial_state(2).finite()
     for number in range(len(tensors_of(network.initial_state(2)))):

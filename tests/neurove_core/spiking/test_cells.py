@@ -1,4 +1,4 @@
-"""ASLSTM, SLSTM and readout against their equations written out by hand, and the laws of their state."""
+"""ASLSTM, SLSTM and readout compared with their equations written by hand, and properties of their state."""
 
 import math
 
@@ -16,7 +16,7 @@ each_width = pytest.mark.parametrize(("inputs", "hidden"), [(1, 8), (8, 8), (5, 
 
 
 def make_layer(inputs: int = 5, hidden: int = 7, seed: int = 0, **options) -> ASLSTM:
-    """A layer whose cells fire now and then."""
+    """A layer whose cells fire in some steps."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         return ASLSTM(inputs, hidden, **{"v_th": 0.3, **options}).double()
@@ -54,7 +54,7 @@ def one_unit_by_hand(
 
 @pytest.mark.parametrize("d", [0.0, 0.2, 0.7])
 @pytest.mark.parametrize("alpha", [0.5, 0.9])
-def test_one_cell_computes_equations_7_and_9_as_written_out_by_hand(d, alpha):
+def test_one_cell_computes_equations_7_and_9_as_written_by_hand(d, alpha):
     w = {"i": (0.7, -0.3, 0.1), "f": (-0.4, 0.6, 0.5), "g": (1.1, 0.9, -0.2), "o": (0.3, -0.8, 0.4), "z": (0.5, 0, 0.1)}
     xs = [0.9, -0.4, 1.5, 1.2, -2.0, 0.3, 0.8, 0.0]
     params = ASLSTMParams(
@@ -66,7 +66,7 @@ def test_one_cell_computes_equations_7_and_9_as_written_out_by_hand(d, alpha):
         v_th=0.6,
     )
     expected = one_unit_by_hand(xs, w, d, alpha, 0.6)
-    assert {s for _, _, s in expected} == {0.0, 1.0}  # it fires, and not always: the reset matters
+    assert {s for _, _, s in expected} == {0.0, 1.0}  # it fires in some steps only, so the reset has an effect
     zero = torch.zeros(1, 1, dtype=torch.float64)
     state = ASLSTMState(zero, zero, zero)
     for x, by_hand in zip(xs, expected, strict=True):
@@ -88,7 +88,7 @@ def test_step_by_step_equals_the_whole_sequence_bit_for_bit(inputs, hidden, diff
 
 
 @each_form
-def test_a_sequence_may_be_cut_anywhere_if_the_state_goes_on(diffusion):
+def test_a_sequence_may_be_split_anywhere_if_the_state_continues(diffusion):
     layer, x = make_layer(diffusion=diffusion), make_input(5)
     _, whole = layer(x, layer.initial_state(4))
     _, middle = layer(x[:5], layer.initial_state(4))
@@ -97,15 +97,15 @@ def test_a_sequence_may_be_cut_anywhere_if_the_state_goes_on(diffusion):
 
 @each_form
 @each_width
-def test_a_constant_input_moves_the_state_at_every_step_whatever_the_widths(inputs, hidden, diffusion):
+def test_a_constant_input_changes_the_state_at_every_step_for_any_widths(inputs, hidden, diffusion):
     layer = make_layer(inputs, hidden, diffusion=diffusion)
     states, _ = layer(make_input(inputs, steps=1).expand(8, -1, -1), layer.initial_state(4))
-    assert (states.c.diff(dim=0).abs().amax(dim=(1, 2)) > 1e-6).all()  # a cell that forgets repeats its first step
+    assert (states.c.diff(dim=0).abs().amax(dim=(1, 2)) > 1e-6).all()  # a cell without memory repeats its first step
     assert (states.v.diff(dim=0).abs().amax(dim=(1, 2)) > 1e-6).all()
 
 
 @each_form
-def test_what_was_seen_long_ago_still_shows(diffusion):
+def test_an_early_input_still_affects_late_steps(diffusion):
     layer, x = make_layer(diffusion=diffusion), make_input(5, steps=6)
     other = x.clone()
     other[0] += 1
@@ -133,7 +133,7 @@ def test_gradients_flow_to_every_parameter_and_back_to_the_first_input(diffusion
     by_x, *gradients = torch.autograd.grad((states.s[-1] + states.v[-1]).sum(), [x, *parameters])
     for name, gradient in zip(names, gradients, strict=True):
         assert torch.isfinite(gradient).all(), name
-        assert gradient.reshape(len(gradient), -1).any(dim=1).all(), name  # of every gate and every cell
+        assert gradient.reshape(len(gradient), -1).any(dim=1).all(), name  # for every gate and every cell
     assert by_x[0].any()
 
 
@@ -164,7 +164,7 @@ def test_no_gradient_goes_through_the_reset():
     assert by_v.any()
 
 
-def test_a_cell_that_fired_keeps_nothing_of_h_in_its_membrane_at_the_next_step():
+def test_after_a_spike_no_h_remains_in_the_membrane_at_the_next_step():
     layer, x = make_layer(), make_input(5, steps=1)[0]
     rest = layer.initial_state(4)
     fired = aslstm_step(x, rest._replace(s=torch.ones_like(rest.s)), layer.params())
@@ -172,7 +172,7 @@ def test_a_cell_that_fired_keeps_nothing_of_h_in_its_membrane_at_the_next_step()
     assert not torch.allclose(fired.v, aslstm_step(x, rest, layer.params()).v)
 
 
-def test_the_form_without_diffusion_is_the_layer_with_a_diffusion_of_zero():
+def test_without_diffusion_a_layer_equals_one_with_zero_diffusion():
     with_zero, without = make_layer(seed=5), make_layer(seed=5, diffusion=False)
     with torch.no_grad():
         with_zero.d_time.zero_()
@@ -182,7 +182,7 @@ def test_the_form_without_diffusion_is_the_layer_with_a_diffusion_of_zero():
 
 
 @pytest.mark.parametrize("kappa", [0.0, 0.2, 0.9])
-def test_output_neurons_driven_by_a_constant_sum_it_up_geometrically(kappa):
+def test_output_neurons_sum_a_constant_input_geometrically(kappa):
     z, weight, bias = torch.tensor([[1.0, -2.0]]), torch.tensor([[0.5, 0.25], [2.0, 0.1]]), torch.tensor([0.3, -0.4])
     drive = torch.tensor([[0.5 - 0.5 + 0.3, 2.0 - 0.2 - 0.4]])
     y = torch.zeros(1, 2)
@@ -195,14 +195,14 @@ def test_output_neurons_driven_by_a_constant_sum_it_up_geometrically(kappa):
 
 
 def make_slstm(inputs: int = 5, hidden: int = 7, **options) -> SLSTM:
-    """A layer whose cells fire now and then."""
+    """A layer whose cells fire in some steps."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
         return SLSTM(inputs, hidden, **options).double()
 
 
 @pytest.mark.parametrize("v_th", [0.05, 0.2])
-def test_one_slstm_cell_computes_its_equations_as_written_out_by_hand(v_th):
+def test_one_slstm_cell_computes_its_equations_as_written_by_hand(v_th):
     w = {"i": (0.7, -0.3, 0.1), "f": (-0.4, 0.6, 0.5), "g": (1.1, 0.9, -0.2), "o": (0.3, -0.8, 0.4)}
     params = SLSTMParams(
         w_x=torch.tensor([[w[name][0]] for name in "ifgo"], dtype=torch.float64),
@@ -225,7 +225,7 @@ def test_one_slstm_cell_computes_its_equations_as_written_out_by_hand(v_th):
 
 @each_width
 @pytest.mark.parametrize("cut", [1, 5, 11])
-def test_slstm_steps_equal_its_scan_and_it_may_be_cut_anywhere(inputs, hidden, cut):
+def test_slstm_steps_equal_its_scan_and_it_may_be_split_anywhere(inputs, hidden, cut):
     layer, x = make_slstm(inputs, hidden), make_input(inputs)
     states, last = layer(x, layer.initial_state(4))
     state = layer.initial_state(4)
@@ -240,7 +240,7 @@ def test_slstm_steps_equal_its_scan_and_it_may_be_cut_anywhere(inputs, hidden, c
 
 
 @each_width
-def test_slstm_does_not_forget_under_a_constant_input_whatever_the_widths(inputs, hidden):
+def test_slstm_keeps_its_memory_under_a_constant_input_for_any_widths(inputs, hidden):
     layer = make_slstm(inputs, hidden, v_th=0.9)  # snnTorch 1.0.0 repeats its first step with 1 input and 8 cells
     states, _ = layer(torch.ones(4, 3, inputs, dtype=torch.float64), layer.initial_state(3))
     for field in (states.c, states.v):
@@ -276,7 +276,7 @@ def test_no_gradient_goes_through_the_reset_of_slstm():
 # Readout
 
 
-def test_the_readout_scans_as_its_steps_do_and_goes_on_from_its_state():
+def test_the_readout_scan_equals_its_steps_and_continues_from_its_state():
     readout, z = Readout(5, 2).double(), make_input(5)
     assert readout.kappa.item() == pytest.approx(0.2)
     answers, last = readout(z, readout.initial_state(4))
@@ -289,7 +289,7 @@ def test_the_readout_scans_as_its_steps_do_and_goes_on_from_its_state():
 
 
 @pytest.mark.parametrize("logit", [-30.0, 30.0])
-def test_kappa_stays_a_leak_whatever_training_does(logit):
+def test_kappa_stays_between_0_and_1_for_any_logit(logit):
     readout = Readout(5, 2).double()
     torch.nn.init.constant_(readout.kappa_logit, logit)
     assert 0 < readout.kappa < 1
@@ -342,7 +342,7 @@ def test_a_wrong_input_or_state_is_named_with_its_shape(layer, shape):
         layer(make_input(5), layer.initial_state(2))
 
 
-def test_a_step_of_another_width_is_refused():
+def test_a_step_of_another_width_is_rejected():
     layer = make_slstm()
     with pytest.raises(InvalidField, match="5 wide"):
         slstm_step(torch.zeros(4, 6).double(), layer.initial_state(4), layer.params())

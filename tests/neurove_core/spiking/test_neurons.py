@@ -1,8 +1,6 @@
-"""LIF, ALIF and LTC against their closed forms; their modules against their steps."""
+"""LIF, ALIF and LTC compared with their closed forms; their modules compared with their steps."""
 
 import math
-import subprocess
-import sys
 
 import pytest
 import torch
@@ -10,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-import neurove_core
 from neurove_core.spiking import alif, ltc
 from neurove_core.spiking import lif as neurons
 from neurove_core.spiking.alif import ALIFParams, alif_step, diffuse
@@ -46,7 +43,7 @@ def test_a_constant_current_fires_first_when_its_geometric_sum_reaches_the_thres
     spikes, _ = lif_scan(torch.full((steps, 1), current, dtype=torch.float64), at_rest(1), LIFParams(decay=decay))
     v = current * (1 - decay ** torch.arange(1, steps + 1, dtype=torch.float64)) / (1 - decay)
     if (v - 1).abs().min() < 1e-9:
-        return  # too near the threshold for the sum and the recursion to round alike
+        return  # too near the threshold: sum and recursion may round differently
     fired = (v >= 1).nonzero()
     if not len(fired):
         assert not spikes.any()
@@ -56,7 +53,7 @@ def test_a_constant_current_fires_first_when_its_geometric_sum_reaches_the_thres
 
 
 @pytest.mark.parametrize("overshoot", [0.0, 0.3, 100.0])
-def test_a_neuron_that_fires_is_reset_to_zero_however_far_above_the_threshold_it_was(overshoot):
+def test_a_neuron_that_fires_is_reset_to_zero_from_any_potential(overshoot):
     current = torch.tensor([[1 + overshoot, 0.999]], dtype=torch.float64)
     spikes, state = lif_step(current, at_rest(1, 2), LIF)
     assert spikes.tolist() == [[1.0, 0.0]]
@@ -73,7 +70,7 @@ def test_the_threshold_is_the_unit_of_all_potentials(v_th, seed):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_scan_equals_its_steps_and_may_be_cut_anywhere(seed):
+def test_a_scan_equals_its_steps_and_may_be_split_anywhere(seed):
     currents = random_currents(seed)
     whole, last = lif_scan(currents, at_rest(3, 4), LIF)
     state, steps = at_rest(3, 4), []
@@ -89,17 +86,21 @@ def test_a_scan_equals_its_steps_and_may_be_cut_anywhere(seed):
     assert torch.equal(end.v, last.v)
 
 
-def test_the_gradient_goes_through_the_leak_and_the_surrogate_but_not_through_the_reset():
+def test_the_gradient_flows_through_leak_and_surrogate_but_not_through_the_reset():
     current = torch.tensor([0.2, 0.9, 1.2], dtype=torch.float64, requires_grad=True)
     spikes, state = lif_step(current, at_rest(3), LIF)
     (by_state,) = torch.autograd.grad(state.v.sum(), current, retain_graph=True)
     (by_spikes,) = torch.autograd.grad(spikes.sum(), current)
-    assert by_state.tolist() == [1.0, 1.0, 0.0]  # a cut reset: 1 where it stayed, 0 where it fired, nothing of spike
+    assert by_state.tolist() == [
+        1.0,
+        1.0,
+        0.0,
+    ]  # 1 where the neuron did not fire, 0 where it did; nothing from the spike
     torch.testing.assert_close(by_spikes, surrogate_gradient(current.detach() - LIF.v_th, "rectangular", 1.0))
 
 
 def run_alif(spikes: Tensor, v: Tensor, params: ALIFParams) -> Tensor:
-    """Spikes of a population behind another one, f the identity."""
+    """Spikes of a population that follows another one, f the identity."""
     state, out = at_rest(*spikes.shape[1:]), []
     for x, v_before in zip(spikes, v, strict=True):
         fired, state = alif_step(x, v_before, state, params, lambda z: 0.4 * z)
@@ -130,7 +131,7 @@ def test_a_potential_below_the_threshold_reaches_the_next_layer_only_by_diffusio
     assert run_alif(silent, v, ALIFParams(LIF, d_space=0.5)).any()
 
 
-def test_each_neuron_may_have_its_own_diffusion_and_f_sees_the_sum():
+def test_each_neuron_may_have_its_own_diffusion_and_f_gets_the_sum():
     spikes, v = torch.tensor([[1.0, 0.0]]), torch.tensor([[0.5, 0.8]])
     d = torch.tensor([0.1, 0.25])
     torch.testing.assert_close(diffuse(spikes, v, d), torch.tensor([[1.05, 0.2]]))
@@ -183,7 +184,7 @@ def run_ltc(xs: list[float], params: LTCParams, m: float = 0.0) -> list[tuple[fl
     return steps
 
 
-def test_one_ltc_neuron_computes_its_equations_as_written_out_by_hand():
+def test_one_ltc_neuron_computes_its_equations_as_written_by_hand():
     params = one_ltc(0.9, -0.7, 0.1, (0.8, -0.5), 0.3)
     xs = [0.2, 0.9, 1.4, -0.3, 0.6, 0.7, 0.1, 1.2]
     expected = ltc_by_hand(xs, params)
@@ -199,7 +200,7 @@ def test_an_ltc_neuron_of_fixed_time_constant_leaks_geometrically(a):
     assert m == pytest.approx([0.4 * (1 - a) ** t for t in range(1, 7)])
 
 
-def test_an_ltc_neuron_that_fires_is_reset_to_zero_and_no_gradient_goes_through_the_reset():
+def test_an_ltc_neuron_that_fires_is_reset_to_zero_without_a_gradient_through_the_reset():
     params = one_ltc(1.0, 0.0, 0.0, (0.0, 0.0), 0.0)  # a = 1/2: m = x / 2 at the first step
     x = torch.tensor([[0.8], [1.0], [7.0]], dtype=torch.float64, requires_grad=True)
     zeros = torch.zeros(3, 1, dtype=torch.float64)
@@ -214,7 +215,7 @@ def test_an_ltc_neuron_that_fires_is_reset_to_zero_and_no_gradient_goes_through_
 
 
 def make(name: str, **options) -> neurons.LIF | alif.ALIF | ltc.LTC:
-    """A population of 4 neurons with 4 inputs that fires now and then."""
+    """A population of 4 neurons with 4 inputs that fires in some steps."""
     with torch.random.fork_rng():
         torch.manual_seed(0)
         if name == "LIF":
@@ -242,7 +243,7 @@ def step_of(module: torch.nn.Module, x: Tensor, state: tuple[Tensor, ...]) -> tu
 
 
 @each_module
-def test_a_module_scans_as_its_steps_do(name):
+def test_a_module_equals_its_steps(name):
     module, x = make(name), random_currents(3)
     steps, last = module(x, module.initial_state(3))
     state = module.initial_state(3)
@@ -250,13 +251,13 @@ def test_a_module_scans_as_its_steps_do(name):
         spikes, state = step_of(module, x_t, state)
         assert torch.equal(steps.s[t], spikes)
     for one, other in zip(last, state, strict=True):
-        torch.testing.assert_close(one, other, rtol=0, atol=1e-14)  # ALIF's f sees all steps at once
+        torch.testing.assert_close(one, other, rtol=0, atol=1e-14)  # ALIF applies f to all steps at once
     assert 0 < steps.s.mean() < 1
 
 
 @each_module
 @pytest.mark.parametrize("cut", [1, 17, 49])
-def test_a_module_stopped_after_k_steps_goes_on_from_its_state(name, cut):
+def test_a_module_stopped_after_k_steps_continues_from_its_state(name, cut):
     module, x = make(name), random_currents(4)
     whole, last = module(x, module.initial_state(3))
     first, middle = module(x[:cut], module.initial_state(3))
@@ -267,7 +268,7 @@ def test_a_module_stopped_after_k_steps_goes_on_from_its_state(name, cut):
 
 
 @pytest.mark.parametrize("name", ["LIF", "ALIF"])
-def test_steps_tell_the_potential_before_the_reset(name):
+def test_steps_return_the_potential_before_the_reset(name):
     module, x = make(name), random_currents(5)
     steps, last = module(x, module.initial_state(3))
     v_th = 1.0 if name == "LIF" else 0.3
@@ -276,7 +277,7 @@ def test_steps_tell_the_potential_before_the_reset(name):
 
 
 @each_module
-def test_a_constant_input_makes_no_neuron_forget(name):
+def test_neurons_keep_their_memory_under_a_constant_input(name):
     module = make(name, v_th=50.0)
     _, one = module(0.1 * torch.ones(1, 3, 4, dtype=torch.float64), module.initial_state(3))
     _, two = module(0.1 * torch.ones(2, 3, 4, dtype=torch.float64), module.initial_state(3))
@@ -302,7 +303,7 @@ def test_an_alif_neuron_of_the_module_leaks_with_decay_and_diffusion_in_time_tog
 
 
 def test_both_diffusions_of_alif_learn():
-    module, x = make("ALIF", surrogate="arctan"), random_currents(7)  # never zero, as the rectangle may be
+    module, x = make("ALIF", surrogate="arctan"), random_currents(7)  # never zero, unlike the rectangle
     steps, _ = module(x, module.initial_state(3), x)
     gradients = torch.autograd.grad(steps.s.sum(), [module.d_space, module.d_time])
     assert all(gradient.all() for gradient in gradients)
@@ -365,29 +366,10 @@ def test_a_state_of_another_batch_is_named_with_its_shape(name):
     assert caught.value.details["bound"] == "must be (B, N) = (3, 4)"
 
 
-def test_potentials_of_another_shape_and_a_step_of_another_width_are_refused():
+def test_potentials_of_another_shape_and_a_step_of_another_width_are_rejected():
     alif, x = make("ALIF"), random_currents(0)
     with pytest.raises(InvalidField, match="v_before.shape"):
         alif(x, alif.initial_state(3), x[:-1])
     ltc = make("LTC")
     with pytest.raises(InvalidField, match="4 wide"):
         ltc_step(torch.zeros(3, 5, dtype=torch.float64), ltc.initial_state(3), ltc.params())
-
-
-# The package
-
-
-@pytest.mark.parametrize("module", ["neurove_core", "neurove_core.io"])
-def test_a_package_without_neurons_does_not_load_torch(module):
-    code = f"import sys, {module}; assert 'torch' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
-def test_the_package_gives_its_neurons_and_cells_by_name():
-    for name in ("LIF", "ALIF", "LTC", "SLSTM", "ASLSTM", "Readout"):
-        assert name in neurove_core.__all__
-        assert name in dir(neurove_core)
-        assert getattr(neurove_core, name).__name__ == name
-    assert neurove_core.LIF is neurons.LIF
-    with pytest.raises(AttributeError, match="no attribute 'GRU'"):
-        _ = neurove_core.GRU

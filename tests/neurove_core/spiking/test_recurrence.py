@@ -1,4 +1,4 @@
-"""The fused path answers, fires and learns as the plain layers do, in every kind, with and without a closed loop."""
+"""The compiled network equals the plain layers in outputs, spikes and gradients, in open and closed loop."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ from neurove_core.spiking.slstm import SLSTMParams, SLSTMState, slstm_step
 
 STEPS, BATCH, HIDDEN = 40, 5, 7
 CONSTANTS = Constants(alpha=0.5, width=0.5, damping=0.25)
-GRAD_S = (0.02, -0.03)  # of the loss by each spike of a layer
+GRAD_S = (0.02, -0.03)  # gradient of the loss with respect to each spike of a layer
 
 
 def make_weights(kind, dtype=np.float64, seed=0):
@@ -65,7 +65,7 @@ def make_inputs(dtype=np.float64):
 
 
 class Plain:
-    """The same network out of the plain steps of cells.py and neurons.py, one tensor per weight."""
+    """The same network from the plain steps of the cells, one tensor per weight."""
 
     def __init__(self, kind, weights):
         self.kind = kind
@@ -112,7 +112,7 @@ def kind(request):
 
 
 @pytest.mark.parametrize("free_from", [STEPS, 25, 1], ids=["teacher-forced", "closed-from-25", "closed"])
-def test_answers_and_every_gradient_equal_autograds_and_spikes_bit_for_bit(kind, free_from):
+def test_outputs_and_gradients_equal_autograd_and_spikes_are_equal_bit_for_bit(kind, free_from):
     weights, state, x = make_weights(kind), make_state(), make_inputs()
     plain = Plain(kind, weights)
     answers, spikes = plain.run(x, state, free_from)
@@ -120,7 +120,7 @@ def test_answers_and_every_gradient_equal_autograds_and_spikes_bit_for_bit(kind,
     np.testing.assert_allclose(tape.y[1:], answers.detach().numpy(), rtol=0, atol=1e-12)
     fired = np.stack([tape.first.s[1:], tape.second.s[1:]], axis=1)
     assert np.array_equal(fired, spikes.detach().numpy())
-    assert 0.01 < fired.mean() < 0.99  # the comparison is about something
+    assert 0.01 < fired.mean() < 0.99  # the comparison covers spikes and silence
     grad_y = np.random.default_rng(3).normal(size=answers.shape)
     of_spikes = (spikes.sum(dim=(0, 2, 3)) * torch.tensor(GRAD_S, dtype=answers.dtype)).sum()
     ((answers * torch.tensor(grad_y)).sum() + of_spikes).backward()
@@ -141,7 +141,7 @@ def test_float32_fires_as_plain_torch_does(kind):
     np.testing.assert_allclose(tape.y[1:], answers.detach().numpy(), rtol=0, atol=2e-5)
 
 
-def test_a_sequence_in_pieces_equals_the_whole(kind):
+def test_a_split_sequence_equals_the_whole(kind):
     weights, state, x = make_weights(kind), make_state(), make_inputs()
     whole = recurrence.forward(kind, weights, CONSTANTS, x, state, STEPS)
     first = recurrence.forward(kind, weights, CONSTANTS, x[:17], state, 17)

@@ -1,4 +1,4 @@
-"""The fused LIF scan is the plain one: spikes and potentials bit for bit, gradients to rounding."""
+"""The compiled LIF scan equals the plain one: spikes and potentials bit for bit, gradients up to rounding."""
 
 import pytest
 import torch
@@ -8,7 +8,7 @@ from neurove_core.spiking.lif import LIFParams, LIFState, lif_scan, lif_scan_ref
 from neurove_core.spiking.plain import plain
 
 STEPS, BATCH = 5, 2
-MAP = (BATCH, 7, 11, 13)  # more than one block of neurons, and no multiple of any vector's width
+MAP = (BATCH, 7, 11, 13)  # more than one block of neurons, and not a multiple of any vector width
 LAYOUTS = ("contiguous", "channels_last", "strided")
 PARAMS = LIFParams(decay=0.7, v_th=0.9, surrogate_width=0.45)
 
@@ -53,7 +53,7 @@ def test_spikes_and_potentials_equal_the_plain_ones_bit_for_bit(seed, dtype, lay
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 5), (2, 1024), (1, 2049), (1, 1, 1, 1), (2, 3, 1, 1)])
 @torch.no_grad()
-def test_populations_of_any_shape_and_size_are_scanned_whole(shape):
+def test_populations_of_any_shape_and_size_are_scanned_completely(shape):
     currents, v = make_currents(shape)
     spikes, state = lif_scan(currents, LIFState(v), PARAMS)
     expected, expected_state = lif_scan_reference(currents, LIFState(v), PARAMS)
@@ -82,7 +82,7 @@ def test_the_gradient_passes_where_the_potential_is_within_half_a_width_of_the_t
     assert currents.grad[0].tolist() == [0, 0, 2, 2, 2, 0, 0]
 
 
-def test_a_gradient_of_one_output_alone_is_enough():
+def test_a_gradient_of_only_one_output_is_accepted():
     currents, v = make_currents(dtype=torch.float64)
     for output in (0, 1):
         grads = []
@@ -95,7 +95,7 @@ def test_a_gradient_of_one_output_alone_is_enough():
 
 
 @torch.no_grad()
-def test_a_sequence_cut_in_two_with_its_state_carried_equals_the_whole_one():
+def test_a_sequence_split_in_two_equals_the_whole_one():
     currents, v = make_currents(layout="channels_last")
     whole, last = lif_scan(currents, LIFState(v), PARAMS)
     first, between = lif_scan(currents[:2], LIFState(v), PARAMS)
@@ -105,7 +105,7 @@ def test_a_sequence_cut_in_two_with_its_state_carried_equals_the_whole_one():
 
 
 @torch.no_grad()
-def test_a_scan_changes_neither_its_currents_nor_the_state_it_was_given():
+def test_a_scan_changes_neither_its_currents_nor_the_state_it_receives():
     currents, v = make_currents()
     before = currents.clone(), v.clone()
     lif_scan(currents, LIFState(v), PARAMS)
@@ -126,7 +126,7 @@ def test_a_number_that_is_not_finite_ends_in_the_state_as_it_does_in_plain_steps
 
 
 @torch.no_grad()
-def test_half_precision_and_one_state_for_all_neurons_take_the_plain_way():
+def test_half_precision_and_a_broadcast_state_use_the_plain_path():
     currents, v = make_currents()
     for odd, state in ((currents.bfloat16(), v.bfloat16()), (currents, v[:1])):
         spikes, _ = lif_scan(odd, LIFState(state), PARAMS)
@@ -134,7 +134,7 @@ def test_half_precision_and_one_state_for_all_neurons_take_the_plain_way():
 
 
 @pytest.mark.parametrize("surrogate", ["rectangular", "arctan", "triangle"])
-def test_inside_plain_every_step_is_autograds_and_outside_it_is_not(surrogate):
+def test_inside_plain_every_step_uses_autograd_and_outside_it_does_not(surrogate):
     currents, v = make_currents()
     currents.requires_grad_()
 
@@ -146,7 +146,7 @@ def test_inside_plain_every_step_is_autograds_and_outside_it_is_not(surrogate):
     assert "Stack" not in recorded()
 
 
-def test_half_precision_currents_of_autocast_are_scanned_as_the_float32_that_plain_steps_make_of_them():
+def test_half_precision_currents_of_autocast_are_scanned_in_float32_as_in_plain_steps():
     currents, v = make_currents()
     leaf = currents.bfloat16().requires_grad_()
     spikes, state = lif_scan(leaf, LIFState(v), PARAMS)

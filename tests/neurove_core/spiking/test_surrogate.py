@@ -1,4 +1,4 @@
-"""spike: a step forward, the surrogate backward."""
+"""spike: a step in the forward pass, the surrogate in the backward pass."""
 
 import math
 
@@ -23,7 +23,7 @@ def test_a_spike_is_one_from_the_threshold_on_and_zero_below_it(u, kind):
 @each_width
 def test_the_surrogate_has_area_one_over_u(kind, width):
     s = torch.linspace(-math.pi / 2, math.pi / 2, 400_003, dtype=torch.float64)[1:-1]
-    u = width * torch.tan(s)  # reaches far enough out for the tails of arctan
+    u = width * torch.tan(s)  # wide enough for the tails of arctan
     area = torch.trapezoid(surrogate_gradient(u, kind, width) * width / torch.cos(s).square(), s)
     assert area.item() == pytest.approx(1, abs=1e-4)
 
@@ -40,7 +40,7 @@ def test_the_surrogate_is_even_positive_at_the_threshold_and_falls_away_from_it(
 
 @each_kind
 @each_width
-def test_the_gradient_of_a_spike_is_the_surrogate_times_what_comes_from_above(kind, width):
+def test_the_gradient_of_a_spike_is_the_surrogate_times_the_incoming_gradient(kind, width):
     u = torch.linspace(-2, 2, 81, dtype=torch.float64).requires_grad_()
     above = torch.linspace(-1, 3, 81, dtype=torch.float64)
     (gradient,) = torch.autograd.grad(spike(u, kind, width), u, above)
