@@ -85,8 +85,8 @@ def test_fitted_intervals_have_their_nominal_coverage_on_unseen_sequences(made):
 def test_the_report_gives_the_coverage_of_each_axis_for_each_augmentation(made):
     groups = made.report["groups"]
     assert set(groups) == set(calibration.VARIANTS) | {f"hard scenes, {seen}" for seen in calibration.VARIANTS}
-    assert groups["as it is"]["vz"]["0.9"] == pytest.approx(0.9, abs=0.01)
-    assert groups["as it is"]["vz"]["0.99"] > groups["as it is"]["vz"]["0.5"]
+    assert groups["unchanged"]["vz"]["0.9"] == pytest.approx(0.9, abs=0.01)
+    assert groups["unchanged"]["vz"]["0.99"] > groups["unchanged"]["vz"]["0.5"]
 
 
 def test_correlated_errors_are_correlated_in_the_bundle(made):
@@ -187,7 +187,7 @@ def test_an_invalid_correlation_matrix_is_refused(made, row, column, value, why)
 
 def test_a_bundle_with_another_camera_or_unit_is_not_calibrated(made, tmp_path):
     config = TrainingConfig(model=SMALL.model_copy(update={"canonical": CanonicalConfig()}))
-    with pytest.raises(BadModel, match="not those of the configuration"):
+    with pytest.raises(BadModel, match="differ from those of the configuration"):
         calibration.calibrate(made.bundle, config, tmp_path)
     with pytest.raises(BadModel, match="linear_unit='m/s'"):
         calibration.calibrate(replace(made.bundle, linear_unit="m/s"), TrainingConfig(model=SMALL), tmp_path)

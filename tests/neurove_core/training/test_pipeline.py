@@ -59,7 +59,7 @@ def test_a_run_called_from_python_leaves_the_same_files_and_weights_as_the_comma
     folder, _ = trained
     out, by_command = folder / "out", folder / "by-command"
     arguments = ["train", str(folder / "tiny.toml"), "--out", str(by_command), "--data", str(out / "data"), "--json"]
-    assert main.main([*arguments, "--calibration", "16", "--device", "cpu"]) == 0
+    assert main.main([*arguments, "--calibration-sequences", "16", "--device", "cpu"]) == 0
     assert {"tiny.safetensors", "checkpoint.safetensors", "run.json"} <= files_in(out)
     assert files_in(by_command) == files_in(out)
     one, other = (bundle.load(each / "tiny.safetensors") for each in (out, by_command))
