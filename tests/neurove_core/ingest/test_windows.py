@@ -155,20 +155,20 @@ def test_a_lost_first_packet_changes_no_later_window(lost):
 
 
 @pytest.mark.parametrize("as_one_packet", [True, False])
-@pytest.mark.parametrize("hole", range(6))
+@pytest.mark.parametrize("gap", range(6))
 def test_a_gap_of_up_to_max_hole_windows_gives_empty_windows_and_a_longer_one_is_skipped_and_counted(
-    hole, as_one_packet
+    gap, as_one_packet
 ):
-    after_us = (hole + 1) * 10_000 + 17
+    after_us = (gap + 1) * 10_000 + 17
     packets = [at(5, after_us)] if as_one_packet else [at(5), at(after_us)]
     result = run([*packets, tick(after_us + 10_000)])
-    bridged = hole if hole <= CONFIG.max_hole_windows else 0
+    bridged = gap if gap <= CONFIG.max_hole_windows else 0
     assert [(w.start_us, w.events) for w in result.windows] == [
         (0, 1),
         *((10_000 * (k + 1), 0) for k in range(bridged)),
         (after_us - 17, 1),
     ]
-    assert result.skipped == hole - bridged
+    assert result.skipped == gap - bridged
     assert all(not w.counts.any() for w in result.windows if w.events == 0)
 
 

@@ -93,7 +93,7 @@ def test_the_error_for_an_int8_model_says_that_int8_once_covered_less(precision)
     off = model.golden._replace(twists=model.golden.twists + np.float32(0.1))
     with pytest.raises(BadModel, match="golden test: window") as refused:
         self_test.check(Estimator(replace(model, golden=off)))
-    assert ("before the projection was int8" in str(refused.value)) == (precision == "int8")
+    assert ("before the projection was in int8" in str(refused.value)) == (precision == "int8")
 
 
 def test_the_tolerance_is_relative_to_the_scale_of_the_model():

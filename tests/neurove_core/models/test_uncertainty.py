@@ -191,7 +191,7 @@ def test_a_bundle_with_another_camera_or_unit_is_not_calibrated(made, tmp_path):
         calibration.calibrate(made.bundle, config, tmp_path)
     with pytest.raises(BadModel, match="linear_unit='m/s'"):
         calibration.calibrate(replace(made.bundle, linear_unit="m/s"), TrainingConfig(model=SMALL), tmp_path)
-    with pytest.raises(InvalidField, match="sequences=15: at least 16"):
+    with pytest.raises(InvalidField, match="sequences=15: must be at least 16"):
         calibration.calibration_sets(TrainingConfig(), 15)
 
 

@@ -96,11 +96,11 @@ def test_a_bundle_keeps_its_kind_and_serves(kind, tmp_path):
     estimator, recording = Estimator(replace(loaded, linear_unit=PER_HEIGHT)), open_source(SOURCE)
     estimator.warm_up()
     said = estimate_recording(estimator, recording)
-    told = report([evaluate(said, recording.twists())])
+    figures = report([evaluate(said, recording.twists())])
     assert np.isfinite(said.twists).all()
-    assert (told["firing_rate"] is None) == (kind == "ann")
+    assert (figures["firing_rate"] is None) == (kind == "ann")
     layers = {"neurove": {"block 1", "block 2", "cell 1", "cell 2"}, "snn-ang": {"block 1", "block 2"}, "ann": set()}
-    assert set(told["firing_rate_by_layer"]) == layers[kind]
+    assert set(figures["firing_rate_by_layer"]) == layers[kind]
 
 
 def test_a_bundle_of_one_kind_does_not_load_as_another():
