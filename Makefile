@@ -16,7 +16,7 @@ run: $(VENV)/installed
 test: $(VENV)/installed-dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	$(BIN)/mypy
+	MYPYPATH=$(VENV)/packages $(BIN)/mypy
 	$(BIN)/python tests/wheel.py
 	$(BIN)/pytest --numprocesses $(JOBS) --dist loadgroup --no-loadscope-reorder --cov --cov-report=term
 
@@ -35,10 +35,17 @@ $(VENV)/python:
 	@$(PIP) $(TORCH_ARGS) torch
 	@touch $@
 
+# Type checkers do not follow the mapping of folders to packages in pyproject.toml; these links show it to them.
+$(VENV)/packages: $(VENV)/python
+	@mkdir -p $@
+	@ln -sfn $(CURDIR)/protocol $@/neurove_protocol
+	@ln -sfn $(CURDIR)/neurove_core $@/neurove_core
+	@ln -sfn $(CURDIR)/service $@/neurove_service
+
 $(VENV)/installed: $(VENV)/python pyproject.toml constraints.txt
-	@$(PIP) -e '.[experiments,recordings]'
+	@$(PIP) -e '.[serve,recordings,experiments]'
 	@touch $@
 
-$(VENV)/installed-dev: $(VENV)/installed
+$(VENV)/installed-dev: $(VENV)/installed $(VENV)/packages
 	@$(PIP) -e '.[dev]'
 	@touch $@

@@ -1,30 +1,66 @@
-"""The paper (NeuroVE) and its models: no network, no clocks, no threads.
+"""NeuroVE: velocity of an event camera from its events, by a spiking network. No network access, no clocks, no threads.
 
-Its neurons and cells are here by name, `from neurove_core import ALIF, ASLSTM`, and loaded only when asked for: reading
-recordings does without torch.
+The public names of the package; each is loaded at its first use, so that reading recordings does not import torch:
+
+- `open_source(source)`: a recording from a file, a folder, or a simulation.
+- `load_model(name_or_path)`: a model, built in or from a bundle file.
+- `Estimator(model)`: estimates twists from events.
+- `LIF`, `ALIF`, `LTC`, `SLSTM`, `ASLSTM`, `Readout`: the neurons and cells of the paper, as torch modules.
+
+    from neurove_core import Estimator, load_model, open_source
+
+    recording = open_source("sim://street?seconds=2&seed=3")
+    estimator = Estimator(load_model("default"))
+    for estimate in estimator.estimates(recording):
+        print(estimate.end_us, estimate.twists[-1])  # [us], and vx vy vz [m/s], wx wy wz [rad/s]
 """
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from neurove_core.cells import ASLSTM, SLSTM, Readout
-    from neurove_core.neurons import ALIF, LIF, LTC
+    from pathlib import Path
 
-__all__ = ["ALIF", "ASLSTM", "LIF", "LTC", "SLSTM", "Readout"]
+    from neurove_core.estimator import Estimator
+    from neurove_core.models.bundle import Bundle
+    from neurove_core.sources import open_source
+    from neurove_core.spiking.alif import ALIF
+    from neurove_core.spiking.aslstm import ASLSTM
+    from neurove_core.spiking.lif import LIF
+    from neurove_core.spiking.ltc import LTC
+    from neurove_core.spiking.readout import Readout
+    from neurove_core.spiking.slstm import SLSTM
+
+__all__ = ["ALIF", "ASLSTM", "LIF", "LTC", "SLSTM", "Estimator", "Readout", "load_model", "open_source"]
 
 _MODULE_OF = {
-    "ALIF": "neurons",
-    "LIF": "neurons",
-    "LTC": "neurons",
-    "ASLSTM": "cells",
-    "SLSTM": "cells",
-    "Readout": "cells",
+    "ALIF": "spiking.alif",
+    "ASLSTM": "spiking.aslstm",
+    "Estimator": "estimator",
+    "LIF": "spiking.lif",
+    "LTC": "spiking.ltc",
+    "Readout": "spiking.readout",
+    "SLSTM": "spiking.slstm",
+    "open_source": "sources",
 }
 
 
+def load_model(name_or_path: "str | Path") -> "Bundle":
+    """A model for `Estimator`.
+
+    Args:
+        name_or_path: name of a built-in model, such as `default`, or the path of a bundle file.
+
+    Raises:
+        BadModel: there is neither such a model nor such a file, or the file is not a valid bundle.
+    """
+    from neurove_core import models
+
+    return models.find(str(name_or_path))
+
+
 def __getattr__(name: str) -> Any:
-    """A neuron or cell, loaded at its first use (PEP 562)."""
+    """A public name, loaded at its first use (PEP 562)."""
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     found = getattr(importlib.import_module(f"{__name__}.{_MODULE_OF[name]}"), name)
@@ -33,5 +69,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """The names of the package, those not yet loaded too."""
+    """All names of the package, including those not yet loaded."""
     return sorted({*globals(), *__all__})

@@ -1,4 +1,4 @@
-"""Functions as machine code: what the hot loops are compiled by."""
+"""The decorator that compiles hot loops to machine code by numba."""
 
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar, cast
@@ -10,8 +10,11 @@ R = TypeVar("R")
 
 
 def compiled(function: Callable[P, R]) -> Callable[P, R]:
-    """The function as machine code with the same signature; numba itself is untyped."""
+    """Compile a function and keep its signature for type checkers; numba itself is untyped.
+
+    The code runs without the GIL and is cached on disk.
+    """
     try:
         return cast("Callable[P, R]", numba.njit(nogil=True, cache=True)(function))
-    except RuntimeError:  # nowhere to write a cache, as in a read-only image: compiled anew at each start
+    except RuntimeError:  # no writable cache folder, as in a read-only image: compiled at each start
         return cast("Callable[P, R]", numba.njit(nogil=True)(function))

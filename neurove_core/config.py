@@ -1,6 +1,6 @@
-"""Frozen, checked configurations of a model: its windows, its canonical camera and its network.
+"""Immutable, validated configurations of a model: its windows, its canonical camera and its network.
 
-They travel in the header of the model's bundle; a wrong value stops the start with a sentence that names it.
+They are stored in the header of the model's bundle. A wrong value raises an error that names it.
 """
 
 from typing import Annotated, Literal, Self
@@ -17,12 +17,12 @@ class Config(BaseModel):
 
 
 class WindowConfig(Config):
-    """How sensor time is cut: windows [k * duration_us, (k + 1) * duration_us), each of n equal chronological bins."""
+    """How sensor time is split: windows [k * duration_us, (k + 1) * duration_us), each with n equal bins in order."""
 
     duration_us: int = Field(50_000, gt=0, le=10_000_000, description="Length of one window [us].")
-    bins: int = Field(5, ge=1, le=64, description="n: bins per window; a window's bins are 2n input channels.")
+    bins: int = Field(5, ge=1, le=64, description="n: bins per window; they give 2n input channels.")
     max_hole_windows: int = Field(
-        20, ge=1, le=10_000, description="A hole in sensor time of more windows than this is skipped, not computed."
+        20, ge=1, le=10_000, description="A longer gap in sensor time, in windows, is skipped instead of computed."
     )
 
     @model_validator(mode="after")
@@ -38,7 +38,7 @@ class WindowConfig(Config):
 
 
 class CanonicalConfig(Config):
-    """The pinhole camera that the network sees, whatever the sensor: its grid is also the spatial down-sampling."""
+    """The pinhole camera that the network sees for any sensor; its grid is also the spatial down-sampling."""
 
     width: int = Field(86, ge=8, description="Grid columns.")
     height: int = Field(65, ge=8, description="Grid rows.")
@@ -56,7 +56,8 @@ class NetworkConfig(Config):
 
     encoding: Literal["binary", "log1p"] = Field("log1p", description="Counts to input: 0/1, or log(1 + count).")
     precision: Literal["float32", "int8"] = Field(
-        "float32", description="Of extractor and projection; int8 rounds their weights to 8 bits, the input to 1/32."
+        "float32",
+        description="Precision of extractor and projection; int8 rounds their weights to 8 bits, the input to 1/32.",
     )
     channels: Annotated[tuple[int, ...], Field(min_length=1, max_length=8)] = (16, 32, 64, 64)
     features: int = Field(128, ge=1, le=4096, description="Width of the layer between extractor and estimator.")
@@ -64,8 +65,8 @@ class NetworkConfig(Config):
     cells: int = Field(2, ge=1, le=8, description="ASLSTM layers; the paper has two.")
     decay: float = Field(0.5, ge=0, lt=1, description="LIF leak per time step: 1 - dt/tau.")
     v_th: float = Field(1.0, gt=0, description="Firing threshold of all neurons.")
-    alpha: float = Field(0.9, ge=0, le=1, description="ASLSTM: share of h that stays in the membrane.")
-    diffusion: bool = Field(True, description="Astrocyte diffusion J; without it the model is the paper's w/o.")
+    alpha: float = Field(0.9, ge=0, le=1, description="ASLSTM: share of h in the membrane potential.")
+    diffusion: bool = Field(True, description="Astrocyte diffusion J; false gives the paper's variant w/o.")
     surrogate: Literal["rectangular", "arctan", "triangle"] = "rectangular"
     surrogate_width: float = Field(1.0, gt=0, description="Width of the surrogate gradient, in thresholds.")
 
@@ -77,25 +78,26 @@ class NetworkConfig(Config):
 
 
 class ModelConfig(Config):
-    """Everything that shapes a model and its input."""
+    """All settings of a model and its input."""
 
     kind: Literal["neurove", "ann", "snn-ang"] = Field(
-        "neurove", description="Which network: NeuroVE, the equal-size one without spikes, or SNN-ANG; see networks."
+        "neurove",
+        description="Which network: NeuroVE, the equal-size network without spikes, or SNN-ANG; see networks.",
     )
     window: WindowConfig = WindowConfig()
     canonical: CanonicalConfig = CanonicalConfig()
     network: NetworkConfig = NetworkConfig()
-    settle_windows: int = Field(16, ge=0, le=256, description="Windows until a fresh state is settled.")
+    settle_windows: int = Field(16, ge=0, le=256, description="Windows until a new state is settled.")
     low_activity_events: int = Field(200, ge=0, description="A window with fewer events is flagged low_activity.")
     low_activity_per_pixel: float = Field(
         0.05,
         ge=0,
         le=100,
-        description="So is one with fewer per pixel that the model sees; a resting sensor has 0.02 to 0.12.",
+        description="The same for events per pixel that the model sees; a stationary sensor has 0.02 to 0.12.",
     )
 
     @model_validator(mode="after")
     def _int8_is_neuroves(self) -> Self:
         if self.kind != "neurove" and self.network.precision != "float32":
-            raise ValueError(f"network.precision={self.network.precision!r}: kind={self.kind!r} has float32 alone")
+            raise ValueError(f"network.precision={self.network.precision!r}: kind={self.kind!r} supports float32 only")
         return self

@@ -1,18 +1,18 @@
-"""Figures without a screen: an empty one to draw into, and its files."""
+"""Figures without a display: an empty figure to draw into, and its files."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from neurove_core.extras import MissingExtra
-from neurove_core.files import written_whole
-from protocol.errors import InvalidField
+from neurove_core.files import atomic_path
+from neurove_protocol.errors import InvalidField
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
 def blank_figure(width_in: float, height_in: float) -> "Figure":
-    """An empty figure of this size [inch], drawn without a screen.
+    """An empty figure of this size [inch], drawn without a display.
 
     Raises:
         MissingExtra: matplotlib is not installed.
@@ -28,7 +28,7 @@ def blank_figure(width_in: float, height_in: float) -> "Figure":
 
 
 def save_figure(figure: "Figure", stem: Path) -> list[Path]:
-    """Write `stem`.png and `stem`.svg, the same bytes for the same figure; returns both paths.
+    """Write `stem`.png and `stem`.svg, with the same bytes for the same figure, and return both paths.
 
     Raises:
         InvalidField: a file cannot be written.
@@ -36,7 +36,7 @@ def save_figure(figure: "Figure", stem: Path) -> list[Path]:
     import matplotlib as mpl
 
     files = [stem.with_suffix(".png"), stem.with_suffix(".svg")]
-    with mpl.rc_context({"svg.hashsalt": stem.name}):  # else the SVG's ids are random
+    with mpl.rc_context({"svg.hashsalt": stem.name}):  # otherwise the SVG's ids are random
         for file in files:
             try:
                 write_figure(figure, file)
@@ -46,16 +46,16 @@ def save_figure(figure: "Figure", stem: Path) -> list[Path]:
 
 
 def write_figure(figure: "Figure", file: Path, dpi: int = 150) -> None:
-    """Write a PNG, or where the suffix says so an SVG; it is whole, or what was there before.
+    """Write a figure atomically, as SVG for the suffix .svg, otherwise as PNG.
 
     Raises:
-        OSError: it can not be written.
+        OSError: the file cannot be written.
     """
     kind = "svg" if file.suffix.lower() == ".svg" else "png"
-    with written_whole(file) as part:
+    with atomic_path(file) as part:
         figure.savefig(part, format=kind, dpi=dpi, metadata={"Date": None} if kind == "svg" else None)
 
 
 def unwritable(file: Path, error: OSError) -> InvalidField:
-    """The error to raise where a result cannot be written."""
+    """The error for a result that cannot be written."""
     return InvalidField("reproduce", "out", str(file), error.strerror or str(error))

@@ -1,4 +1,4 @@
-"""Files that are whole or what they were before, however a process ends."""
+"""Atomic writes: a file has its new content or its old one, however the process ends."""
 
 import os
 from collections.abc import Iterator
@@ -7,13 +7,13 @@ from pathlib import Path
 
 
 @contextmanager
-def written_whole(path: Path) -> Iterator[Path]:
-    """Another name beside a file, to write to; where the block ends without an error, what is there becomes the file.
+def atomic_path(path: Path) -> Iterator[Path]:
+    """A temporary path in the same folder to write to; it replaces the file where the block ends without an error.
 
-    Until then the file is what it was before; several processes may write the same one.
+    Until then the file keeps its old content. Several processes may write the same file.
 
     Raises:
-        OSError: it can not be written; nothing is left beside it.
+        OSError: the file cannot be written; no temporary file is left.
     """
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
@@ -22,21 +22,21 @@ def written_whole(path: Path) -> Iterator[Path]:
         part.replace(path)
         sync(path.parent)
     finally:
-        part.unlink(missing_ok=True)  # it is there only where writing failed
+        part.unlink(missing_ok=True)  # it exists only where writing failed
 
 
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file so that it is whole, or what was there before; several processes may write the same one.
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write a file atomically. Several processes may write the same file.
 
     Raises:
-        OSError: it can not be written; nothing is left beside it.
+        OSError: the file cannot be written; no temporary file is left.
     """
-    with written_whole(path) as part:
+    with atomic_path(path) as part:
         part.write_bytes(data)
 
 
 def sync(path: Path) -> None:
-    """Wait until a file's bytes, or a folder's names, are on the disk."""
+    """Wait until a file's content, or a folder's entries, are on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -45,10 +45,10 @@ def sync(path: Path) -> None:
 
 
 def move_folder(source: Path, target: Path) -> None:
-    """Give a folder another place on the same disk, at once and with everything in it on the disk.
+    """Move a folder atomically on the same disk, after its files are synced.
 
     Raises:
-        OSError: the target is there and not empty, or is no place for it.
+        OSError: the target exists and is not empty, or cannot be created.
     """
     for file in source.iterdir():
         sync(file)

@@ -1,13 +1,13 @@
-"""What goes over the wire between camera drivers, the NeuroVE service and its consumers.
+"""The messages between camera drivers, the NeuroVE service and its consumers.
 
-A driver or a consumer needs this package alone (numpy, msgpack, pydantic): importing it pulls in neither torch nor
-zenoh. README.md beside this file is the contract.
+A driver or a consumer needs only this package (numpy, msgpack, pydantic). Importing it imports neither torch nor zenoh.
+README.md in this folder is the contract.
 """
 
-from protocol.camera import CameraInfo
-from protocol.errors import NeuroVEError
-from protocol.events import EVENT_DTYPE, EventPacket, Events, Sensor
-from protocol.velocity import Flag, Trace, Twist, TwistEstimate
+from neurove_protocol.camera import CameraInfo
+from neurove_protocol.errors import NeuroVEError
+from neurove_protocol.events import EVENT_DTYPE, EventPacket, Events, Sensor
+from neurove_protocol.velocity import Flag, Trace, Twist, TwistEstimate
 
 __all__ = [
     "EVENT_DTYPE",

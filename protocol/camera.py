@@ -1,12 +1,12 @@
-"""CameraInfo: what a camera looks through, so that a network can see any camera as its canonical one."""
+"""CameraInfo: the lens of a camera, so that one network can serve any camera."""
 
 from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from protocol.codec import Message, Name
-from protocol.errors import InvalidField
-from protocol.events import Sensor
+from neurove_protocol.codec import Message, Name
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import Sensor
 
 SCHEMA = "application/msgpack;neurove.camera.1"
 """Zenoh Encoding of a CameraInfo."""
@@ -18,7 +18,7 @@ class CameraInfo(Message):
     """Intrinsics of one stream's camera, in the optical frame (x right, y down, z forward), pixel centres at integers.
 
     `pinhole` takes the distortion k1 k2 p1 p2 [k3] (radial-tangential, as OpenCV and the Event Camera Dataset);
-    `equidistant` takes k1 k2 k3 k4 (fisheye, as Kalibr and MVSEC). An empty list is a perfect lens.
+    `equidistant` takes k1 k2 k3 k4 (fisheye, as Kalibr and MVSEC). An empty list is a lens without distortion.
     """
 
     what: ClassVar[str] = "camera info"
@@ -32,7 +32,7 @@ class CameraInfo(Message):
     cx: float
     cy: float
     distortion: Annotated[tuple[float, ...], Field(strict=False)] = ()
-    height_m: Positive | None = None  # camera above the ground plane [m], where known
+    height_m: Positive | None = None  # height of the camera above the ground plane [m], if known
 
     @model_validator(mode="after")
     def _distortion_fits_the_lens(self) -> Self:

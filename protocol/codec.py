@@ -6,9 +6,9 @@ import msgpack
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import PydanticCustomError
 
-from protocol.errors import InvalidField, Malformed, UnsupportedVersion
-from protocol.fields import WrongField
-from protocol.keys import NAME_RULE, is_name
+from neurove_protocol.errors import InvalidField, Malformed, UnsupportedVersion
+from neurove_protocol.fields import WrongField
+from neurove_protocol.keys import NAME_RULE, is_name
 
 PROTOCOL_VERSION: Final = 1
 """Major version on the wire. Fields may be added within a version; readers of data messages ignore unknown ones."""
@@ -16,7 +16,7 @@ PROTOCOL_VERSION: Final = 1
 MAX_STRING_BYTES = 4096
 MAX_ITEMS = 4096
 MAX_MESSAGE_BYTES = 1 << 20
-"""Cap of every message but the event packet, which has its own (events.Limits)."""
+"""Cap of every message except the event packet, which has its own (events.PacketLimits)."""
 
 
 def _name(value: str) -> str:
@@ -26,11 +26,11 @@ def _name(value: str) -> str:
 
 
 Name = Annotated[str, AfterValidator(_name)]
-"""Of a stream or a node: fit to be one chunk of a key."""
+"""Name of a stream or a node: valid as one chunk of a key."""
 
 Int64 = Annotated[int, Field(ge=-(1 << 63), lt=1 << 63)]
 Count = Annotated[int, Field(ge=0, lt=1 << 63)]
-"""Integers stay within 63 bits and a sign, which every language has."""
+"""Integers fit into a signed 64-bit integer, which every language has."""
 
 
 class Part(BaseModel):
@@ -40,7 +40,7 @@ class Part(BaseModel):
 
 
 class Message(Part):
-    """A message on the wire: a part that stands alone and says which protocol version it speaks."""
+    """A message on the wire: a part with a protocol version."""
 
     what: ClassVar[str] = "message"
     v: Literal[1] = PROTOCOL_VERSION
@@ -54,7 +54,7 @@ class Message(Part):
         """Read and check a message.
 
         Raises:
-            Malformed, UnsupportedVersion, InvalidField: the first thing that is wrong, never any other exception.
+            Malformed, UnsupportedVersion, InvalidField: for the first error; never any other exception.
         """
         return validate(cls, unpack(data, cls.what))
 
@@ -63,7 +63,7 @@ MessageT = TypeVar("MessageT", bound=Message)
 
 
 def validate(kind: type[MessageT], fields: dict[str, Any]) -> MessageT:
-    """The message of this kind that the fields make, or the first reason why not as InvalidField."""
+    """The message of this kind with these fields; InvalidField names the first field that is wrong."""
     try:
         return kind.model_validate(fields)
     except ValidationError as error:
@@ -102,7 +102,7 @@ def unpack(data: bytes, what: str, max_bytes: int = MAX_MESSAGE_BYTES) -> dict[s
 def _map_without_duplicates(pairs: list[tuple[Any, Any]]) -> dict[str, Any]:
     fields = dict(pairs)
     if not all(isinstance(key, str) for key in fields):
-        raise ValueError("a key of a map is no string")
+        raise ValueError("a key of a map is not a string")
     if len(fields) != len(pairs):
-        raise ValueError("a key stands twice in one map")
+        raise ValueError("duplicate key in a map")
     return fields

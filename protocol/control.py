@@ -4,8 +4,8 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import ConfigDict, Field
 
-from protocol.codec import Count, Message, Name, Part
-from protocol.errors import NeuroVEError
+from neurove_protocol.codec import Count, Message, Name, Part
+from neurove_protocol.errors import EXIT_CONFLICT, EXIT_FAILURE, Conflict, NeuroVEError
 
 Verdict = Literal["ok", "lossy", "stalled", "idle"]
 
@@ -16,10 +16,10 @@ CONTROL_SCHEMA = "application/msgpack;neurove.control.1"
 """Zenoh Encoding of control requests, their replies and error replies."""
 
 PROGRESS_SCHEMA = "application/msgpack;neurove.progress.1"
-"""Zenoh Encoding of a ProgressReply: a reply that is not the last one."""
+"""Zenoh Encoding of a ProgressReply, which is never the last reply."""
 
 CHUNK_SCHEMA = "application/octet-stream"
-"""Zenoh Encoding of a chunk: bytes of a bundle, as they are."""
+"""Zenoh Encoding of a chunk: bytes of a bundle."""
 
 MAX_CHUNK_BYTES = 1 << 20
 MAX_SIGNATURE_BYTES = 1 << 16
@@ -31,23 +31,23 @@ DigestPrefix = Annotated[str, Field(pattern="^[0-9a-f]{8,64}$")]
 """The first 8 or more digits of a digest."""
 
 SignatureState = Literal["unsigned", "unchecked", "trusted", "untrusted"]
-"""None came; one came and this node trusts no key; of a key that it trusts; refused by the node."""
+"""No signature; a signature, but this node trusts no key; signed by a trusted key; refused by the node."""
 
 
 class Request(Message):
-    """A request: an unknown field is refused, for a misspelt one would be ignored in silence."""
+    """A request. Unknown fields are refused, so that a misspelt field is not ignored silently."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 
 
 class HealthRequest(Request):
-    """Ask a node how it is."""
+    """Query the health of a node."""
 
     what: ClassVar[str] = "health request"
 
 
 class ModelsRequest(Request):
-    """Ask a node for its models."""
+    """Query the models of a node."""
 
     what: ClassVar[str] = "models request"
 
@@ -58,32 +58,32 @@ class ActivateRequest(Request):
     what: ClassVar[str] = "activate request"
 
     model: Annotated[str, Field(min_length=1, max_length=128)]  # name, or the first 8 or more digits of its digest
-    expect: DigestPrefix | None = None  # of the active model: refused with conflict where it is another
-    shadow_s: Annotated[float, Field(ge=0, le=3600)] = 0.0  # runs beside the active model for so long first
-    canary: Annotated[tuple[Name, ...], Field(strict=False)] = ()  # streams that change; none means all
+    expect: DigestPrefix | None = None  # of the active model: conflict if another one is active
+    shadow_s: Annotated[float, Field(ge=0, le=3600)] = 0.0  # time in shadow before activation [s]
+    canary: Annotated[tuple[Name, ...], Field(strict=False)] = ()  # streams that change; empty means all
 
 
 class RollbackRequest(Request):
-    """Make the model before the active one again."""
+    """Activate the previous model again."""
 
     what: ClassVar[str] = "rollback request"
 
-    expect: DigestPrefix | None = None  # of the active model: refused with conflict where it is another
+    expect: DigestPrefix | None = None  # of the active model: conflict if another one is active
 
 
 class PushRequest(Request):
-    """There is a bundle to be pulled, in chunks, from the queryable that its digest names."""
+    """Offer a bundle; the node pulls it in chunks from the queryable that the digest names."""
 
     what: ClassVar[str] = "push request"
 
     digest: Digest
     size: Annotated[int, Field(ge=1, lt=1 << 63)]  # bytes
-    name: Annotated[str, Field(min_length=1, max_length=128)]  # for people: what errors call it
+    name: Annotated[str, Field(min_length=1, max_length=128)]  # for people: the name of the bundle in messages
     signature: Annotated[bytes, Field(max_length=MAX_SIGNATURE_BYTES)] | None = None
 
 
 class ChunkRequest(Request):
-    """Ask who pushes for a piece of the bundle; the answer is that many bytes of it, as they are."""
+    """Request a piece of the bundle from the client that pushes; the answer is exactly these bytes."""
 
     what: ClassVar[str] = "chunk request"
 
@@ -92,19 +92,19 @@ class ChunkRequest(Request):
 
 
 class Losses(Part):
-    """Everything that did not become part of an estimate, by cause; counted since the stream began."""
+    """Data that is not part of an estimate, by cause; counted since the stream began."""
 
-    gap_packets: Count = 0  # missing by sequence number: lost on the way
+    gap_packets: Count = 0  # missing by sequence number: lost before this node
     overload_packets: Count = 0  # dropped here, oldest first, because the queue was full
-    duplicate_packets: Count = 0  # a sequence number that came before
-    out_of_order_packets: Count = 0  # older than one already taken
-    malformed_packets: Count = 0  # refused: not what the contract says
-    failed_packets: Count = 0  # a fault of ours while working on it; the log has the trace back
-    late_events: Count = 0  # of a window that was already answered
-    skipped_windows: Count = 0  # windows in a hole of the sensor's time too long to bridge
+    duplicate_packets: Count = 0  # a sequence number that arrived before
+    out_of_order_packets: Count = 0  # older than a packet already processed
+    malformed_packets: Count = 0  # refused: they break a rule of the contract
+    failed_packets: Count = 0  # an internal error; the log has the traceback
+    late_events: Count = 0  # of a window that is already answered
+    skipped_windows: Count = 0  # windows in a gap of the sensor's time that is too long to bridge
 
     def nonzero(self) -> dict[str, int]:
-        """The causes that happened, with their counts."""
+        """The causes with a count above 0."""
         return {name: value for name, value in self.model_dump().items() if value}
 
 
@@ -117,7 +117,7 @@ class Latency(Part):
 
 
 class StreamStatus(Message):
-    """One stream on one node: its verdict and its counters since the stream began."""
+    """The verdict and the counters of one stream on one node, since the stream began."""
 
     what: ClassVar[str] = "stream status"
 
@@ -133,27 +133,27 @@ class StreamStatus(Message):
     windows: Count
     estimates: Count
     resets: Count
-    outside_events: Count  # seen by pixels that look past the canonical camera's field of view: no loss, a crop
+    outside_events: Count  # outside the canonical camera's field of view: cropped, not lost
     lost: Losses
-    latency_ms: Latency | None  # none before the first estimate
+    latency_ms: Latency | None  # None before the first estimate
     last_packet_age_s: float
 
 
 class ModelInfo(Part):
-    """A model that a node has, as its bundle describes it."""
+    """A model of a node, as its bundle describes it."""
 
     name: str
     digest: str
     trained: bool
-    provenance: str  # one line: where it comes from
+    provenance: str  # one line: how it was made
     parameters: Count
-    release: Count = 0  # counts up; 0 where its maker does not count
-    figures: dict[str, float] = Field(default_factory=dict)  # of its validation, as its maker names them
+    release: Count = 0  # release counter; 0 if its author does not count
+    figures: dict[str, float] = Field(default_factory=dict)  # of its validation, with the author's names
     signature: SignatureState = "unsigned"
 
 
 class HealthReply(Message):
-    """How a node is: `ok` is the verdict, `why` gives the reason where it is not."""
+    """The health of a node: `ok` is the verdict, `why` is the reason if it is not ok."""
 
     what: ClassVar[str] = "health reply"
 
@@ -164,11 +164,11 @@ class HealthReply(Message):
     version: str  # of the package
     model: ModelInfo
     epoch: Count
-    refused_streams: Count  # streams not served, because the node serves as many as it is configured to
+    refused_streams: Count  # streams refused because max_streams is reached
     streams: Annotated[tuple[StreamStatus, ...], Field(strict=False)]
-    ready: bool = True  # the next packet of a stream gets its estimate: false while the node ends
-    change: str = ""  # one sentence on the newest change of model: what is under way, or how it ended
-    rollbacks: Count = 0  # models that were taken back by themselves since the start
+    ready: bool = True  # the node answers the next packet of a stream; false while it shuts down
+    change: str = ""  # one sentence about the newest model change: its progress or its result
+    rollbacks: Count = 0  # automatic rollbacks since the start
 
 
 class ModelsReply(Message):
@@ -181,15 +181,15 @@ class ModelsReply(Message):
     previous: ModelInfo | None
     epoch: Count
     available: Annotated[tuple[ModelInfo, ...], Field(strict=False)]
-    unreadable: dict[str, str]  # file name -> why it is no model
+    unreadable: dict[str, str]  # file name -> why the file is not a model
     staged: Annotated[
         tuple[ModelInfo, ...], Field(strict=False)
     ] = ()  # pushed and verified, neither active nor previous
-    partial: dict[str, Count] = Field(default_factory=dict)  # digest of a push that was cut -> bytes that are here
+    partial: dict[str, Count] = Field(default_factory=dict)  # digest of an incomplete push -> bytes stored
 
 
 class ProgressReply(Message):
-    """A step of a push, an activation or a rollback that still goes on; the last reply of the query is its result."""
+    """A step of a running push, activation or rollback; the last reply of the query is its result."""
 
     what: ClassVar[str] = "progress reply"
 
@@ -199,17 +199,17 @@ class ProgressReply(Message):
 
 
 class PushReply(Message):
-    """The bundle is on the node, whole and verified."""
+    """The bundle is on the node, complete and verified."""
 
     what: ClassVar[str] = "push reply"
 
     node: Name
     model: ModelInfo
-    fetched: Count  # bytes that this push moved; 0 where the node had it
+    fetched: Count  # bytes that this push transferred; 0 if the node already had the bundle
 
 
 class ActivateReply(Message):
-    """The change was made: streams answer with the new model from their next window on."""
+    """The change is done: streams use the new model from their next window on."""
 
     what: ClassVar[str] = "activate reply"
 
@@ -220,7 +220,7 @@ class ActivateReply(Message):
 
 
 class ErrorReply(Message):
-    """Why a request was refused."""
+    """The reason why a request was refused."""
 
     what: ClassVar[str] = "error reply"
 
@@ -230,13 +230,14 @@ class ErrorReply(Message):
 
     @classmethod
     def of(cls, error: NeuroVEError) -> "ErrorReply":
-        """The reply that tells a peer about an error."""
+        """The reply that reports an error to a peer."""
         return cls(code=error.code, message=error.message, details=error.details)
 
 
 class PeerError(NeuroVEError):
-    """A peer refused our request; `code` and details are the peer's."""
+    """A peer refused our request; `code` and `details` are those of the peer."""
 
     def __init__(self, reply: ErrorReply) -> None:
         super().__init__(reply.message, **reply.details)
-        self.code = reply.code  # type: ignore[misc]  # this class stands for any peer's error
+        self.code = reply.code  # type: ignore[misc]  # this class represents any error of a peer
+        self.exit_code = EXIT_CONFLICT if reply.code == Conflict.code else EXIT_FAILURE  # type: ignore[misc]

@@ -1,20 +1,45 @@
-"""NeuroVEError and the errors that a peer can be told.
+"""NeuroVEError and the errors that a node reports to a peer.
 
-Every error has a stable `code` (part of the wire contract), a sentence that names field, value and bound, and the same
-three as `details` for machines.
+Every error has a stable `code` (part of the wire contract), a sentence that names the field, the value and the bound,
+the same parts as `details` for machines, and the exit code of a command that fails with it.
+
+    NeuroVEError                     exit code 2: wrong usage
+    +- InternalError
+    +- InputError                    a message, a field or an event is refused
+    |  +- Malformed, UnsupportedVersion, InvalidField, UnknownFormat, BlobLength, EventOutsideSensor, TimeBackwards
+    +- ModelError                    a model is refused, or a model change failed
+    |  +- UnknownModel, BadModel, Untrusted, Downgrade
+    |  +- NoMemory, TooSlow, Diverged, RolledBack, NothingBefore
+    +- TransferError                 a pushed bundle is not stored
+    |  +- NoStore, TooLarge, NoQuota, NoSpace, TransferInterrupted
+    +- RequestError                  the node does not handle the request now
+    |  +- Busy, Conflict (exit code 3)
+    +- PeerError (control.py)        exit code 1, or 3 for a conflict: a node refused our request
+
+`neurove_core` adds RecordingError (io.errors) and MissingExtra; `neurove_service` adds what a client or a node
+reports about its configuration and its connections.
 """
 
 import reprlib
-from typing import ClassVar
+from typing import ClassVar, Final
 
 Detail = str | int | float | bool | None
 
+EXIT_FAILURE: Final = 1
+"""Exit code of a command whose answer is bad news: no service, a broken recording, a refused request."""
+
+EXIT_WRONG_USAGE: Final = 2
+"""Exit code of a command that was called wrongly: an unknown source, setting, file or field."""
+
+EXIT_CONFLICT: Final = 3
+"""Exit code of a command that another client's model change preceded."""
+
 MAX_TEXT_BYTES = 1024
-"""Cap of an error's sentence and of each of its details: what a peer is told must fit the caps of a message."""
+"""Cap of an error's sentence and of each of its details, so that an error reply fits the caps of a message."""
 
 
 class _Short(reprlib.Repr):
-    """A repr whose length, depth and cost are bounded, for values that a peer sent."""
+    """A repr with bounded length, depth and cost, for values that a peer sent."""
 
     repr_bytes = reprlib.Repr.repr_str
 
@@ -28,7 +53,7 @@ _SHORT = _Short()
 
 
 def shown(value: object) -> str:
-    """The value as a sentence shows it: its repr, at most 80 characters however long or deep the value is.
+    """The value as text for a sentence: its repr, at most 80 characters for any value.
 
     >>> shown([[[1]]])
     '[[...]]'
@@ -38,7 +63,7 @@ def shown(value: object) -> str:
 
 
 def _clipped(text: str) -> str:
-    data = text.encode("utf-8", "backslashreplace")  # a file name may hold what UTF-8 does not
+    data = text.encode("utf-8", "backslashreplace")  # a file name may hold characters that UTF-8 cannot encode
     return (data if len(data) <= MAX_TEXT_BYTES else data[: MAX_TEXT_BYTES - 3] + b"...").decode("utf-8", "ignore")
 
 
@@ -46,6 +71,7 @@ class NeuroVEError(Exception):
     """Base of all errors that a user or a peer may see: a stable code, a sentence, and its parts as fields."""
 
     code: ClassVar[str] = "internal"
+    exit_code: ClassVar[int] = EXIT_WRONG_USAGE
 
     def __init__(self, message: str, /, **details: Detail) -> None:
         self.message = _clipped(message)
@@ -55,8 +81,24 @@ class NeuroVEError(Exception):
         super().__init__(self.message)
 
 
+class InputError(NeuroVEError):
+    """A message, one of its fields, or an event is refused."""
+
+
+class ModelError(NeuroVEError):
+    """A model is refused, or a model change failed."""
+
+
+class TransferError(NeuroVEError):
+    """A pushed bundle is not stored."""
+
+
+class RequestError(NeuroVEError):
+    """The node does not handle the request now."""
+
+
 class InternalError(NeuroVEError):
-    """A bug on the answering side; its log has the trace back."""
+    """A bug on the answering side; its log has the traceback."""
 
     code = "internal"
 
@@ -64,8 +106,8 @@ class InternalError(NeuroVEError):
         super().__init__("internal error: see the log of the node that answered")
 
 
-class Malformed(NeuroVEError):
-    """The bytes are no message at all: not msgpack, cut short, trailing bytes, or a key twice."""
+class Malformed(InputError):
+    """The bytes are not a message: not msgpack, truncated, with trailing bytes, or with a duplicate key."""
 
     code = "malformed"
 
@@ -73,28 +115,28 @@ class Malformed(NeuroVEError):
         super().__init__(f"{what}: not a valid message: {why}", what=what)
 
 
-class UnsupportedVersion(NeuroVEError):
-    """The message speaks another major version of the protocol."""
+class UnsupportedVersion(InputError):
+    """The message has another major version of the protocol."""
 
     code = "unsupported_version"
 
     def __init__(self, what: str, got: object, want: int) -> None:
         value = got if isinstance(got, int) else shown(got)
-        super().__init__(f"{what}: protocol version v={value}, this side speaks v={want}", field="v", value=value)
+        super().__init__(f"{what}: protocol version v={value}, this side supports v={want}", field="v", value=value)
 
 
-class InvalidField(NeuroVEError):
+class InvalidField(InputError):
     """One field is missing, of the wrong type, or out of its bound."""
 
     code = "invalid_field"
 
     def __init__(self, what: str, field: str, value: object, bound: str) -> None:
-        field = field if len(field) <= 80 else field[:77] + "..."  # a misspelt one is the peer's, of any length
+        field = field if len(field) <= 80 else field[:77] + "..."  # a peer may send a field name of any length
         super().__init__(f"{what}: {field}={shown(value)}: {bound}", field=field, value=shown(value), bound=bound)
 
 
-class UnknownFormat(NeuroVEError):
-    """The event blob is in a layout that this side cannot read."""
+class UnknownFormat(InputError):
+    """This side does not know the layout of the event blob."""
 
     code = "unknown_format"
 
@@ -104,7 +146,7 @@ class UnknownFormat(NeuroVEError):
         )
 
 
-class BlobLength(NeuroVEError):
+class BlobLength(InputError):
     """The event blob is not n times the record size of its format."""
 
     code = "blob_length"
@@ -118,7 +160,7 @@ class BlobLength(NeuroVEError):
         )
 
 
-class EventOutsideSensor(NeuroVEError):
+class EventOutsideSensor(InputError):
     """An event lies outside the sensor that its packet names."""
 
     code = "event_outside_sensor"
@@ -127,7 +169,7 @@ class EventOutsideSensor(NeuroVEError):
         super().__init__(f"event {index} at x={x} y={y} lies outside the sensor {sensor}", index=index, x=x, y=y)
 
 
-class TimeBackwards(NeuroVEError):
+class TimeBackwards(InputError):
     """Times of a packet run backwards."""
 
     code = "time_backwards"
@@ -141,8 +183,8 @@ class TimeBackwards(NeuroVEError):
         )
 
 
-class UnknownModel(NeuroVEError):
-    """No model of this name is available on the node."""
+class UnknownModel(ModelError):
+    """The node has no model of this name."""
 
     code = "unknown_model"
 
@@ -150,35 +192,37 @@ class UnknownModel(NeuroVEError):
         super().__init__(f"model={name!r}: not on this node; available: {', '.join(available) or 'none'}", value=name)
 
 
-class BadModel(NeuroVEError):
-    """A model file is unreadable, foreign, or does not hold what its header declares."""
+class BadModel(ModelError):
+    """A model file is unreadable, has another format, or does not match its header."""
 
     code = "bad_model"
 
     def __init__(self, name: str, why: str) -> None:
         super().__init__(f"model {name}: {why}", value=name)
+        self.why = _clipped(why)
 
 
-class Untrusted(NeuroVEError):
-    """A model's signature does not show that someone trusted made exactly these bytes."""
+class Untrusted(ModelError):
+    """No trusted key signed exactly the bytes of this model."""
 
     code = "untrusted"
 
     def __init__(self, name: str, reason: str, why: str) -> None:
         super().__init__(f"model {name}: signature refused ({reason}): {why}", value=name, reason=reason)
+        self.why = why
 
 
-class NoStore(NeuroVEError):
-    """The node keeps no pushed models: it was given no folder for them, or one that it can not write to."""
+class NoStore(TransferError):
+    """The node stores no pushed models: no folder is configured, or the folder is not writable."""
 
     code = "no_store"
 
     def __init__(self, why: str) -> None:
-        super().__init__(f"this node keeps no pushed models: {why}", why=why)
+        super().__init__(f"this node stores no pushed models: {why}", why=why)
 
 
-class TooLarge(NeuroVEError):
-    """A bundle is larger than a node takes."""
+class TooLarge(TransferError):
+    """A bundle is larger than the node accepts."""
 
     code = "too_large"
 
@@ -186,21 +230,21 @@ class TooLarge(NeuroVEError):
         super().__init__(f"model {name}: size={size}: a bundle has at most {cap} bytes", value=size, bound=cap)
 
 
-class NoQuota(NeuroVEError):
-    """With this bundle the node's pushed models would take more than they may."""
+class NoQuota(TransferError):
+    """With this bundle the node's pushed models would exceed their quota."""
 
     code = "no_quota"
 
     def __init__(self, name: str, size: int, used: int, quota: int) -> None:
         super().__init__(
-            f"model {name}: size={size}: {used} of {quota} bytes for pushed models are taken",
+            f"model {name}: size={size}: {used} of {quota} bytes for pushed models are in use",
             value=size,
             used=used,
             bound=quota,
         )
 
 
-class NoSpace(NeuroVEError):
+class NoSpace(TransferError):
     """The node's disk is full."""
 
     code = "no_space"
@@ -209,53 +253,54 @@ class NoSpace(NeuroVEError):
         super().__init__(f"model {name}: needs {need} bytes, the node's disk has {free}", value=need, bound=free)
 
 
-class Cut(NeuroVEError):
-    """Whoever pushed a bundle stopped to answer; what came is kept, and the next push goes on from there."""
+class TransferInterrupted(TransferError):
+    """The client that pushed a bundle stopped answering; the node keeps what arrived, and the next push resumes."""
 
     code = "cut"
 
     def __init__(self, name: str, have: int, size: int, why: str) -> None:
         super().__init__(
-            f"model {name}: cut at {have} of {size} bytes: {why}; the next push goes on from there",
+            f"model {name}: interrupted at {have} of {size} bytes: {why}; the next push resumes there",
             value=have,
             bound=size,
         )
 
 
-class Busy(NeuroVEError):
-    """The node works on as many requests of this kind as it takes."""
+class Busy(RequestError):
+    """The node handles its maximum number of requests of this kind."""
 
     code = "busy"
 
     def __init__(self, at_once: int) -> None:
-        super().__init__(f"busy: this node works on at most {at_once} such requests at once", bound=at_once)
+        super().__init__(f"busy: this node handles at most {at_once} such requests at once", bound=at_once)
 
 
-class Conflict(NeuroVEError):
-    """Somebody else changed the model first, or is about to."""
+class Conflict(RequestError):
+    """Another client changes the model, or changed it first."""
 
     code = "conflict"
+    exit_code = EXIT_CONFLICT
 
     def __init__(self, why: str) -> None:
         super().__init__(f"conflict: {why}", why=why)
 
 
-class NoMemory(NeuroVEError):
-    """A model is refused, for it might not fit beside the one that serves."""
+class NoMemory(ModelError):
+    """A model is refused because it might not fit into memory together with the active one."""
 
     code = "no_memory"
 
     def __init__(self, model: str, free_bytes: int, need_bytes: int) -> None:
         super().__init__(
-            f"model {model}: free_bytes={free_bytes}: a change of model needs {need_bytes} bytes of memory",
+            f"model {model}: free_bytes={free_bytes}: a model change needs {need_bytes} bytes of memory",
             field="free_bytes",
             value=free_bytes,
             bound=need_bytes,
         )
 
 
-class TooSlow(NeuroVEError):
-    """A model is refused, for this node can not run it in time."""
+class TooSlow(ModelError):
+    """A model is refused because this node cannot run it in time."""
 
     code = "too_slow"
 
@@ -269,8 +314,8 @@ class TooSlow(NeuroVEError):
         )
 
 
-class Diverged(NeuroVEError):
-    """A model is refused, for beside the active one on live streams it did not behave alike."""
+class Diverged(ModelError):
+    """A model is refused because its estimates in shadow differ too much from those of the active model."""
 
     code = "diverged"
 
@@ -279,8 +324,8 @@ class Diverged(NeuroVEError):
         super().__init__(f"model {model}: {field}={value}: the bound is {bound}", field=field, value=value, bound=bound)
 
 
-class RolledBack(NeuroVEError):
-    """A model served, and was taken back by itself on its probation; the one before serves on."""
+class RolledBack(ModelError):
+    """The node rolled a model back during its probation; the previous model serves again."""
 
     code = "rolled_back"
 
@@ -288,20 +333,20 @@ class RolledBack(NeuroVEError):
         super().__init__(f"model change: {why}", why=why)
 
 
-class NothingBefore(NeuroVEError):
-    """There is no model to go back to."""
+class NothingBefore(ModelError):
+    """There is no previous model."""
 
     code = "nothing_before"
 
     def __init__(self) -> None:
-        super().__init__("nothing to roll back to: this node has no model before the active one")
+        super().__init__("cannot roll back: this node has no previous model")
 
 
-class Downgrade(NeuroVEError):
-    """A model's release is lower than one that was accepted before, and its signature does not allow that."""
+class Downgrade(ModelError):
+    """A model's release is lower than an accepted one, and its signature does not allow a downgrade."""
 
     code = "downgrade"
 
     def __init__(self, name: str, release: int, highest: int) -> None:
-        why = f"release={release}: release {highest} was here before, and its signature does not allow a downgrade"
+        why = f"release={release}: release {highest} was accepted before, and the signature does not allow a downgrade"
         super().__init__(f"model {name}: {why}", value=release, bound=highest)

@@ -1,6 +1,6 @@
 """Events and the packet that carries them: EVENT_DTYPE, Sensor, Events, EventPacket, encode_packet, decode_packet.
 
-`open_packet` leaves the events as they lie in the packet, for a reader that goes over them itself.
+`open_packet` leaves the events in the layout of the packet, for a reader that decodes them itself.
 """
 
 from collections.abc import Sequence
@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from protocol.codec import Count, Message, Name, unpack, validate
-from protocol.errors import BlobLength, EventOutsideSensor, InvalidField, TimeBackwards, UnknownFormat
+from neurove_protocol.codec import Count, Message, Name, unpack, validate
+from neurove_protocol.errors import BlobLength, EventOutsideSensor, InvalidField, TimeBackwards, UnknownFormat
 
 EVENT_DTYPE = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1")])
 """One event as a record, for files and tables: t sensor clock [us], x and y [px], p polarity (1 ON, 0 OFF)."""
 
 FORMATS = ("soa6", "soa8")
-"""Layouts of the event blob, bytes per event at the end of the name; `evt3` is reserved for raw Prophesee words."""
+"""Layouts of the event blob; the name ends with the bytes per event. `evt3` is reserved for raw Prophesee words."""
 
 SCHEMA = "application/msgpack;neurove.events.1"
 """Zenoh Encoding of an event packet."""
@@ -56,25 +56,25 @@ class Events(NamedTuple):
 
     @property
     def n(self) -> int:
-        """How many events these are."""
+        """Number of events."""
         return int(self.t.size)
 
     @property
     def first_us(self) -> int:
-        """Time of the first one; there must be one [us]."""
+        """Time of the first event [us]; there must be one."""
         return int(self.t[0])
 
     @property
     def last_us(self) -> int:
-        """Time of the last one; there must be one [us]."""
+        """Time of the last event [us]; there must be one."""
         return int(self.t[-1])
 
     def before(self, t_us: int) -> int:
-        """How many of these are earlier than that."""
+        """Number of events earlier than `t_us`."""
         return int(np.searchsorted(self.t, t_us))
 
     def span(self, first: int, stop: int) -> "Events":
-        """Events number `first` up to but without `stop`, as views."""
+        """Events [first, stop), as views."""
         return Events(self.t[first:stop], self.x[first:stop], self.y[first:stop], self.p[first:stop])
 
     def to_records(self) -> NDArray[np.void]:
@@ -86,7 +86,7 @@ class Events(NamedTuple):
 
     @classmethod
     def from_columns(cls, t: Any, x: Any, y: Any, p: Any) -> "Events":
-        """Events from anything array-like; copies only where a column has another type."""
+        """Events from array-likes; copies a column only if its type differs."""
         return cls(np.asarray(t, np.int64), np.asarray(x, np.uint16), np.asarray(y, np.uint16), np.asarray(p, np.uint8))
 
     @classmethod
@@ -108,44 +108,44 @@ class Events(NamedTuple):
 
 
 class WireEvents(NamedTuple):
-    """Events as they lie in a packet: what `Events` of this length says, in 6 or 8 bytes each."""
+    """Events in the layout of a packet, 6 or 8 bytes each."""
 
     t0_us: int  # sensor clock
-    blob: NDArray[np.uint8]  # a packet's, read-only; at any address
+    blob: NDArray[np.uint8]  # of a packet, read-only; at any address
     wide: bool  # soa8, else soa6
-    first: int  # of the blob's events these are number `first` up to but without `stop`
+    first: int  # these are events [first, stop) of the blob
     stop: int
 
     @property
     def n(self) -> int:
-        """How many events these are."""
+        """Number of events."""
         return self.stop - self.first
 
     @property
     def first_us(self) -> int:
-        """Time of the first one; there must be one [us]."""
+        """Time of the first event [us]; there must be one."""
         return self.t0_us + int(self._column(0)[0])
 
     @property
     def last_us(self) -> int:
-        """Time of the last one; there must be one [us]."""
+        """Time of the last event [us]; there must be one."""
         return self.t0_us + int(self._column(0)[-1])
 
     def before(self, t_us: int) -> int:
-        """How many of these are earlier than that."""
+        """Number of events earlier than `t_us`."""
         offset, after_us = self._column(0), t_us - self.t0_us
         if after_us <= 0:
             return 0
-        kind = offset.dtype.type  # another type would have the whole column converted
+        kind = offset.dtype.type  # another type would convert the whole column
         return self.n if after_us > np.iinfo(kind).max else int(np.searchsorted(offset, kind(after_us)))
 
     def span(self, first: int, stop: int) -> "WireEvents":
-        """Events number `first` up to but without `stop`, as views."""
+        """Events [first, stop), as views."""
         first, stop, _ = slice(first, stop).indices(self.n)
         return self._replace(first=self.first + first, stop=self.first + max(first, stop))
 
     def columns(self) -> Events:
-        """The same as columns; x stays a view, the others are computed."""
+        """The same events as columns; x stays a view, the others are computed."""
         offset, x, y_and_p = (self._column(index) for index in range(3))
         p = (y_and_p >> np.uint16(15)).astype(np.uint8)
         return Events(offset.astype(np.int64) + self.t0_us, x, y_and_p & _Y_MASK, p)
@@ -188,20 +188,20 @@ def check_events(events: Events, sensor: Sensor, not_before_us: int | None = Non
 
 @dataclass(frozen=True, slots=True)
 class EventPacket:
-    """What a driver sends at once: the ordered events of one stream from t0_us on.
+    """The ordered events of one stream, from t0_us on, that a driver sends at once.
 
-    A packet without events is a clock tick: it says that nothing happened before t0_us that was not sent.
+    A packet without events is a clock tick: the driver has sent every event before t0_us.
     """
 
     stream: str
-    seq: int  # counts packets of this stream from 0, without holes
+    seq: int  # counts packets of this stream from 0, without gaps
     sensor: Sensor
     t0_us: int  # sensor clock; no event of this packet is earlier
     events: Events
 
 
 class WirePacket(NamedTuple):
-    """An event packet whose events are as they came; otherwise what an EventPacket is."""
+    """An EventPacket whose events are still in the layout of the packet."""
 
     stream: str
     seq: int
@@ -211,8 +211,8 @@ class WirePacket(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
-    """Caps on what a packet may claim; beyond them it is refused."""
+class PacketLimits:
+    """Caps on a packet; a larger one is refused."""
 
     max_events: int = 1_000_000
     max_side_px: int = 4096
@@ -223,7 +223,7 @@ class Limits:
         return self.max_events * 8 + 1024
 
 
-DEFAULT_LIMITS = Limits()
+DEFAULT_LIMITS = PacketLimits()
 
 Packet = EventPacket | WirePacket
 
@@ -249,10 +249,10 @@ def encode_packet(packet: EventPacket, blob_format: str | None = None) -> bytes:
         blob_format: one of FORMATS; by default the smallest that the packet's time span fits.
 
     Raises:
-        EventOutsideSensor, TimeBackwards, InvalidField: the packet is not what it must be.
+        EventOutsideSensor, TimeBackwards, InvalidField: the packet is invalid.
     """
     check_events(packet.events, packet.sensor, packet.t0_us)
-    if (packet.events.p > 1).any():  # -1 for OFF, say, would turn into ON
+    if (packet.events.p > 1).any():  # -1 for OFF would become ON
         raise InvalidField(_Header.what, "p", int(packet.events.p.max()), "the polarity is 1 (ON) or 0 (OFF)")
     span_us = int(packet.events.t[-1]) - packet.t0_us if packet.events.n else 0
     blob_format = blob_format or ("soa6" if span_us < 1 << 16 else "soa8")
@@ -282,7 +282,7 @@ def encode_packet(packet: EventPacket, blob_format: str | None = None) -> bytes:
     return validate(_Header, header).encode()
 
 
-def decode_packet(data: bytes, limits: Limits = DEFAULT_LIMITS) -> EventPacket:
+def decode_packet(data: bytes, limits: PacketLimits = DEFAULT_LIMITS) -> EventPacket:
     """Read and check an event packet; x is a view into `data`, the other columns are computed.
 
     Raises:
@@ -295,11 +295,11 @@ def decode_packet(data: bytes, limits: Limits = DEFAULT_LIMITS) -> EventPacket:
     return EventPacket(packet.stream, packet.seq, packet.sensor, packet.t0_us, events)
 
 
-def open_packet(data: bytes, limits: Limits = DEFAULT_LIMITS) -> WirePacket:
-    """Read an event packet and check all but its events, which may lie outside the sensor or run backwards.
+def open_packet(data: bytes, limits: PacketLimits = DEFAULT_LIMITS) -> WirePacket:
+    """Read an event packet and check everything except its events, which may lie outside the sensor or run backwards.
 
     Raises:
-        NeuroVEError: as decode_packet, but for EventOutsideSensor and TimeBackwards.
+        NeuroVEError: as decode_packet, except for EventOutsideSensor and TimeBackwards.
     """
     header = validate(_Header, unpack(data, _Header.what, limits.max_bytes))
     for name, value, bound in (

@@ -1,12 +1,12 @@
-"""Zenoh key expressions: build and parse; nothing else spells a key.
+"""Zenoh key expressions: this module alone builds and parses keys.
 
-The `@node` chunk is what Zenoh calls verbatim: a wildcard never matches it, so a stream can not shadow a node.
+The `@node` chunk is verbatim in Zenoh: a wildcard never matches it, so a stream cannot shadow a node.
 """
 
 import re
 from dataclasses import dataclass
 
-from protocol.errors import InvalidField
+from neurove_protocol.errors import InvalidField
 
 DEFAULT_PREFIX = "neurove/v1"
 NAME_RULE = "1 to 64 characters of A-Z a-z 0-9 _ . - and no dot or dash first"
@@ -16,12 +16,12 @@ _PREFIX = re.compile(r"[A-Za-z0-9_.-]{1,64}(/[A-Za-z0-9_.-]{1,64}){0,7}")
 
 
 def is_name(name: str) -> bool:
-    """Whether the name is fit to be one chunk of a key."""
+    """Whether the name is valid as one chunk of a key."""
     return _NAME.fullmatch(name) is not None
 
 
 def check_name(what: str, name: str) -> str:
-    """The name, if it is fit to be one chunk of a key.
+    """The name, if it is valid as one chunk of a key.
 
     >>> check_name("stream", "cam0")
     'cam0'
@@ -80,19 +80,19 @@ class Keys:
         return self._of_node(node, "models")
 
     def activate(self, node: str = "*") -> str:
-        """Queryable: change the model of a node. Under `model/`, so that an access list can guard it alone."""
+        """Queryable: change the model of a node. Under `model/`, so that an access list can restrict it."""
         return self._of_node(node, "model/activate")
 
     def rollback(self, node: str = "*") -> str:
-        """Queryable: back to the model before."""
+        """Queryable: activate the previous model again."""
         return self._of_node(node, "model/rollback")
 
     def push(self, node: str = "*") -> str:
-        """Queryable: tell a node of a bundle that it may pull."""
+        """Queryable: offer a bundle to a node."""
         return self._of_node(node, "model/push")
 
     def chunks(self, digest: str) -> str:
-        """Queryable of whoever pushes a bundle: pieces of its bytes. Verbatim, so that no stream can shadow it.
+        """Queryable of the client that pushes a bundle: pieces of its bytes. Verbatim, so that no stream can shadow it.
 
         Raises:
             InvalidField: the digest is not 64 digits 0-9 a-f.

@@ -1,4 +1,4 @@
-"""Twist, TwistEstimate and its quality flags: what the service says about a stream, once per window."""
+"""Twist, TwistEstimate and its quality flags: what the service publishes for a stream, once per window."""
 
 import math
 from enum import StrEnum
@@ -7,8 +7,8 @@ from typing import Annotated, ClassVar, NamedTuple, Self
 from pydantic import AfterValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from protocol.codec import Count, Int64, Message, Name, Part
-from protocol.errors import InvalidField
+from neurove_protocol.codec import Count, Int64, Message, Name, Part
+from neurove_protocol.errors import InvalidField
 
 SCHEMA = "application/msgpack;neurove.velocity.1"
 """Zenoh Encoding of a TwistEstimate."""
@@ -18,19 +18,19 @@ AXES = ("vx", "vy", "vz", "wx", "wy", "wz")
 
 
 class Flag(StrEnum):
-    """What a consumer should know before it trusts an estimate. Readers ignore flags that they do not know."""
+    """Quality flags of an estimate. Readers ignore flags that they do not know."""
 
-    UNTRAINED = "untrained"  # the model was never trained: the numbers mean nothing
-    UNCALIBRATED = "uncalibrated"  # no CameraInfo: the sensor was scaled plainly onto the canonical camera
-    UNSCALED = "unscaled"  # no camera height: the linear part is up to scale, given as for 1 m
+    UNTRAINED = "untrained"  # the model is not trained; its numbers have no meaning
+    UNCALIBRATED = "uncalibrated"  # no CameraInfo; the sensor is scaled linearly onto the canonical camera
+    UNSCALED = "unscaled"  # no camera height; the linear part is up to scale and assumes 1 m
     SETTLING = "settling"  # the recurrent state is younger than the model's settling time
-    RESET = "reset"  # the state began anew in this window
-    SENSOR_CHANGED = "sensor_changed"  # and it did because the stream's geometry or CameraInfo changed
+    RESET = "reset"  # the recurrent state was reset in this window
+    SENSOR_CHANGED = "sensor_changed"  # cause of the reset: the stream's geometry or CameraInfo changed
     GAP = "gap"  # packets of this window were lost
-    OVERLOAD = "overload"  # and they were dropped here, because this node could not keep up
+    OVERLOAD = "overload"  # this node dropped them because it could not keep up
     LOW_ACTIVITY = "low_activity"  # fewer events than the model needs to see motion
-    SATURATED = "saturated"  # some cell counted more events than it can hold
-    UNCERTAIN = "uncertain"  # the linear velocity's standard deviation is a larger share of it than the model's bound
+    SATURATED = "saturated"  # the event count of a cell reached its maximum
+    UNCERTAIN = "uncertain"  # sigma of the linear velocity, as a share of the speed, is above the model's bound
 
 
 class Twist(NamedTuple):
@@ -61,16 +61,16 @@ Covariance = Annotated[
     Field(strict=False, min_length=_AXES * _AXES, max_length=_AXES * _AXES),
     AfterValidator(_fits_a_covariance),
 ]
-"""Of the six numbers of a twist, 6x6 row by row: as geometry_msgs/TwistWithCovariance has it, in the same order."""
+"""6x6 covariance of a twist, row by row, in the layout of geometry_msgs/TwistWithCovariance."""
 
 
 class Trace(Part):
-    """When one estimate passed where, on the service's monotonic clock [ns]; only differences have a meaning."""
+    """Time stamps of one estimate on the service's monotonic clock [ns]; only differences have a meaning."""
 
-    received_ns: Int64  # the packet that completed the window came in from the network
+    received_ns: Int64  # the packet that completed the window arrived from the network
     queued_ns: Int64  # the stream's worker took it out of its queue
-    computed_ns: Int64  # the network had answered
-    published_ns: Int64  # handed over to Zenoh
+    computed_ns: Int64  # the network finished
+    published_ns: Int64  # the estimate was passed to Zenoh
 
     @property
     def latency_ms(self) -> float:
@@ -79,12 +79,12 @@ class Trace(Part):
 
 
 class TwistEstimate(Message):
-    """One window's answer: n twists, one per chronological bin (the paper's [n, 6]), and how far to trust them."""
+    """The estimate of one window: n twists, one per chronological bin (the paper's [n, 6])."""
 
     what: ClassVar[str] = "twist estimate"
 
     stream: Name
-    seq: Count  # counts estimates of this stream from 0, without holes
+    seq: Count  # counts estimates of this stream from 0, without gaps
     start_us: Int64  # window [start_us, end_us), sensor clock
     end_us: Int64
     bin_end_us: Annotated[tuple[Int64, ...], Field(strict=False, min_length=1)]
@@ -95,7 +95,7 @@ class TwistEstimate(Message):
     epoch: Count  # counts model changes of the node
     events: Count  # events of this window, all of the sensor
     flags: Annotated[tuple[str, ...], Field(strict=False)] = ()
-    covariance: Covariance | None = None  # of each of these twists; none where the model has no measure of its errors
+    covariance: Covariance | None = None  # of each twist; None if the model has no calibrated uncertainty
     trace: Trace
 
     @model_validator(mode="after")
@@ -108,12 +108,12 @@ class TwistEstimate(Message):
 
     @property
     def twist(self) -> Twist:
-        """The newest twist: that of the last bin."""
+        """The newest twist, of the last bin."""
         return self.twists[-1]
 
     @property
     def sigma(self) -> Twist | None:
-        """Standard deviation of each axis; none where there is no covariance."""
+        """Standard deviation of each axis; None without a covariance."""
         if self.covariance is None:
             return None
         return Twist(*(math.sqrt(self.covariance[i * _AXES + i]) for i in range(_AXES)))

@@ -1,1 +1,1 @@
-"""The long-running process: camera streams in over Zenoh, velocity out."""
+"""The long-running service: event streams in over Zenoh, velocity out."""

@@ -1,6 +1,7 @@
-"""Configuration of the service and of its clients: defaults < TOML file < environment NEUROVE_* < flags.
+"""Configuration of the service and its clients: defaults < TOML file < environment NEUROVE_* < flags.
 
-Unknown keys and wrong values stop the start with one sentence that names field, value, bound and where it came from.
+An unknown key or a wrong value stops the start with one sentence that names the field, the value, the bound and the
+source of the value.
 """
 
 import os
@@ -17,10 +18,10 @@ from pydantic_settings import (
     TomlConfigSettingsSource,
 )
 
-from protocol.errors import NeuroVEError
-from protocol.events import Limits
-from protocol.fields import WrongField
-from protocol.keys import DEFAULT_PREFIX, Keys, check_name
+from neurove_protocol.errors import NeuroVEError
+from neurove_protocol.events import PacketLimits
+from neurove_protocol.fields import WrongField
+from neurove_protocol.keys import DEFAULT_PREFIX, Keys, check_name
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 ENVIRONMENT = "NEUROVE_"
@@ -52,14 +53,16 @@ class _Settings(BaseSettings):
         dotenv_settings: PydanticBaseSettingsSource,
         file_secret_settings: PydanticBaseSettingsSource,
     ) -> tuple[PydanticBaseSettingsSource, ...]:
-        """Only what load() hands over: it reads the sources itself, to know where each value came from."""
+        """Only the values from load(), which reads the sources itself to know the source of each value."""
         return (init_settings,)
 
     prefix: Annotated[str, BeforeValidator(lambda value: Keys(str(value)).prefix)] = Field(
         DEFAULT_PREFIX, description="Key prefix of the deployment."
     )
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="Least severe line logged.")
-    zenoh_config: Path | None = Field(None, description="Zenoh configuration (JSON5) to start from, as for TLS.")
+    zenoh_config: Path | None = Field(
+        None, description="Zenoh configuration (JSON5) with further settings, such as TLS."
+    )
 
     @property
     def keys(self) -> Keys:
@@ -68,7 +71,7 @@ class _Settings(BaseSettings):
 
 
 class ClientConfig(_Settings):
-    """Settings of drive, watch, health and the other commands that talk to a service."""
+    """Settings of drive, watch, health and the other commands that connect to a service."""
 
     connect: Endpoints = Field((DEFAULT_ENDPOINT,), min_length=1, description="Endpoints to connect to.")
 
@@ -77,42 +80,55 @@ class ServiceConfig(_Settings):
     """Settings of `neurove serve`."""
 
     node: Annotated[str, BeforeValidator(lambda value: check_name("node", str(value)))] = Field(
-        "edge", description="Name of this node, one key chunk."
+        "edge", description="Name of this node: one key chunk."
     )
     mode: Literal["peer", "client", "router"] = Field(
-        "peer", description="Zenoh mode: peer for direct links, client towards a router."
+        "peer", description="Zenoh mode: peer for direct links, client with a router."
     )
-    listen: Endpoints = Field((DEFAULT_ENDPOINT,), description="Endpoints to listen on; in client mode none.")
-    connect: Endpoints = Field((), validate_default=True, description="Endpoints to connect to, such as a router's.")
-    model: str = Field("default", min_length=1, description="Active model at start: its name, or a bundle's file.")
-    models_dir: Path | None = Field(None, description="Folder of the bundles that may be activated.")
+    listen: Endpoints = Field((DEFAULT_ENDPOINT,), description="Endpoints to listen on; none in client mode.")
+    connect: Endpoints = Field(
+        (), validate_default=True, description="Endpoints to connect to, such as the one of a router."
+    )
+    model: str = Field("default", min_length=1, description="Active model at the start: its name, or a bundle file.")
+    models_dir: Path | None = Field(None, description="Folder of bundles that may be activated.")
     state_dir: Path | None = Field(
-        None, description="Folder of pushed models and of what is kept over a restart; by default models_dir."
+        None, description="Folder of pushed models and of the state that survives a restart; default: models_dir."
     )
     trusted_keys: Paths = Field(
-        (), description="Public keys (PEM): only models signed by one of them are pushed or activated; none: any model."
+        (),
+        description="Public keys (PEM): only models signed by one of them are accepted and activated; none: any model.",
     )
-    store_mib: int = Field(2048, ge=1, le=1 << 20, description="Most that pushed models take on the disk [MiB].")
-    queue_s: float = Field(1.0, gt=0, le=60, description="Packets that wait longer are dropped, oldest first [s].")
-    queue_mib: int = Field(64, ge=1, le=4096, description="Most bytes waiting per stream [MiB].")
-    max_streams: int = Field(16, ge=1, le=1024, description="Streams served at once; more are refused and counted.")
+    store_mib: int = Field(2048, ge=1, le=1 << 20, description="Maximum disk space of pushed models [MiB].")
+    queue_s: float = Field(
+        1.0, gt=0, le=60, description="Packets that wait longer in the queue are dropped, oldest first [s]."
+    )
+    queue_mib: int = Field(64, ge=1, le=4096, description="Maximum size of the queue of a stream [MiB].")
+    max_streams: int = Field(
+        16, ge=1, le=1024, description="Maximum number of streams; further ones are refused and counted."
+    )
     max_packet_events: int = Field(1_000_000, ge=1, le=16_000_000, description="Larger packets are refused.")
     max_side_px: int = Field(4096, ge=16, le=32768, description="Larger sensors are refused.")
-    idle_evict_s: float = Field(30.0, gt=0, le=86_400, description="A stream silent for so long is forgotten [s].")
+    idle_evict_s: float = Field(
+        30.0, gt=0, le=86_400, description="A stream without packets for this time is evicted [s]."
+    )
     status_period_s: float = Field(1.0, gt=0, le=60, description="Period of the status messages [s].")
-    ring_windows: int = Field(64, ge=1, le=1024, description="Newest windows kept per stream, to prime a new model.")
-    ring_mib: int = Field(4, ge=1, le=1024, description="Most bytes that these windows take per stream [MiB].")
+    ring_windows: int = Field(
+        64, ge=1, le=1024, description="Newest windows kept per stream, to prime a new model with."
+    )
+    ring_mib: int = Field(4, ge=1, le=1024, description="Maximum size of these windows per stream [MiB].")
     prime_s: float = Field(
-        15.0, ge=0, le=600, description="Longest that a new model waits for more windows than are kept [s]."
+        15.0, ge=0, le=600, description="Maximum wait of a new model that needs more windows than are kept [s]."
     )
     probation_s: float = Field(
-        10.0, ge=0, le=3600, description="A new model may be taken back exactly for so long [s]."
+        10.0, ge=0, le=3600, description="Probation of a new model, in which a rollback is exact [s]."
     )
     shadow_divergence: float = Field(
-        1.0, gt=0, description="Largest RMS difference to the active model in a shadow run, in its own RMS."
+        1.0,
+        gt=0,
+        description="Maximum RMS difference to the active model in shadow, divided by the active model's RMS.",
     )
     probation_divergence: float = Field(
-        3.0, gt=0, description="And on probation: beyond it a new model is taken back by itself."
+        3.0, gt=0, description="The same on probation; beyond it the node rolls back automatically."
     )
 
     @model_validator(mode="before")
@@ -131,28 +147,28 @@ class ServiceConfig(_Settings):
 
     @property
     def state_folder(self) -> Path | None:
-        """Where pushed models and the active model are kept; None: nowhere."""
+        """Folder of pushed models and of active.json; None: nothing is stored."""
         return self.state_dir or self.models_dir
 
     @property
-    def limits(self) -> Limits:
-        """Caps on event packets."""
-        return Limits(self.max_packet_events, self.max_side_px)
+    def limits(self) -> PacketLimits:
+        """Limits of event packets."""
+        return PacketLimits(self.max_packet_events, self.max_side_px)
 
 
 SettingsT = TypeVar("SettingsT", bound=_Settings)
 
 
 def load(kind: type[SettingsT], flags: dict[str, Any], file: Path | None = None) -> tuple[SettingsT, dict[str, str]]:
-    """The settings of a command, and for each field where its value came from.
+    """The settings of a command, and the source of each value.
 
     Args:
         kind: ServiceConfig or ClientConfig.
-        flags: what the command line says; None means not given.
-        file: TOML file, where given.
+        flags: values from the command line; None means not given.
+        file: TOML file, if given.
 
     Raises:
-        ConfigError: the first thing that is wrong.
+        ConfigError: for the first wrong setting.
     """
     layers = [
         (f"file {file}" if file else "file", _from_file(kind, file) if file else {}),
@@ -170,20 +186,20 @@ def load(kind: type[SettingsT], flags: dict[str, Any], file: Path | None = None)
         wrong = WrongField.of(error)
         field = str(wrong.path[0])
         raise _wrong(field, wrong.value, wrong.why, origin[field], kind) from None
-    except NeuroVEError as error:  # a name or prefix that is no key
+    except NeuroVEError as error:  # a name or prefix that is not a valid key
         field = str(error.details.get("field"))
         raise _wrong(field, values.get(field), str(error.details.get("bound")), origin.get(field, "?"), kind) from None
 
 
 def _wrong(field: str, value: object, why: str, where: str, kind: type[_Settings]) -> ConfigError:
     if field not in kind.model_fields:
-        why = f"unknown setting; known are {', '.join(sorted(kind.model_fields))}"
+        why = f"unknown setting; known settings: {', '.join(sorted(kind.model_fields))}"
     return ConfigError(f"config: {field}={value!r} (from {where}): {why}", field=field, value=repr(value), bound=why)
 
 
 def _from_file(kind: type[_Settings], file: Path) -> dict[str, Any]:
     try:
-        file.read_bytes()  # the source below passes over a missing file in silence
+        file.read_bytes()  # the source below ignores a missing file
         return TomlConfigSettingsSource(kind, file)()
     except OSError as error:
         raise ConfigError(f"config file {file}: {error.strerror}") from None

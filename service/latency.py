@@ -1,12 +1,12 @@
-"""Percentiles of latencies; apart from health.py, for a client needs them without the service's own imports."""
+"""Percentiles of latencies, in a module of its own: clients need them without the imports of the node."""
 
 import numpy as np
 
-from protocol.control import Latency
+from neurove_protocol.control import Latency
 
 
 def latency(latencies_ms: list[float]) -> Latency | None:
-    """Percentiles of some latencies, or None where there are none.
+    """Percentiles of latencies [ms]; None without latencies.
 
     >>> latency([1.0, 2.0, 3.0]).p50
     2.0

@@ -1,4 +1,4 @@
-"""How a process ends and what it tells its supervisor: signals, its parent's death, systemd's notify socket."""
+"""End of the process and messages to its supervisor: signals, death of the parent, notify socket of systemd."""
 
 import contextlib
 import os
@@ -10,7 +10,7 @@ _PARENT_CHECK_S = 0.5
 
 
 def stop_on_signals(*, with_parent: bool = False) -> threading.Event:
-    """An event that SIGINT and SIGTERM set, and the death of the parent process too where asked.
+    """An event that SIGINT and SIGTERM set; with `with_parent` also the death of the parent process.
 
     Call it on the main thread.
     """
@@ -30,7 +30,7 @@ def stop_on_signals(*, with_parent: bool = False) -> threading.Event:
 
 
 def notify(state: str) -> None:
-    """Tell systemd, where it asked for it: `READY=1`, `WATCHDOG=1`, `STOPPING=1`, `STATUS=...`."""
+    """Send a state to systemd, if it set NOTIFY_SOCKET: `READY=1`, `WATCHDOG=1`, `STOPPING=1`, `STATUS=...`."""
     address = os.environ.get("NOTIFY_SOCKET")
     if not address:
         return

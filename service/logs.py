@@ -1,4 +1,4 @@
-"""Logs to stderr at human rate: coloured lines on a terminal, one JSON object per line elsewhere."""
+"""Logs on stderr: coloured lines on a terminal, otherwise one JSON object per line."""
 
 import logging
 import sys
@@ -7,7 +7,7 @@ import structlog
 
 
 def configure(level: str = "info") -> None:
-    """Route structlog and the standard library's loggers (Zenoh's among them) to stderr."""
+    """Send the logs of structlog and of the standard library, which include Zenoh's, to stderr."""
     human = sys.stderr.isatty()
     shared: list[structlog.typing.Processor] = [
         structlog.stdlib.add_log_level,

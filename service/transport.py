@@ -1,7 +1,7 @@
-"""Zenoh, and the only file that imports it: no Zenoh type appears in a signature of another module.
+"""Transport over Zenoh. Only this module imports zenoh, and no other module has a Zenoh type in a signature.
 
-Settings and traps are those measured in eclipse-zenoh 1.10: multicast and shared memory off, explicit endpoints,
-direct callbacks that only append, every query answered, sessions always closed.
+The settings follow measurements with eclipse-zenoh 1.10: multicast and shared memory off, explicit endpoints, direct
+callbacks that only append, every query answered, every session closed.
 """
 
 import contextlib
@@ -16,9 +16,9 @@ from typing import Any, NamedTuple, Self
 
 import zenoh
 
-from protocol.control import CONTROL_SCHEMA, PROGRESS_SCHEMA, ErrorReply, PeerError
-from protocol.errors import Busy, InternalError, NeuroVEError
-from service import logs
+from neurove_protocol.control import CONTROL_SCHEMA, PROGRESS_SCHEMA, ErrorReply, PeerError
+from neurove_protocol.errors import Busy, InternalError, NeuroVEError
+from neurove_service import logs
 
 log = logs.get(__name__)
 
@@ -34,16 +34,20 @@ _RETRY_S = 0.5
 _SYSTEM_ERROR = re.compile(r"([^:\[\]]+) \(os error \d+\)")
 
 OnSample = Callable[[str, bytes, int], None]
-"""key, payload, and when it was received (monotonic ns). Runs on Zenoh's thread: it may only append and return."""
+"""Key, payload, and time of reception (monotonic) [ns]. Runs on Zenoh's thread: it must only append and return."""
 
 
 class EndpointError(NeuroVEError):
-    """A session can not be opened: an endpoint is taken, wrong, or nobody listens there."""
+    """Cannot open a session: an endpoint is in use or wrong, or no process listens there."""
 
     code = "endpoint"
 
 
-class Answered(NamedTuple):
+class Unreachable(EndpointError):
+    """No process listens at the endpoints to connect to, or one side refuses the certificate of the other."""
+
+
+class Reply(NamedTuple):
     """One reply to a query."""
 
     key: str
@@ -51,23 +55,23 @@ class Answered(NamedTuple):
     schema: str = ""  # Zenoh Encoding
 
 
-Tell = Callable[[bytes], None]
-"""Sends one more reply, ahead of the last one; nothing happens where the caller has left."""
+Report = Callable[[bytes], None]
+"""Sends a reply before the last one; does nothing if the caller has left."""
 
 
 class Publisher:
-    """Publishes one key. Events and estimates use DROP: the newest data matters, a slow peer must not hold us up."""
+    """Publishes one key. Messages are dropped on a congested link, so that a slow peer does not delay newer data."""
 
     def __init__(self, publisher: zenoh.Publisher) -> None:
         self._publisher = publisher
 
     def put(self, payload: bytes) -> None:
-        """Hand a message over; it may be dropped on the way, which the receiver sees in the sequence numbers."""
+        """Publish a message; if it is dropped, the receiver sees a gap in the sequence numbers."""
         self._publisher.put(payload)
 
     @property
     def matching(self) -> bool:
-        """Whether some subscriber is connected now."""
+        """Whether a subscriber is connected now."""
         status = self._publisher.matching_status  # an object that is always true, though its type says bool
         return bool(getattr(status, "matching", status))
 
@@ -77,12 +81,12 @@ class Publisher:
 
 
 class Transport:
-    """One Zenoh session. Use it in a `with` block, or close it: an open session keeps the process alive."""
+    """One Zenoh session. Use it in a `with` block or close it: an open session keeps the process alive."""
 
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
         self._answering: list[tuple[Any, threading.Thread]] = []
-        self._kept: list[Any] = []  # Zenoh takes back what is garbage collected
+        self._kept: list[Any] = []  # Zenoh undeclares what is garbage collected
 
     def __enter__(self) -> Self:
         return self
@@ -93,19 +97,19 @@ class Transport:
         self.close()
 
     def close(self) -> None:
-        """End everything declared on this session, and the session."""
+        """Undeclare everything and close the session."""
         for queryable, thread in self._answering:
             queryable.undeclare()
             thread.join(timeout=1)
         self._session.close()  # type: ignore[no-untyped-call]  # gap in Zenoh's stubs
 
     def publisher(self, key: str, schema: str, *, urgent: bool = False) -> Publisher:
-        """A publisher of a key whose messages carry the schema as their Encoding.
+        """Declare a publisher.
 
         Args:
             key: concrete key.
-            schema: Zenoh Encoding.
-            urgent: sent before ordinary data and never batched: for estimates.
+            schema: Zenoh Encoding of its messages.
+            urgent: for estimates: sent before ordinary data and never batched.
         """
         priority = zenoh.Priority.DATA_HIGH if urgent else zenoh.Priority.DATA
         declared = self._session.declare_publisher(
@@ -118,12 +122,12 @@ class Transport:
         return Publisher(declared)
 
     def put(self, key: str, payload: bytes, schema: str) -> None:
-        """Publish one message that must not be dropped on a busy link, such as a CameraInfo."""
+        """Publish one message that must not be dropped on a congested link, such as a CameraInfo."""
         block = zenoh.CongestionControl.BLOCK
         self._session.put(key, payload, encoding=zenoh.Encoding(schema), congestion_control=block)
 
     def subscribe(self, key: str, on_sample: OnSample) -> None:
-        """Receive every message of a key expression, for as long as the session lives."""
+        """Receive every message of a key expression until the session is closed."""
 
         def receive(sample: zenoh.Sample) -> None:
             on_sample(str(sample.key_expr), sample.payload.to_bytes(), time.monotonic_ns())
@@ -131,11 +135,11 @@ class Transport:
         self._kept.append(self._session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
 
     def answer(self, key: str, handle: Callable[[bytes], bytes], schema: str = CONTROL_SCHEMA) -> None:
-        """Answer queries of a key on a thread of their own; what `handle` raises is told to the caller.
+        """Answer the queries of a key on a separate thread; an error of `handle` goes to the caller.
 
         Args:
             key: concrete key.
-            handle: request payload to reply payload; raises NeuroVEError to refuse.
+            handle: turns the request payload into the reply payload; raises NeuroVEError to refuse.
             schema: Zenoh Encoding of the replies.
         """
 
@@ -148,19 +152,20 @@ class Transport:
     def answer_streaming(
         self,
         key: str,
-        handle: Callable[[bytes, Tell], bytes],
+        handle: Callable[[bytes, Report], bytes],
         at_once: int = 4,
         after: Callable[[], None] = lambda: None,
     ) -> None:
-        """Answer queries whose work takes time: each on its own thread, with replies on the way to the last one.
+        """Answer queries that take time: each on its own thread, with progress replies before the last reply.
 
-        A caller that leaves does not stop the work.
+        The work continues if the caller leaves.
 
         Args:
             key: concrete key.
-            handle: request payload and a way to tell progress, to the last reply's payload; raises as in `answer`.
-            at_once: with so many under way further queries are refused as busy.
-            after: called when the last reply has gone, and nothing refers to what the work has made any more.
+            handle: turns the request payload into the payload of the last reply, and reports progress; raises as in
+                `answer`.
+            at_once: maximum number of queries at once; further ones are refused as busy.
+            after: called after the last reply, when nothing refers to the objects of the work any more.
         """
         free = threading.BoundedSemaphore(at_once)
 
@@ -172,12 +177,12 @@ class Transport:
                     _refuse(query, Busy(at_once))
 
         def work_alone(query: zenoh.Query) -> None:
-            def tell(payload: bytes) -> None:
+            def report(payload: bytes) -> None:
                 _send(query, key, payload, PROGRESS_SCHEMA)
 
             with query:
                 try:
-                    _reply(query, key, lambda request: handle(request, tell), CONTROL_SCHEMA)
+                    _reply(query, key, lambda request: handle(request, report), CONTROL_SCHEMA)
                 finally:
                     free.release()
             after()
@@ -195,66 +200,72 @@ class Transport:
         thread.start()
         self._answering.append((queryable, thread))
 
-    def ask(self, key: str, request: bytes, timeout_s: float, *, bulk: bool = False) -> list[Answered]:
-        """Query a key expression and wait for everybody's reply.
+    def ask(self, key: str, request: bytes, timeout_s: float, *, bulk: bool = False) -> list[Reply]:
+        """Query a key expression and wait for all replies.
 
         Args:
             key: key expression.
             request: payload of the query.
-            timeout_s: later replies are not waited for.
-            bulk: the reply is large and in no hurry: it takes the query's priority, after all other data.
+            timeout_s: replies after this time are ignored [s].
+            bulk: the reply is large and not urgent: query and reply have a lower priority than all other data.
 
         Returns:
-            replies, in the order they came; empty where nobody answers the key or nobody did in time.
+            replies in order of arrival; empty if no peer answered in time.
 
         Raises:
-            PeerError: a peer refused, with its own code and reason.
+            PeerError: a peer refused; it has the code and the reason of the peer.
         """
         priority = zenoh.Priority.DATA_LOW if bulk else zenoh.Priority.DATA
-        return list(self._ask(key, request, timeout_s, priority, zenoh.ConsolidationMode.AUTO))
+        return list(_query(self._session, key, request, timeout_s, priority, zenoh.ConsolidationMode.AUTO))
 
-    def ask_streaming(self, key: str, request: bytes, timeout_s: float) -> Iterator[Answered]:
-        """Query one node and hear every reply as it comes; those of PROGRESS_SCHEMA are not the last one.
+    def ask_streaming(self, key: str, request: bytes, timeout_s: float) -> Iterator[Reply]:
+        """Query one node and yield every reply as it arrives; replies with PROGRESS_SCHEMA precede the last one.
 
         Raises:
             PeerError: as ask.
         """
-        return self._ask(key, request, timeout_s, zenoh.Priority.DATA, zenoh.ConsolidationMode.NONE)
-
-    def _ask(
-        self, key: str, request: bytes, timeout_s: float, priority: zenoh.Priority, mode: zenoh.ConsolidationMode
-    ) -> Iterator[Answered]:
-        channel: Any = zenoh.handlers.FifoChannel(64)
-        replies = self._session.get(
-            key,
-            channel,
-            payload=request,
-            timeout=timeout_s,
-            priority=priority,
-            consolidation=mode,
-            congestion_control=zenoh.CongestionControl.BLOCK,
-        )
-        for reply in replies:
-            if reply.ok is not None:
-                yield Answered(str(reply.ok.key_expr), reply.ok.payload.to_bytes(), str(reply.ok.encoding))
-            elif reply.err is not None and reply.err.payload.to_bytes() != b"Timeout":
-                raise PeerError(ErrorReply.decode(reply.err.payload.to_bytes()))
+        return _query(self._session, key, request, timeout_s, zenoh.Priority.DATA, zenoh.ConsolidationMode.NONE)
 
     def token(self, key: str) -> Callable[[], None]:
-        """Declare a liveliness token; call the result to take it back."""
+        """Declare a liveliness token; call the result to undeclare it."""
         token = self._session.liveliness().declare_token(key)
         self._kept.append(token)
 
-        def take_back() -> None:
+        def undeclare() -> None:
             self._kept.remove(token)
             token.undeclare()  # type: ignore[no-untyped-call]  # gap in Zenoh's stubs
 
-        return take_back
+        return undeclare
 
     def tokens(self, key: str, timeout_s: float) -> list[str]:
-        """The liveliness tokens that exist now under a key expression."""
+        """The present liveliness tokens of a key expression."""
         replies = self._session.liveliness().get(key, timeout=timeout_s)
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+
+
+def _query(
+    session: zenoh.Session,
+    key: str,
+    request: bytes,
+    timeout_s: float,
+    priority: zenoh.Priority,
+    mode: zenoh.ConsolidationMode,
+) -> Iterator[Reply]:
+    channel: Any = zenoh.handlers.FifoChannel(64)
+    replies = session.get(
+        key,
+        channel,
+        payload=request,
+        timeout=timeout_s,
+        priority=priority,
+        consolidation=mode,
+        congestion_control=zenoh.CongestionControl.BLOCK,
+    )
+    for reply in replies:
+        if reply.ok is not None:
+            yield Reply(str(reply.ok.key_expr), reply.ok.payload.to_bytes(), str(reply.ok.encoding))
+        elif reply.err is not None and reply.err.payload.to_bytes() != b"Timeout":  # Zenoh has no code for it
+            raise PeerError(ErrorReply.decode(reply.err.payload.to_bytes()))
 
 
 def _reply(query: zenoh.Query, key: str, handle: Callable[[bytes], bytes], schema: str) -> None:
@@ -262,7 +273,7 @@ def _reply(query: zenoh.Query, key: str, handle: Callable[[bytes], bytes], schem
         answer = handle(query.payload.to_bytes() if query.payload else b"")
     except NeuroVEError as error:
         return _refuse(query, error)
-    except Exception:  # a bug must not end the loop; the caller still gets an answer
+    except Exception:  # a bug must not end the loop; the caller still gets a reply
         log.exception("handler failed", key=key)
         return _refuse(query, InternalError())
     return _send(query, key, answer, schema)
@@ -293,12 +304,13 @@ def open_transport(
         mode: `peer`, `client` or `router`.
         listen: endpoints to listen on.
         connect: endpoints to connect to; in client mode one of them must answer.
-        config_file: Zenoh configuration (JSON5) to start from.
-        patience_s: how long a client keeps trying where nobody listens yet.
-        stop: ends the trying early.
+        config_file: Zenoh configuration (JSON5) that these settings are added to.
+        patience_s: how long a client retries while no process listens [s].
+        stop: ends the retries early.
 
     Raises:
-        EndpointError: after that time, or at once where waiting can not help.
+        Unreachable: no process listened for that time.
+        EndpointError: the session cannot be opened, and a retry cannot help.
     """
     config = _session_config(mode, listen, connect, config_file)
     stop = stop or threading.Event()
@@ -308,12 +320,12 @@ def open_transport(
         try:
             return Transport(zenoh.open(config))
         except zenoh.ZError as error:
-            if not str(error).startswith("Unable to connect"):
+            if not str(error).startswith("Unable to connect"):  # Zenoh has one error class and no codes
                 raise EndpointError(
-                    f"can not open a Zenoh session: {_where(listen, connect)}: {_reason(error)}"
+                    f"cannot open a Zenoh session: {_where(listen, connect)}: {_reason(error)}"
                 ) from None
         if time.monotonic() >= deadline or stop.is_set():
-            raise EndpointError(_unreached(connect))
+            raise Unreachable(_unreached(connect))
         if not waiting:
             log.info("waiting for a router", connect=", ".join(connect), why=_unreached(connect))
             waiting = True
@@ -334,7 +346,7 @@ def _session_config(
             config.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
         where = f"zenoh_config={config_file}" if config_file else _where(listen, connect)
-        raise EndpointError(f"can not configure Zenoh: {where}: {_reason(error)}") from None
+        raise EndpointError(f"cannot configure Zenoh: {where}: {_reason(error)}") from None
     return config
 
 
@@ -344,13 +356,13 @@ def _where(listen: tuple[str, ...], connect: tuple[str, ...]) -> str:
 
 
 def _unreached(connect: tuple[str, ...]) -> str:
-    """Why no connection came about, as far as Zenoh tells: a closed port and a refused certificate look the same."""
+    """Why there is no connection; Zenoh reports a closed port and a refused certificate in the same way."""
     secured = any(endpoint.startswith(("tls/", "quic/")) for endpoint in connect)
     refused = ", or one side refuses the other's certificate (zenoh_config)" if secured else ""
-    return f"nobody listens at {', '.join(connect)}{refused}"
+    return f"no process listens at {', '.join(connect)}{refused}"
 
 
 def _reason(error: zenoh.ZError) -> str:
-    """What Zenoh says, without the places in its own source, or the system's own word where that is the reason."""
+    """The error of the operating system if there is one, or Zenoh's text without its source locations."""
     system = _SYSTEM_ERROR.search(str(error))
     return system[1].strip() if system else str(error).split(" at /", maxsplit=1)[0].removesuffix(".")

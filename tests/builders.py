@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from protocol import EventPacket, Events, Sensor
+from neurove_protocol import EventPacket, Events, Sensor
 
 SENSOR = Sensor(64, 48)
 

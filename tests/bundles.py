@@ -1,4 +1,4 @@
-"""A small bundle, and its bytes taken apart, edited and put together again."""
+"""A small bundle, and helpers that split, edit and join its bytes."""
 
 import json
 import struct
@@ -9,10 +9,10 @@ import pytest
 import safetensors.torch
 import torch
 
-from neurove_core import bundle
-from neurove_core.bundle import Bundle
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from protocol.errors import BadModel
+from neurove_core.models import bundle
+from neurove_core.models.bundle import Bundle
+from neurove_protocol.errors import BadModel
 
 CONFIG = ModelConfig(
     window=WindowConfig(duration_us=10_000, bins=2),
@@ -29,40 +29,42 @@ ORIGINAL = make_bundle()
 DATA = ORIGINAL.to_bytes()
 
 
-def packed(header: bytes, data: bytes = b"") -> bytes:
+def join_header(header: bytes, data: bytes = b"") -> bytes:
+    """The bytes of a safetensors file with this header and this tensor data."""
     return struct.pack("<Q", len(header)) + header + data
 
 
-def unpacked(data: bytes = DATA) -> tuple[dict[str, Any], bytes]:
+def split_header(data: bytes = DATA) -> tuple[dict[str, Any], bytes]:
+    """The header and the tensor data of a safetensors file."""
     (length,) = struct.unpack("<Q", data[:8])
     return json.loads(data[8 : 8 + length]), data[8 + length :]
 
 
 def with_entries(edit: Callable[[dict[str, Any]], object], data: bytes = DATA) -> bytes:
     """The bundle's bytes with its safetensors header edited."""
-    entries, tensors = unpacked(data)
+    entries, tensors = split_header(data)
     edit(entries)
-    return packed(json.dumps(entries).encode(), tensors)
+    return join_header(json.dumps(entries).encode(), tensors)
 
 
 def with_fields(edit: Callable[[dict[str, Any]], object], data: bytes = DATA) -> bytes:
     """The bundle's bytes with its own header, inside that of safetensors, edited."""
-    entries, tensors = unpacked(data)
+    entries, tensors = split_header(data)
     fields = json.loads(entries["__metadata__"]["neurove"])
     edit(fields)
     entries["__metadata__"]["neurove"] = json.dumps(fields)
-    return packed(json.dumps(entries).encode(), tensors)
+    return join_header(json.dumps(entries).encode(), tensors)
 
 
 def with_tensors(edit: Callable[[dict[str, torch.Tensor]], object], data: bytes = DATA) -> bytes:
     """The bundle's bytes with its tensors edited."""
     tensors = safetensors.torch.load(data)
     edit(tensors)
-    return safetensors.torch.save(tensors, unpacked(data)[0]["__metadata__"])
+    return safetensors.torch.save(tensors, split_header(data)[0]["__metadata__"])
 
 
 def refusal(data: bytes) -> str:
-    """The sentence that refuses these bytes."""
+    """The message that refuses these bytes."""
     with pytest.raises(BadModel) as refused:
         bundle.from_bytes(data, "some.safetensors")
     assert refused.value.code == "bad_model"

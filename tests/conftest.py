@@ -1,4 +1,4 @@
-"""One thread and bounded property tests: a run depends neither on cores nor, in CI, on chance. How commands are run."""
+"""One thread and bounded property tests, so that a run depends neither on cores nor, in CI, on randomness; fixtures."""
 
 import logging
 import os
@@ -10,15 +10,15 @@ import structlog
 import torch
 from hypothesis import settings
 
-from service import cli
+from neurove_service.cli import main
 
 torch.set_num_threads(1)
 
 
 def pytest_collection_modifyitems(items):
-    """For `--dist loadgroup`: a file stays together, for its fixtures; live tests stay in one process, one by one.
+    """For `--dist loadgroup`: tests of a file stay together; live tests run one by one in one process.
 
-    They come first, because they take longest and mostly wait.
+    Live tests come first, because they take longest and mostly wait.
     """
     for item in items:
         group = "live" if item.get_closest_marker("live") else str(item.path)
@@ -60,7 +60,7 @@ def run(capsys, logging_as_before, signals_as_before):
     """Runs one command in this process: its exit code, output and errors."""
 
     def call(*arguments):
-        code = cli.main([str(argument) for argument in arguments])
+        code = main.main([str(argument) for argument in arguments])
         return Ran(code, *capsys.readouterr())
 
     return call

@@ -8,10 +8,12 @@ import hdf5plugin
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core import rotations
-from neurove_core.geometry import Poses
-from neurove_core.io import Imu, open_source, write_dsec
-from protocol import Events
+from neurove_core.geometry import rotations
+from neurove_core.geometry.motion import Poses
+from neurove_core.io import Imu
+from neurove_core.io.formats.hdf5.dsec_write import write_dsec
+from neurove_core.sources import open_source
+from neurove_protocol import Events
 from tests.builders import SENSOR, make_events
 
 DAY_US = 1_506_117_902_000_000

@@ -10,8 +10,8 @@ import pytest
 
 from neurove_core.io import BrokenRecording, Imu, Recording, Triggers
 from neurove_core.io.recording import CHUNK_EVENTS
-from protocol import Events, Sensor
-from protocol.events import check_events
+from neurove_protocol import Events, Sensor
+from neurove_protocol.events import check_events
 
 SHARED = Path(__file__).resolve().parents[1].parent / "shared/data"
 

@@ -10,7 +10,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from protocol import Events, Sensor
+from neurove_protocol import Events, Sensor
 from tests.builders import SENSOR
 
 PACKET, DVS, IMU = "event_camera_msgs/msg/EventPacket", "dvs_msgs/msg/EventArray", "sensor_msgs/msg/Imu"

@@ -1,4 +1,8 @@
-"""Who may import whom (STYLE section 2), read from the sources: the offending line is named."""
+"""Who may import whom, read from the sources: a table of rooms, no circle, nothing upwards, and bounded sizes.
+
+A room is a folder of a package, or a file that lies directly in a package. `MAY_IMPORT` says what a room may import;
+every room may import `neurove_protocol` and what is installed, except for what `FOREIGN` restricts.
+"""
 
 import ast
 import sys
@@ -9,43 +13,76 @@ from typing import NamedTuple
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PRODUCT = ("protocol", "neurove_core", "service")
-OF_PROTOCOL = {
-    *sys.stdlib_module_names,
-    "numpy",
-    "msgpack",
-    "pydantic",
-    "pydantic_core",
-    "protocol",
-}  # core: pydantic's
-APART = ("neurove_core.training", "neurove_core.experiments")
+FOLDERS = {"protocol": "neurove_protocol", "neurove_core": "neurove_core", "service": "neurove_service"}
+OF_PROTOCOL = {*sys.stdlib_module_names, "numpy", "msgpack", "pydantic", "pydantic_core", "neurove_protocol"}
+MAX_LEVELS = 12
+MAX_LINES, MAX_CLASS_LINES = 450, 200
+COMPILED_KERNELS = {
+    "neurove_core/engine/sparse.py",
+    "neurove_core/engine/sparse_int8.py",
+    "neurove_core/engine/vectors.py",
+}
+
+_FILES = "config compiled files figures extras"
+_READ = f"{_FILES} geometry io io.formats sources"
+_MODEL = f"{_FILES} spiking networks models geometry ingest engine estimator self_test"
+MAY_IMPORT = {
+    # neurove_core, from below
+    "neurove_core.config": "",
+    "neurove_core.compiled": "",
+    "neurove_core.files": "",
+    "neurove_core.extras": "",
+    "neurove_core.figures": "extras files",
+    "neurove_core.geometry": "config",
+    "neurove_core.spiking": "compiled extras",
+    "neurove_core.ingest": "config compiled geometry",
+    "neurove_core.networks": "config compiled spiking",
+    "neurove_core.engine": "config compiled spiking networks",
+    "neurove_core.models": "config files extras spiking networks",
+    "neurove_core.estimator": "config geometry ingest networks engine models io",
+    "neurove_core.self_test": "config models estimator",
+    "neurove_core.io": "files figures extras compiled geometry",
+    "neurove_core.io.formats": "files extras compiled geometry io",
+    "neurove_core.sim": f"{_FILES} geometry io io.formats",
+    "neurove_core.sources": "extras io io.formats sim",
+    "neurove_core.evaluation": f"{_READ} networks models estimator",
+    "neurove_core.training": f"{_READ} {_MODEL} sim evaluation",
+    "neurove_core.bench": f"{_READ} {_MODEL} sim",
+    "neurove_core.experiments": f"{_READ} {_MODEL} sim evaluation training",
+    "neurove_core": "estimator models sources spiking",
+    # neurove_service
+    "neurove_service.logs": "",
+    "neurove_service.lifecycle": "",
+    "neurove_service.latency": "",
+    "neurove_service.config": "",
+    "neurove_service.transport": "logs",
+    "neurove_service.streams": "logs core:estimator core:ingest core:models core:networks",
+    "neurove_service.models": "logs streams core:files core:models core:estimator core:self_test core:ingest",
+    "neurove_service.clients": (
+        "logs config transport core:io core:io.formats core:bench core:config core:geometry core:ingest"
+    ),
+    "neurove_service.node": "logs config lifecycle latency transport streams models core:models",
+    "neurove_service": "",
+    "neurove_service.cli": "*",
+    "neurove_protocol": "",
+}
 
 
 class Import(NamedTuple):
-    """One name that a module imports, such as `neurove_core.bundle.load`."""
+    """One name that a module imports, such as `neurove_core.models.bundle.load`."""
 
     line: int
     name: str
-    lazy: bool  # inside a function: it costs nothing until it is called
 
     def of(self, *packages: str) -> bool:
         return any(self.name == package or self.name.startswith(package + ".") for package in packages)
 
 
 def imports_of(source: str, package: str) -> Iterator[Import]:
-    """Every import of a module, wherever in it, relative ones made absolute.
-
-    Args:
-        source: of the module.
-        package: that the module lies in, with dots.
-    """
-    pending: list[tuple[ast.AST, bool]] = [(ast.parse(source), False)]
-    while pending:
-        node, lazy = pending.pop()
+    """Every import of a module, wherever in it, relative ones made absolute; `package` is what the module lies in."""
+    for node in ast.walk(ast.parse(source)):
         for name in names_of(node, package):
-            yield Import(getattr(node, "lineno", 0), name, lazy)
-        inside = lazy or isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
-        pending += [(child, inside) for child in ast.iter_child_nodes(node)]
+            yield Import(getattr(node, "lineno", 0), name)
 
 
 def names_of(node: ast.AST, package: str) -> list[str]:
@@ -63,52 +100,139 @@ def names_of(node: ast.AST, package: str) -> list[str]:
     return []
 
 
+def dotted(path: Path) -> str:
+    """The name of the module at a path relative to the root; a package is named as its folder."""
+    parts = [FOLDERS.get(path.parts[0], path.parts[0]), *path.with_suffix("").parts[1:]]
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def room_of(name: str) -> str | None:
+    """The room that a dotted name lies in: the longest entry of the table that begins it."""
+    rooms = [room for room in MAY_IMPORT if name == room or name.startswith(room + ".")]
+    return max(rooms, key=len, default=None)
+
+
+def allowed(room: str) -> set[str]:
+    top = room.partition(".")[0]
+    full = {"core": "neurove_core"}
+    names = (entry.rpartition(":")[::2] for entry in MAY_IMPORT[room].split())
+    return {room, "neurove_protocol", *(f"{full.get(prefix, top)}.{name}" for prefix, name in names)}
+
+
 def why_not(path: Path, found: Import) -> str | None:
     """Why the module at `path` (relative to the root) may not import this; None if it may."""
-    package, module = path.parts[0], Import(0, ".".join(path.with_suffix("").parts), lazy=False)
-    if package == "tests":
+    top = path.parts[0]
+    if top == "tests":
         private = any(part.startswith("_") and not part.endswith("__") for part in found.name.split("."))
-        return "tests use no private names" if private and found.of(*PRODUCT) else None
+        return "tests use no private names" if private and found.of(*FOLDERS.values()) else None
     if found.of("tests"):
         return "nothing imports tests"
-    if package == "protocol":
-        allowed = found.name.split(".")[0] in OF_PROTOCOL
-        return None if allowed else "protocol imports the standard library, numpy, msgpack and pydantic alone"
-    if package == "neurove_core":
-        if found.of("zenoh", "service"):
-            return "neurove_core knows no network and no service"
-        if found.of(*APART) and not module.of(*APART):
-            return "training and experiments are imported from inside themselves alone"
+    if found.of("protocol", "service"):
+        return "the packages are named neurove_protocol and neurove_service"
+    if top == "protocol":
+        if found.name.split(".")[0] not in OF_PROTOCOL:
+            return "protocol imports the standard library, numpy, msgpack and pydantic alone"
         return None
-    if found.lazy and (module.name == "service.cli" or module.name.startswith("service.commands_")):
+    if found.of("zenoh") and path.as_posix() != "service/transport.py":
+        return "zenoh is imported in service/transport.py alone"
+    if not found.of(*FOLDERS.values()):
         return None
-    if found.of("zenoh") and module.name != "service.transport":
-        return "service imports zenoh in transport.py alone"
-    if found.of(*APART):
-        return "service imports neither training nor experiments; cli.py and its commands may, inside their functions"
-    return None
+    room, other = room_of(dotted(path)), room_of(found.name)
+    assert room is not None
+    if found.of("neurove_service.cli") and room != "neurove_service.cli":
+        return "nothing imports the command line"
+    if other in (None, room) or MAY_IMPORT[room] == "*":
+        return None
+    if any(part.startswith("_") for part in found.name.split(".")):
+        return "private names stay in their room"
+    return None if other in allowed(room) else f"{room} may not import {other}"
+
+
+def modules(root: Path) -> dict[str, Path]:
+    """Every module of the three packages below a root, by its dotted name; paths relative to the root."""
+    paths = [path.relative_to(root) for folder in FOLDERS for path in sorted((root / folder).rglob("*.py"))]
+    return {dotted(path): path for path in paths}
 
 
 def offences(root: Path) -> list[str]:
-    """`path:line: who may not import what, and why` for every wrong import below a root."""
+    """`path:line: may not import what: why` for every wrong import below a root."""
+    tests = [path.relative_to(root) for path in sorted((root / "tests").rglob("*.py"))]
     return [
-        f"{path.relative_to(root).as_posix()}:{one.line}: may not import {one.name}: {reason}"
-        for package in (*PRODUCT, "tests")
-        for path in sorted((root / package).rglob("*.py"))
-        for one in imports_of(path.read_text(), ".".join(path.relative_to(root).parent.parts))
-        if (reason := why_not(path.relative_to(root), one))
+        f"{path.as_posix()}:{one.line}: may not import {one.name}: {reason}"
+        for path in (*modules(root).values(), *tests)
+        for one in imports_of((root / path).read_text(), dotted(path.parent))
+        if (reason := why_not(path, one))
     ]
 
 
-def test_every_module_imports_only_what_its_layer_may():
+def arrows(root: Path, *, of_rooms: bool) -> dict[str, set[str]]:
+    """Who imports whom, by module or by room."""
+    known = modules(root)
+    found: dict[str, set[str]] = {}
+    for name, path in known.items():
+        source = (room_of(name) or name) if of_rooms else name
+        into = found.setdefault(source, set())
+        for one in imports_of((root / path).read_text(), dotted(path.parent)):
+            module = one.name if one.name in known else one.name.rpartition(".")[0]
+            if module in known:
+                into.add((room_of(module) or module) if of_rooms else module)
+    return {source: {other for other in into if other != source} for source, into in found.items()}
+
+
+def levels(graph: dict[str, set[str]]) -> dict[str, int]:
+    """How many steps down each node reaches; a circle raises with its names."""
+    depth: dict[str, int] = {}
+
+    def visit(node: str, above: tuple[str, ...]) -> int:
+        if node in above:
+            raise AssertionError("import circle: " + " -> ".join((*above[above.index(node) :], node)))
+        if node not in depth:
+            depth[node] = 1 + max((visit(other, (*above, node)) for other in sorted(graph.get(node, ()))), default=0)
+        return depth[node]
+
+    for node in sorted(graph):
+        visit(node, ())
+    return depth
+
+
+def test_every_module_imports_only_what_its_room_may():
     assert offences(ROOT) == []
 
 
-def test_the_check_sees_the_whole_tree():
-    seen = {path.parent.name for package in PRODUCT for path in (ROOT / package).rglob("*.py")}
-    assert {"protocol", "neurove_core", "service"} <= seen
-    bundle = (ROOT / "neurove_core" / "bundle.py").read_text()
-    assert {"torch", "neurove_core.networks.Network"} <= {one.name for one in imports_of(bundle, "neurove_core")}
+def test_the_table_names_rooms_that_exist_and_every_module_has_one():
+    known = modules(ROOT)
+    assert {room_of(name) for name in known} == set(MAY_IMPORT)
+    mentioned = {other for room in MAY_IMPORT if MAY_IMPORT[room] != "*" for other in allowed(room)}
+    assert mentioned <= set(MAY_IMPORT)
+
+
+def test_no_circle_of_modules():
+    assert max(levels(arrows(ROOT, of_rooms=False)).values()) > 1
+
+
+def test_no_circle_of_rooms_and_few_levels():
+    depth = levels(arrows(ROOT, of_rooms=True))
+    assert 1 < max(depth.values()) <= MAX_LEVELS
+
+
+def test_a_planted_circle_is_found():
+    with pytest.raises(AssertionError, match="import circle: b -> c -> b"):
+        levels({"a": {"b"}, "b": {"c"}, "c": {"b"}})
+
+
+def test_no_module_and_no_class_is_two_things():
+    long = []
+    for path in modules(ROOT).values():
+        source = (ROOT / path).read_text()
+        lines = source.count("\n")
+        if lines > MAX_LINES and path.as_posix() not in COMPILED_KERNELS:
+            long.append(f"{path}: {lines} lines, at most {MAX_LINES}")
+        long += [
+            f"{path}: class {node.name} has {size} lines, at most {MAX_CLASS_LINES}"
+            for node in ast.walk(ast.parse(source))
+            if isinstance(node, ast.ClassDef) and (size := (node.end_lineno or 0) - node.lineno + 1) > MAX_CLASS_LINES
+        ]
+    assert long == []
 
 
 @pytest.mark.parametrize(
@@ -116,34 +240,48 @@ def test_the_check_sees_the_whole_tree():
     [
         ("protocol/a.py", "import torch", "torch"),
         ("protocol/a.py", "import zenoh", "zenoh"),
-        ("protocol/a.py", "from torch.nn import Module", "torch.nn.Module"),
-        ("protocol/a.py", "from neurove_core import bundle", "neurove_core.bundle"),
-        ("protocol/deep/er.py", "from service import stream", "service.stream"),
+        ("protocol/a.py", "from neurove_core import models", "neurove_core.models"),
+        ("protocol/deep/er.py", "from neurove_service import streams", "neurove_service.streams"),
         ("protocol/a.py", "def f():\n    import torch  # here", "torch"),
         ("protocol/a.py", "if TYPE_CHECKING:\n    import torch  # here", "torch"),
         ("protocol/a.py", "try:\n    import scipy  # here\nexcept ImportError:\n    pass", "scipy"),
         ("protocol/a.py", "x = __import__('torch')", "torch"),
         ("protocol/a.py", "x = importlib.import_module('torch.nn')", "torch.nn"),
         ("protocol/a.py", "from tests import builders", "tests.builders"),
-        ("neurove_core/a.py", "import zenoh as z", "zenoh"),
-        ("neurove_core/io/a.py", "from zenoh import Session", "zenoh.Session"),
-        ("neurove_core/a.py", "from service.stream import Stream", "service.stream.Stream"),
-        ("neurove_core/a.py", "from neurove_core import training", "neurove_core.training"),
-        ("neurove_core/a.py", "from . import experiments", "neurove_core.experiments"),
-        ("neurove_core/io/a.py", "from ..training import loop", "neurove_core.training.loop"),
-        ("neurove_core/a.py", "from .training.loop import fit", "neurove_core.training.loop.fit"),
-        ("neurove_core/trainings.py", "import neurove_core.experiments.sine", "neurove_core.experiments.sine"),
-        ("service/app.py", "import zenoh", "zenoh"),
-        ("service/app.py", "def f():\n    from zenoh import Config  # here", "zenoh.Config"),
+        ("service/node/app.py", "from protocol import Events", "protocol.Events"),
+        ("neurove_core/geometry/a.py", "import zenoh as z", "zenoh"),
+        ("neurove_core/spiking/a.py", "from neurove_core.engine import cells", "neurove_core.engine.cells"),
+        ("neurove_core/spiking/a.py", "from neurove_core.ingest import wire", "neurove_core.ingest.wire"),
+        ("neurove_core/spiking/fused/a.py", "from neurove_core.io import errors", "neurove_core.io.errors"),
+        ("neurove_core/spiking/a.py", "from neurove_core import geometry", "neurove_core.geometry"),
+        ("neurove_core/networks/a.py", "from ..engine import engine", "neurove_core.engine.engine"),
+        ("neurove_core/io/a.py", "from neurove_core.sim import simulate", "neurove_core.sim.simulate"),
+        ("neurove_core/io/a.py", "from neurove_core.io.formats import ecd", "neurove_core.io.formats.ecd"),
+        ("neurove_core/io/formats/a.py", "from neurove_core import sources", "neurove_core.sources"),
+        (
+            "neurove_core/models/a.py",
+            "from neurove_core.estimator import Estimator",
+            "neurove_core.estimator.Estimator",
+        ),
+        ("neurove_core/estimator.py", "from neurove_core.training.loop import fit", "neurove_core.training.loop.fit"),
+        ("neurove_core/training/a.py", "from . import curve, _curve", "neurove_core.training._curve"),
+        ("neurove_core/training/a.py", "import neurove_core.experiments.sine", "neurove_core.experiments.sine"),
+        ("neurove_core/config.py", "from neurove_service.config import load", "neurove_service.config.load"),
+        ("service/node/app.py", "import zenoh", "zenoh"),
+        ("service/node/app.py", "def f():\n    from zenoh import Config  # here", "zenoh.Config"),
         ("service/dashboard/transport.py", "import zenoh", "zenoh"),
-        ("service/app.py", "from neurove_core.training import loop", "neurove_core.training.loop"),
-        ("service/transport.py", "def f():\n    import neurove_core.experiments  # here", "neurove_core.experiments"),
-        ("service/cli.py", "import zenoh", "zenoh"),
-        ("service/commands_asking.py", "import zenoh", "zenoh"),
-        ("service/commands/asking.py", "def f():\n    import zenoh  # here", "zenoh"),
-        ("service/cli.py", "class A:\n    from neurove_core import training  # here", "neurove_core.training"),
-        ("tests/service/test_a.py", "from service.stream import _Sequence", "service.stream._Sequence"),
-        ("tests/test_a.py", "import protocol._private", "protocol._private"),
+        ("service/node/app.py", "from neurove_core.training import loop", "neurove_core.training.loop"),
+        ("service/node/app.py", "from neurove_service.cli import main", "neurove_service.cli.main"),
+        ("service/streams/a.py", "from neurove_service.models import slot", "neurove_service.models.slot"),
+        ("service/models/a.py", "from neurove_service.node import app", "neurove_service.node.app"),
+        ("service/clients/a.py", "def f():\n    import neurove_core.training  # here", "neurove_core.training"),
+        ("service/cli/main.py", "import zenoh", "zenoh"),
+        (
+            "tests/service/test_a.py",
+            "from neurove_service.streams.stream import _x",
+            "neurove_service.streams.stream._x",
+        ),
+        ("tests/test_a.py", "import neurove_protocol._private", "neurove_protocol._private"),
     ],
 )
 def test_a_planted_violation_is_caught_with_its_file_and_line(tmp_path, path, line, name):
@@ -152,6 +290,9 @@ def test_a_planted_violation_is_caught_with_its_file_and_line(tmp_path, path, li
     source = f"import json\n\n{line if 'here' in line else line + '  # here'}\n"
     file.write_text(source)
     number = next(i for i, text in enumerate(source.splitlines(), 1) if text.endswith("# here"))
+    if "_curve" in name:  # inside a room private modules are its own
+        assert offences(tmp_path) == []
+        return
     (caught,) = offences(tmp_path)
     assert caught.startswith(f"{path}:{number}: may not import {name}: ")
 
@@ -159,20 +300,25 @@ def test_a_planted_violation_is_caught_with_its_file_and_line(tmp_path, path, li
 @pytest.mark.parametrize(
     ("path", "line"),
     [
-        ("protocol/a.py", "import json, numpy as np, msgpack, pydantic\nfrom protocol.errors import NeuroVEError"),
+        (
+            "protocol/a.py",
+            "import json, numpy as np, msgpack, pydantic\nfrom neurove_protocol.errors import NeuroVEError",
+        ),
         ("protocol/a.py", "from . import errors\nfrom .errors import shown"),
-        ("neurove_core/a.py", "import torch, numba\nfrom protocol import Events\nfrom neurove_core.bundle import _x"),
+        ("neurove_core/estimator.py", "import torch, numba\nfrom neurove_protocol import Events"),
         ("neurove_core/training/loop.py", "from neurove_core.training import dataset\nfrom . import dataset as d"),
-        ("neurove_core/experiments/sine.py", "from neurove_core.training import loop"),
-        ("service/transport.py", "import zenoh\nfrom protocol import Twist"),
-        ("service/app.py", "from neurove_core.estimator import Estimator\nfrom service.transport import Transport"),
-        ("service/commands_experiments.py", "def train():\n    from neurove_core.training import loop"),
-        ("service/cli.py", "def train():\n    import zenoh\n    from neurove_core.training import loop"),
-        ("tests/live/test_a.py", "import zenoh, torch, service.cli\nfrom neurove_core.training import loop"),
-        ("tests/test_a.py", "from __future__ import annotations\nfrom protocol import __doc__\nimport _pytest"),
+        ("neurove_core/experiments/sine/a.py", "from neurove_core.training import loop"),
+        ("service/transport.py", "import zenoh\nfrom neurove_protocol import Twist"),
+        ("service/node/app.py", "from neurove_service.models.slot import ModelSlot"),
+        ("service/cli/experiments.py", "def train():\n    from neurove_core.training import loop"),
+        (
+            "tests/live/test_a.py",
+            "import zenoh, torch, neurove_service.cli.main\nfrom neurove_core.training import loop",
+        ),
+        ("tests/test_a.py", "from __future__ import annotations\nfrom neurove_protocol import __doc__\nimport _pytest"),
     ],
 )
-def test_what_a_layer_may_import_is_not_caught(tmp_path, path, line):
+def test_what_a_room_may_import_is_not_caught(tmp_path, path, line):
     file = tmp_path / path
     file.parent.mkdir(parents=True)
     file.write_text(line + "\n")

@@ -1,17 +1,18 @@
 #!/bin/sh
-# A small certificate authority: one key and certificate for every participant of a deployment. Needs openssl 1.1.1 or
-# later. See README.md, Who may.
+# A small certificate authority: makes a key and a certificate for every participant of a deployment. Needs openssl
+# 1.1.1 or later. See README.md, Access control.
 #
 #   sh make-ca.sh DIR ROLE-NAME[=HOST,...] ...
 #
 #   ROLE  router, node, driver, consumer, recorder or operator
-#   NAME  of the node (its `node` setting), of the driver's stream, of the person or program
-#   HOST  names and addresses that others connect to: for a router, and for a node that listens itself
+#   NAME  name of the node (its `node` setting), of the driver's stream, of the person or of the program
+#   HOST  host names and addresses to which others connect: for a router, and for a node that listens itself
 #
 #   sh make-ca.sh pki router-box=192.168.7.1 node-edge1 driver-cam0 consumer-planner operator-alice
 #
-# What is there is never written over, so the same line with a name more makes that name alone. Days of validity: DAYS
-# (730) and CA_DAYS (3650). Whoever has DIR/ca.key can make an operator: keep DIR off the robots.
+# Existing files are never overwritten, so the same command with one more name makes only the files of that name. The
+# environment variables DAYS (730) and CA_DAYS (3650) set the days of validity. Anyone who has DIR/ca.key can make an
+# operator certificate: do not keep DIR on a robot.
 set -eu
 umask 077
 
@@ -27,7 +28,7 @@ refuse() {
     exit 2
 }
 
-# Zenoh looks for HOST among these names, as address or as DNS name.
+# Zenoh searches for HOST in these names, as an address or as a DNS name.
 names_of() {
     echo "$1" | tr ',' '\n' | while read -r host; do
         case $host in
@@ -38,15 +39,15 @@ names_of() {
     done | paste -sd, -
 }
 
-# All names are looked at before anything is made.
+# Check all names before any file is made.
 for one in "$@"; do
     name=${one%%=*}
     echo "$name" | grep -Eq '^(router|node|driver|consumer|recorder|operator)-[A-Za-z0-9_][A-Za-z0-9_.-]{0,51}$' ||
         refuse "'$name': give ROLE-NAME (router, node, driver, consumer, recorder, operator; a name of up to 52 characters), such as node-edge1"
     case $one in
         *=*) echo "${one#*=}" | grep -Eq '^[A-Za-z0-9.:-]+(,[A-Za-z0-9.:-]+)*$' ||
-            refuse "'$one': give hosts as names or addresses, joined by commas" ;;
-        router-*) refuse "'$name': a router needs the hosts that others connect to: $name=192.168.7.1" ;;
+            refuse "'$one': give hosts as names or addresses, separated by commas" ;;
+        router-*) refuse "'$name': a router needs the hosts to which others connect: $name=192.168.7.1" ;;
     esac
     case $one in
         router-*=* | node-*=*) ;;
@@ -55,12 +56,12 @@ for one in "$@"; do
 done
 
 mkdir -p "$dir"
-[ -e "$dir/ca.key" ] || [ ! -e "$dir/ca.crt" ] || refuse "$dir/ca.key is not here: nothing can be signed without it"
+[ -e "$dir/ca.key" ] || [ ! -e "$dir/ca.crt" ] || refuse "$dir/ca.key is not here: the script cannot sign without it"
 if [ ! -e "$dir/ca.key" ] && [ ! -e "$dir/ca.crt" ]; then
     openssl ecparam -name prime256v1 -genkey -noout -out "$dir/ca.key"
     openssl req -x509 -new -sha256 -key "$dir/ca.key" -days "${CA_DAYS:-3650}" -subj "/CN=neurove-ca" \
         -out "$dir/ca.crt" -addext "keyUsage=critical,keyCertSign,cRLSign"
-    echo "made $dir/ca.crt: the authority; its key stays here"
+    echo "made $dir/ca.crt: certificate of the authority; keep its key here"
 fi
 
 for one in "$@"; do
@@ -69,7 +70,7 @@ for one in "$@"; do
         echo "kept $dir/$name.crt"
         continue
     fi
-    # A certificate without serverAuth can not pass for a router, whoever holds it.
+    # A certificate without serverAuth does not let its holder act as a router.
     extensions="basicConstraints=critical,CA:false
 keyUsage=critical,digitalSignature
 extendedKeyUsage=clientAuth
@@ -80,7 +81,7 @@ keyUsage=critical,digitalSignature
 extendedKeyUsage=clientAuth,serverAuth
 subjectAltName=$(names_of "${one#*=}")" ;;
     esac
-    # Made under other names first: a cut leaves no half certificate, and the next run makes it whole.
+    # Files get temporary names first: an interruption leaves no partial certificate, and the next run completes it.
     openssl ecparam -name prime256v1 -genkey -noout | openssl pkcs8 -topk8 -nocrypt -out "$dir/.$name.key"
     openssl req -new -sha256 -key "$dir/.$name.key" -subj "/CN=$name" -out "$dir/.$name.csr"
     echo "$extensions" > "$dir/.$name.ext"

@@ -1,10 +1,10 @@
-"""One Zenoh configuration for every certificate that make-ca.sh made, with keys and access list inside.
+"""Make one Zenoh configuration for every certificate of make-ca.sh, including keys and access list.
 
     python make-configs.py DIR [--prefix neurove/v1] [--listen tls/0.0.0.0:7447]
 
-DIR/NAME.json5 is all that a participant needs: give the file to `neurove ... --zenoh-config`, and keep it secret. The
-router's (and that of a node which listens itself) lists who may do what. Files are written anew each time: after a
-certificate came or went, run it again, copy the router's file and restart the router.
+DIR/NAME.json5 contains everything that a participant needs. Pass it to `neurove ... --zenoh-config` and keep it secret.
+The file of a router, or of a node that listens itself, also has the access list of all participants. Each run rewrites
+all files. After you add or remove a certificate, run the script again, copy the router's file and restart the router.
 """
 
 import argparse
@@ -18,18 +18,21 @@ from pathlib import Path
 
 ROLES = ("router", "node", "driver", "consumer", "recorder", "operator")
 TEMPLATES = Path(__file__).resolve().parent
-IN, OUT = "ingress", "egress"  # as the listening side sees it: from the participant, to the participant
+IN, OUT = "ingress", "egress"  # seen from the listening side: from the participant, to the participant
 
 
 def access_control(names: list[str], prefix: str) -> dict[str, object]:
-    """Zenoh's `access_control` for these participants: default deny, and one policy for each.
+    """Make Zenoh's `access_control` for these participants: default deny, and one policy per participant.
 
-    Zenoh applies a rule only if its key expression includes that of the message, so a wildcard put or a question to
-    `**` is denied by every rule with a narrower key.
+    Zenoh applies a rule only if its key expression includes that of the message. A rule with a narrower key therefore
+    does not permit a put with wildcards or a query to `**`.
 
     Args:
-        names: common names of certificates, `<role>-<name>`.
-        prefix: of all keys.
+        names: common names of the certificates, `<role>-<name>`.
+        prefix: prefix of all keys.
+
+    Returns:
+        the value of `access_control`, ready for JSON.
     """
     rules = [
         {"id": f"{name} {number}", "permission": "allow", "flows": [flow], "messages": messages, "key_exprs": keys}
@@ -53,36 +56,36 @@ Rule = tuple[str, list[str], list[str]]
 
 
 def _rules(role: str, name: str, prefix: str) -> list[Rule]:
-    """What a participant may send (IN) and be sent (OUT): flow, kinds of message, key expressions."""
+    """List what a participant may send (IN) and receive (OUT): flow, kinds of message, key expressions."""
     node = f"{prefix}/@node/*"
     events, camera = f"{prefix}/*/events", f"{prefix}/*/camera"
-    told = [f"{prefix}/*/velocity", f"{prefix}/*/status"]
+    results = [f"{prefix}/*/velocity", f"{prefix}/*/status"]
     asked = [f"{node}/health", f"{node}/models"]
     change, chunks = f"{node}/model/**", f"{prefix}/@push/**"
     own = f"{prefix}/@node/{name}"
-    if role == "driver":  # the events and the camera of its own stream
+    if role == "driver":  # events and camera of its own stream
         return [
             *_publishes([f"{prefix}/{name}/events", f"{prefix}/{name}/camera"], heard_as=[events, camera]),
             *_answers([f"{prefix}/{name}/camera"], asked_as=[camera]),
         ]
-    if role == "node":  # everything that a service does, under its own name
+    if role == "node":  # everything that the service does, under its own name
         return [
             *_hears([events, camera]),
             *_asks([camera, chunks]),
-            *_publishes(told, heard_as=told),
+            *_publishes(results, heard_as=results),
             *_answers([f"{own}/health", f"{own}/models", f"{own}/model/**"], asked_as=[*asked, change]),
-            (IN, ["reply"], [change]),  # a refusal bears the key of the question, which may ask all nodes
+            (IN, ["reply"], [change]),  # an error reply has the key of the query, maybe for all nodes
             (IN, ["liveliness_token"], [f"{own}/alive", f"{own}/serves/*"]),
         ]
     reads = [
-        *_hears(told),
+        *_hears(results),
         *_asks(asked),
         (IN, ["liveliness_query", "declare_liveliness_subscriber"], [f"{node}/alive", f"{node}/serves/*"]),
         (OUT, ["liveliness_token"], [f"{node}/alive", f"{node}/serves/*"]),
     ]
-    if role == "recorder":  # what a consumer may, and the events
+    if role == "recorder":  # as a consumer, and events
         return [*reads, *_hears([events, camera]), *_asks([camera])]
-    if role == "operator":  # what a consumer may, and to change models
+    if role == "operator":  # as a consumer, and model changes
         return [*reads, *_asks([change]), *_answers([chunks], asked_as=[chunks])]
     return reads if role == "consumer" else []
 
@@ -92,7 +95,7 @@ def _hears(keys: list[str]) -> list[Rule]:
 
 
 def _publishes(keys: list[str], *, heard_as: list[str]) -> list[Rule]:
-    return [(IN, ["put"], keys), (OUT, ["declare_subscriber"], heard_as)]  # else it would not know of a listener
+    return [(IN, ["put"], keys), (OUT, ["declare_subscriber"], heard_as)]  # else it learns of no subscriber
 
 
 def _asks(keys: list[str]) -> list[Rule]:
@@ -104,14 +107,14 @@ def _answers(keys: list[str], *, asked_as: list[str]) -> list[Rule]:
 
 
 def listens(certificate: Path) -> bool:
-    """Whether others may connect to the holder: make-ca.sh says so in the certificate where it was given hosts."""
+    """Return whether others may connect to the holder; make-ca.sh marks certificates that it made with hosts."""
     command = ["openssl", "x509", "-in", str(certificate), "-noout", "-purpose"]
-    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    return "SSL server : Yes" in told
+    purposes = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    return "SSL server : Yes" in purposes
 
 
 def config(folder: Path, name: str, access: dict[str, object], endpoint: str) -> str:
-    """The text of a participant's configuration."""
+    """Return the text of a participant's configuration."""
     server = listens(folder / f"{name}.crt")
     text = (TEMPLATES / ("listen.json5" if server else "connect.json5")).read_text(encoding="utf-8")
     values = {
@@ -131,7 +134,7 @@ def _base64(path: Path) -> str:
 
 
 def write(path: Path, text: str) -> None:
-    """A file that only its owner can read, whole or not at all."""
+    """Write a file atomically; only its owner can read it."""
     part = path.with_name(f".{path.name}")
     part.unlink(missing_ok=True)
     with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w", encoding="utf-8") as file:
@@ -140,12 +143,12 @@ def write(path: Path, text: str) -> None:
 
 
 def main() -> int:
-    """Write all configurations of a folder."""
+    """Write the configurations of all participants in a folder."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("folder", metavar="DIR", type=Path, help="the folder that make-ca.sh filled")
-    parser.add_argument("--prefix", default="neurove/v1", help="of all keys; default neurove/v1")
+    parser.add_argument("folder", metavar="DIR", type=Path, help="folder with the certificates of make-ca.sh")
+    parser.add_argument("--prefix", default="neurove/v1", help="prefix of all keys; default neurove/v1")
     parser.add_argument(
-        "--listen", default="tls/0.0.0.0:7447", help="where router and listening nodes listen; default tls/0.0.0.0:7447"
+        "--listen", default="tls/0.0.0.0:7447", help="endpoint of router and listening nodes; default tls/0.0.0.0:7447"
     )
     args = parser.parse_args()
     if not re.fullmatch(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*", args.prefix):

@@ -1,4 +1,4 @@
-"""Speed, told as ratios: ours and a peer in one process, interleaved, with the same inputs and compared answers."""
+"""Benchmarks as ratios: our code and a peer in one process, interleaved, on the same inputs, with compared results."""
 
 import statistics
 import time
@@ -7,25 +7,27 @@ from typing import NamedTuple
 
 
 class Row(NamedTuple):
-    """One comparison; times are medians of CPU time of one thread [ms]."""
+    """One comparison. Times are medians of the CPU time of one thread [ms]."""
 
     name: str
     ours_ms: float
     peer: str
     peer_ms: float
     ratio: float  # the peer's time over ours
-    share_of_limit: float | None  # of what the same run measured as this machine's limit, where there is one
-    equal: bool | None  # whether the answers agree; None where the peer computes something else by design
+    share_of_limit: (
+        float | None
+    )  # the limit of this machine, measured in the same run, over our time; None without a limit
+    equal: bool | None  # whether the results agree; None if the peer computes another result by design
 
 
 def rows(name: str, times: dict[str, float], equal: dict[str, bool | None], limit_ms: float | None = None) -> list[Row]:
-    """One row for each peer, the fastest peer first.
+    """One row per peer, the fastest peer first.
 
     Args:
         name: of the benchmark.
-        times: as `interleaved` gives them: `ours`, the peers, and what else was measured.
-        equal: of each peer.
-        limit_ms: what the limit of this machine would take, measured in the same run.
+        times: result of `interleaved` [ms], with `ours`, the peers and perhaps others.
+        equal: by peer, see Row.
+        limit_ms: time at the limit of this machine, measured in the same run [ms].
     """
     ours = times["ours"]
     share = limit_ms / ours if limit_ms else None
@@ -34,12 +36,12 @@ def rows(name: str, times: dict[str, float], equal: dict[str, bool | None], limi
 
 
 def interleaved(runs: dict[str, Callable[[], object]], rounds: int, warm_up: int = 2) -> dict[str, float]:
-    """Median CPU time [ms] of each, one after the other in every round, so that a busy machine slows all alike.
+    """Median CPU time [ms] of each function. Every round runs all in turn, so that a busy machine slows all alike.
 
     Args:
-        runs: what to time, by name.
-        rounds: how often.
-        warm_up: rounds before, not counted.
+        runs: the functions to time, by name.
+        rounds: number of timed rounds.
+        warm_up: number of rounds before them, not timed.
     """
     times: dict[str, list[float]] = {name: [] for name in runs}
     for turn in range(warm_up + rounds):

@@ -1,4 +1,4 @@
-"""A chart of benchmarks: how many times as fast as each peer."""
+"""A bar chart of benchmark rows: the speed relative to each peer."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -8,7 +8,7 @@ from neurove_core.figures import blank_figure, save_figure
 
 
 def save(rows: Sequence[Row], stamp: str, file: Path) -> list[Path]:
-    """Write a bar for each row, on a logarithmic axis, as PNG and SVG; returns both paths.
+    """Write one bar per row on a logarithmic axis, as PNG and SVG, and return both paths.
 
     Raises:
         MissingExtra: matplotlib is not installed.

@@ -1,4 +1,4 @@
-"""From events to counts, from events to an estimate, from a camera's words to events."""
+"""Benchmarks from events to counts, from events to an estimate, and from the words of a camera to events."""
 
 import tempfile
 from collections.abc import Callable
@@ -9,26 +9,28 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neurove_core import bundle, io
+from neurove_core import sources
 from neurove_core.bench import Row, interleaved, peers, rows, window
+from neurove_core.compiled import compiled
 from neurove_core.config import ModelConfig
-from neurove_core.encoding import to_spikes_reference
 from neurove_core.estimator import Estimator
-from neurove_core.geometry import lookup_table
-from neurove_core.kernels import compiled, count_events, count_events_reference
-from neurove_core.network import NeuroVE
-from neurove_core.neurons import plain
-from protocol import Events, Sensor
+from neurove_core.geometry.camera import lookup_table
+from neurove_core.ingest.counting import count_events, count_events_reference
+from neurove_core.models import bundle
+from neurove_core.networks.encoding import to_spikes_reference
+from neurove_core.networks.neurove import NeuroVE
+from neurove_core.spiking.plain import plain
+from neurove_protocol import Events, Sensor
 
 SENSOR = Sensor(346, 260)
 BINS, DURATION_US = 10, 50_000
 
 
 def ingest(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool) -> list[Row]:
-    """Events of one window to counts [2n, H, W] of a DAVIS346; the limit is to add to cells that are already known."""
+    """Events of one window to counts (2n, H, W) of a DAVIS346. The limit is adding to cells that are already known."""
     found: list[Row] = []
     for n in (5_000,) if quick else (100_000, 1_000_000):
-        events = draw(n)
+        events = sweeping_edge(n)
         known = _cells(events)
         runs: dict[str, Callable[[], Any]] = {
             "ours": _counted(count_events, events),
@@ -41,7 +43,7 @@ def ingest(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool
             name: bool(np.array_equal(np.minimum(run(), 255), expected)) for name, run in runs.items() if name != "ours"
         }
         if "tonic" in equal:
-            equal["tonic"] = None  # it cuts the bins at other times, and drops the last events
+            equal["tonic"] = None  # its bins end at other times, and it drops the last events
         times = interleaved({**runs, "limit": _increments(known)}, rounds)
         found += rows(f"ingest {n:.0e} events, 346x260, n=10", times, equal, times["limit"])
     return found
@@ -59,7 +61,7 @@ def _counted(count: Callable[..., int], events: Events) -> Callable[[], NDArray[
 
 
 def _increments(known: NDArray[np.uint32]) -> Callable[[], None]:
-    """To add to cells that are known: what is left of counting when all else costs nothing."""
+    """Adds to known cells: the part of counting that cannot be avoided."""
 
     def run() -> None:
         _increment(known, np.zeros(2 * BINS * SENSOR.height * SENSOR.width, np.uint8))
@@ -68,10 +70,10 @@ def _increments(known: NDArray[np.uint32]) -> Callable[[], None]:
 
 
 def end_to_end(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool) -> list[Row]:
-    """Events of one window to its estimate, 1e5 events of a DAVIS346, from rest."""
+    """Events of one window to its estimate: 1e5 events of a DAVIS346, from the zero state."""
     found: list[Row] = []
     shapes = {"tiny": window.TINY} if quick else {"shipped": window.SHIPPED, "reference, T=1": window.REFERENCE}
-    events = draw(5_000 if quick else 100_000)
+    events = sweeping_edge(5_000 if quick else 100_000)
     tonic = peers.load("tonic.functional", missing) if with_peers else None
     for name, config in shapes.items():
         estimator = Estimator(bundle.untrained(0, config))
@@ -87,7 +89,7 @@ def end_to_end(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: 
         expected = runs["ours"]()
         equal: dict[str, bool | None] = {
             peer: None
-            if any(name in peer for name in peers.ELSEWISE)
+            if any(name in peer for name in peers.DIFFERENT_BY_DESIGN)
             else bool(np.allclose(run(), expected, rtol=1e-3, atol=1e-4))
             for peer, run in runs.items()
             if not peer.startswith("ours")
@@ -100,25 +102,23 @@ def end_to_end(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: 
 
 
 def _estimated(estimator: Estimator, events: Events) -> Callable[[], NDArray[Any]]:
-    rest = estimator.initial_state(
-        SENSOR
-    )  # its network state and look-up table, as a stream has them; no window is open
+    initial = estimator.initial_state(SENSOR)  # with the look-up table of the stream; no window is open
 
     def run() -> NDArray[Any]:
-        return estimator.push(events, rest, DURATION_US).estimates[0].twists
+        return estimator.push(events, initial, DURATION_US).estimates[0].twists
 
     return run
 
 
 def _in_steps(counts: Callable[[], NDArray[np.uint8]], network: NeuroVE) -> Callable[[], NDArray[Any]]:
-    """Counts to a network's input to its answer, in plain PyTorch or a peer's neurons, from rest."""
-    rest, encoding = network.initial_state(1), network.config.network.encoding
+    """Counts to network input to estimate, in plain PyTorch or with a peer's neurons, from the zero state."""
+    initial, encoding = network.initial_state(1), network.config.network.encoding
 
     @torch.inference_mode()
     def run() -> NDArray[Any]:
         spikes = to_spikes_reference(torch.from_numpy(counts()), encoding)
         with plain():
-            twists: NDArray[Any] = network(spikes[None, None], rest)[0][0, 0].numpy()
+            twists: NDArray[Any] = network(spikes[None, None], initial)[0][0, 0].numpy()
         return twists
 
     return run
@@ -137,7 +137,7 @@ def _numpy_counts(config: ModelConfig, events: Events) -> Callable[[], NDArray[n
 
 
 def _tonic_counts(tonic: Any, config: ModelConfig, events: Events) -> Callable[[], NDArray[np.uint8]]:
-    """Its frames, of events that are on the network's grid already: scaling is not timed."""
+    """Frames of tonic, from events that are already on the network's grid: the scaling is not timed."""
     grid, bins = config.canonical, config.window.bins
     fields, cell = _structured(events), lookup_table(grid, SENSOR, None)[events.y, events.x]
     fields["x"], fields["y"] = cell % grid.width, cell // grid.width
@@ -151,14 +151,14 @@ def _tonic_counts(tonic: Any, config: ModelConfig, events: Events) -> Callable[[
 
 def decode(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool) -> list[Row]:
     """An EVT3 file of a Prophesee camera to events."""
-    events = draw(5_000 if quick else 1_000_000, Sensor(1280, 720))
+    events = sweeping_edge(5_000 if quick else 1_000_000, Sensor(1280, 720))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "recording.raw"
         header = b"% evt 3.0\n% format EVT3;height=720;width=1280\n% geometry 1280x720\n% end\n"
         path.write_bytes(header + _evt3(events).tobytes())
 
         def ours() -> list[Events]:
-            return list(io.open_source(str(path)).chunks())
+            return list(sources.open_source(str(path)).chunks())
 
         runs: dict[str, Callable[[], Any]] = {"ours": ours}
         equal: dict[str, bool | None] = {}
@@ -171,13 +171,13 @@ def decode(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool
             runs["faery"] = theirs
             equal["faery"] = _same_events(theirs(), ours())
         times = interleaved(runs, rounds)
-        if not equal:  # nobody to compare with: our own figure alone
+        if not equal:  # no peer is installed: compare with the written events
             times["written"], equal["written"] = times["ours"], _same_events([_structured(events)], ours())
         return rows(f"decode EVT3, {events.n:.0e} events", times, equal)
 
 
-def draw(n: int, sensor: Sensor = SENSOR) -> Events:
-    """An edge that sweeps over the sensor in one window, with noise: where events are, others are."""
+def sweeping_edge(n: int, sensor: Sensor = SENSOR) -> Events:
+    """Random events of a noisy edge that sweeps over the sensor in one window; like real events, they cluster."""
     rng = np.random.default_rng(0)
     t = np.sort(rng.integers(0, DURATION_US, n))
     x = (t * sensor.width / DURATION_US + rng.normal(0, sensor.width / 12, n)).astype(np.int64) % sensor.width
@@ -201,7 +201,7 @@ def _tonic_frames(tonic: Any, fields: NDArray[Any]) -> Callable[[], Any]:
 
 
 def _dv(dv: Any, events: Events) -> Callable[[], Any]:
-    """An accumulator for each channel; its store is filled beforehand, for Python fills it event by event."""
+    """One accumulator per channel. The store is filled before timing, because Python fills it event by event."""
     store = dv.EventStore()
     for t, x, y, p in zip(*(column.tolist() for column in events), strict=True):
         store.push_back(t, x, y, bool(p))
@@ -246,14 +246,14 @@ def _increment(where: NDArray[np.uint32], counts: NDArray[np.uint8]) -> None:  #
 
 
 def _evt3(events: Events) -> NDArray[np.uint16]:
-    """Words of single events: TIME_HIGH, TIME_LOW and ADDR_Y only where they change, ADDR_X for each event."""
+    """EVT3 words of single events: TIME_HIGH, TIME_LOW and ADDR_Y only when they change, ADDR_X for each event."""
     t, y = events.t, events.y.astype(np.int64)
     words = np.stack([0x8000 | t >> 12, 0x6000 | t & 0xFFF, y, 0x2000 | events.p.astype(np.int64) << 11 | events.x])
-    said = np.ones(words.shape, np.bool_)
-    said[0, 1:] = np.diff(t >> 12) != 0
-    said[1, 1:] = np.diff(t) != 0
-    said[2, 1:] = np.diff(y) != 0
-    return words.T[said.T].astype("<u2")
+    written = np.ones(words.shape, np.bool_)
+    written[0, 1:] = np.diff(t >> 12) != 0
+    written[1, 1:] = np.diff(t) != 0
+    written[2, 1:] = np.diff(y) != 0
+    return words.T[written.T].astype("<u2")
 
 
 def _same_events(theirs: list[Any], ours: list[Events]) -> bool:

@@ -1,4 +1,4 @@
-"""This machine: what it is, and the limits that a run is held against."""
+"""This machine: its description for results, and its limits for comparison."""
 
 import importlib.metadata
 import os
@@ -9,13 +9,13 @@ from pathlib import Path
 import torch
 
 from neurove_core.config import ModelConfig
-from neurove_core.network import NeuroVE
+from neurove_core.networks.neurove import NeuroVE
 
 _SIDE = 1024
 
 
 def stamp(commit: str) -> str:
-    """One line that a result needs beside it: commit, processor, threads, versions."""
+    """One line for a result: commit, processor, load, threads and versions."""
     versions = " ".join(f"{name} {importlib.metadata.version(name)}" for name in ("torch", "numpy", "numba"))
     isa = torch.backends.cpu.get_cpu_capability()
     load = f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown"
@@ -33,18 +33,18 @@ def _processor() -> str:
 
 
 def peak() -> Callable[[], object]:
-    """A large product of float32 matrices, the most arithmetic that this machine does in a time."""
+    """A large float32 matrix product, which reaches the highest arithmetic rate of this machine."""
     a, b = torch.randn(_SIDE, _SIDE), torch.randn(_SIDE, _SIDE)
     out = torch.empty(_SIDE, _SIDE)
     return lambda: torch.mm(a, b, out=out)
 
 
 PEAK_FLOPS = 2 * _SIDE**3
-"""Of one call of `peak()`."""
+"""Operations of one call of the function that `peak` returns."""
 
 
 def flops(config: ModelConfig) -> int:
-    """Multiplications and additions of one window, dense; element by element work left out."""
+    """Multiplications and additions of one window with dense products, without elementwise operations."""
     net = config.network
     sizes = NeuroVE(config).map_sizes()
     inputs, total = 2 * config.window.bins, 0

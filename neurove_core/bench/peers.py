@@ -1,7 +1,7 @@
-"""The peers' neurons in our network: same weights, same input, their LIF layers as their users run them.
+"""The peers' neurons in our network: the same weights and input, with their LIF layers as their users run them.
 
-They come with the extra `bench`, except those whose requirements would pull another torch:
-`pip install --no-deps spikingjelly norse nir nirtorch sinabs pbr`. What is not installed is named and left out.
+The extra `bench` installs the peers, except those whose requirements would install another torch:
+`pip install --no-deps spikingjelly norse nir nirtorch sinabs pbr`. Peers that are not installed are named and skipped.
 """
 
 import copy
@@ -14,18 +14,18 @@ from typing import Any, Final
 import torch
 from torch import Tensor, nn
 
-from neurove_core.network import NeuroVE, SpikingBlock
-from neurove_core.neurons import LIFState
+from neurove_core.networks.neurove import NeuroVE, SpikingBlock
+from neurove_core.spiking.lif import LIFState
 
 Missing = list[str]
-"""Names of peers that could not be loaded, and why."""
+"""Names of peers that could not be loaded, each with the reason."""
 
 
 def load(name: str, missing: Missing) -> Any | None:
-    """A peer's module; None, and a line in `missing`, where it is not installed or does not load."""
+    """Import a peer's module. If that fails, return None and add a line to `missing`."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # a peer's deprecations are not ours
+            warnings.simplefilter("ignore")  # deprecations in a peer are not our concern
             return importlib.import_module(name)
     except ImportError as error:
         missing.append(f"{name.partition('.')[0]} ({error})")
@@ -33,7 +33,7 @@ def load(name: str, missing: Missing) -> Any | None:
 
 
 def networks(network: NeuroVE, missing: Missing) -> dict[str, NeuroVE]:
-    """Our network with each peer's neurons, by the peer's name; run them inside `neurons.plain()`."""
+    """Our network with each peer's neurons, by the name of the peer; run them inside `spiking.plain.plain()`."""
     made = {
         "spikingjelly": _with_neurons(network, _spikingjelly(missing), stepwise=False),
         "snnTorch": _with_neurons(network, _snntorch(missing), stepwise=True),
@@ -43,31 +43,31 @@ def networks(network: NeuroVE, missing: Missing) -> dict[str, NeuroVE]:
     return {name: peer for name, peer in made.items() if peer is not None}
 
 
-ELSEWISE: Final = ("snnTorch", "norse")
-"""Peers that compute something else by design: snnTorch resets a step later, norse rounds its potential elsewhere."""
+DIFFERENT_BY_DESIGN: Final = ("snnTorch", "norse")
+"""Peers with other results by design: snnTorch resets one step later, norse rounds its potential in another place."""
 
 Neurons = Callable[[SpikingBlock], tuple[Callable[[Tensor], Tensor], Callable[[], None]]]
-"""Of one block: currents to spikes, and back to rest."""
+"""For one block: a function from currents to spikes, and one that resets its state."""
 
 
 class PeerBlock(nn.Module):
-    """A block of our network with a peer's neurons; they begin each sequence at rest.
+    """A block of our network with a peer's neurons, which start each sequence from the zero state.
 
     Args:
-        block: ours, whose weights it shares.
-        neurons: the peer's.
-        stepwise: whether the peer's users loop over time, or hand over all steps at once.
+        block: our block; its weights are shared.
+        neurons: make the peer's neurons.
+        stepwise: whether the peer's users loop over time steps or pass all steps at once.
     """
 
     def __init__(self, block: SpikingBlock, neurons: Neurons, *, stepwise: bool) -> None:
         super().__init__()
         self.conv, self.norm = block.conv, block.norm
-        self._fire, self._rest = neurons(block)
+        self._fire, self._reset = neurons(block)
         self._stepwise = stepwise
 
     def forward(self, spikes: Tensor, state: LIFState) -> tuple[Tensor, LIFState]:
-        """As SpikingBlock.forward; the state goes through unseen."""
-        self._rest()
+        """As SpikingBlock.forward, but the state is returned unchanged."""
+        self._reset()
         if self._stepwise:
             return torch.stack([self._fire(self.norm(self.conv(x))) for x in spikes]), state
         current: Tensor = self.norm(self.conv(spikes.flatten(0, 1)))
@@ -75,7 +75,7 @@ class PeerBlock(nn.Module):
 
 
 def features(network: NeuroVE, spikes: Tensor) -> Tensor:
-    """Spikes (T * B, C, H', W') of a network's last map, from rest."""
+    """Spikes (T * B, C, H', W') of the last feature map of a network, from the zero state."""
     state = network.initial_state(spikes.shape[1])
     for block, membrane in zip(network.blocks, state.membranes, strict=True):
         spikes, _ = block(spikes, membrane)
@@ -131,7 +131,7 @@ def _norse(missing: Missing) -> Neurons | None:
 
     def neurons(block: SpikingBlock) -> tuple[Callable[[Tensor], Tensor], Callable[[], None]]:
         share = 1 - block.lif.decay
-        with torch.no_grad():  # v + share (i - v): the norm before it makes up for the share of the current
+        with torch.no_grad():  # v + share (i - v): the norm before it compensates for the factor on the current
             block.norm.weight.div_(share)
             block.norm.bias.div_(share)
         params = module.LIFBoxParameters(tau_mem_inv=torch.tensor(share), v_th=torch.tensor(block.lif.v_th))
@@ -166,12 +166,10 @@ def _sinabs(missing: Missing) -> Neurons | None:
         )
 
         def fire(currents: Tensor) -> Tensor:
-            spikes: Tensor = layer(currents.transpose(0, 1))  # (B, T, ...), as it wants them
+            spikes: Tensor = layer(currents.transpose(0, 1))  # sinabs expects (B, T, ...)
             return spikes.transpose(0, 1)
 
-        return (
-            fire,
-            lambda: layer.reset_states(),
-        )  # a bound method would be copied with the network, and its layer with it
+        # a lambda, because a bound method would be copied with the network, and its layer with it
+        return fire, lambda: layer.reset_states()
 
     return neurons

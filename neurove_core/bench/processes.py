@@ -1,4 +1,4 @@
-"""Two processes on two cores against one: how many windows a machine answers when each core has a process."""
+"""Two processes on two cores against one: the windows per second of a machine with one process per core."""
 
 import multiprocessing
 import statistics
@@ -10,29 +10,29 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neurove_core import bundle
 from neurove_core.bench import Row
-from neurove_core.bench.window import SHIPPED, TINY, draw
-from neurove_core.engine import Engine
-from neurove_core.network import NetworkState, NeuroVE
+from neurove_core.bench.window import SHIPPED, TINY, random_input
+from neurove_core.engine.engine import Engine
+from neurove_core.models import bundle
+from neurove_core.networks.neurove import NetworkState, NeuroVE
 
 PROCESSES: Final = 2
-WINDOWS: Final = 300  # of one process in one run
-_PATIENCE_S: Final = 120.0
+WINDOWS: Final = 300  # per process and run
+_TIMEOUT_S: Final = 120.0
 
 
 class _Share(NamedTuple):
-    """What one process did in a run."""
+    """The result of one process in one run."""
 
     cpu_ms: float
-    answer: NDArray[np.float32]  # of the last window
+    twists: NDArray[np.float32]  # of the last window
 
 
 def processes(rounds: int, *, quick: bool) -> list[Row]:
-    """Windows of the shipped network, T = 1, in one process and in two at once.
+    """Windows of the shipped network, T = 1, in one process and in two processes at once.
 
-    By wall time it is what a user gets, other work of the machine included; by CPU time it is what two cores of one's
-    own would give: whether the processes take caches and memory from each other.
+    The wall time is what a user gets, including the effect of other work on the machine. The CPU time shows whether the
+    processes slow each other down through caches and memory, as if the two cores were free of other work.
     """
     windows = 3 if quick else WINDOWS
     spawn = multiprocessing.get_context("spawn")
@@ -40,22 +40,22 @@ def processes(rounds: int, *, quick: bool) -> list[Row]:
     workers = [spawn.Process(target=_work, args=(pipe[1], quick, windows), daemon=True) for pipe in pipes]
     for worker in workers:
         worker.start()
-    told = [pipe[0] for pipe in pipes]
-    for connection in told:
-        _hear(connection)  # warm
+    pipe_ends = [pipe[0] for pipe in pipes]
+    for connection in pipe_ends:
+        _receive(connection)  # the process has warmed up
     wall: dict[int, list[float]] = {1: [], PROCESSES: []}
     cpu: dict[int, list[float]] = {1: [], PROCESSES: []}
     answers: list[NDArray[np.float32]] = []
     for _ in range(rounds):
         for count in (1, PROCESSES):
             began = time.monotonic()
-            shares = _run(told[:count])
+            shares = _run(pipe_ends[:count])
             wall[count].append(1e3 * (time.monotonic() - began) / (count * windows))
             cpu[count].append(statistics.mean(share.cpu_ms for share in shares) / (count * windows))
-            answers += [share.answer for share in shares]
-    for connection, worker in zip(told, workers, strict=True):
+            answers += [share.twists for share in shares]
+    for connection, worker in zip(pipe_ends, workers, strict=True):
         connection.close()
-        worker.join(_PATIENCE_S)
+        worker.join(_TIMEOUT_S)
     equal = all(np.array_equal(answer, answers[0]) for answer in answers)
     return [
         _row(f"{PROCESSES} processes, shipped, {kind} time per window", times, equal)
@@ -68,31 +68,31 @@ def _row(name: str, times: dict[int, list[float]], equal: bool) -> Row:
     return Row(name, many, "1 process", one, one / many, one / many / PROCESSES, equal)
 
 
-def _run(told: list[Connection]) -> list[_Share]:
-    for connection in told:
+def _run(pipe_ends: list[Connection]) -> list[_Share]:
+    for connection in pipe_ends:
         connection.send("go")
-    return [_hear(connection) for connection in told]
+    return [_receive(connection) for connection in pipe_ends]
 
 
-def _hear(connection: Connection) -> _Share:
-    if not connection.poll(_PATIENCE_S):
-        raise TimeoutError(f"a process of the benchmark did not answer in {_PATIENCE_S:.0f} s")
+def _receive(connection: Connection) -> _Share:
+    if not connection.poll(_TIMEOUT_S):
+        raise TimeoutError(f"a process of the benchmark did not answer in {_TIMEOUT_S:.0f} s")
     share: _Share = connection.recv()
     return share
 
 
-def _work(told: Connection, quick: bool, windows: int) -> None:  # pragma: no cover (another process)
+def _work(pipe_end: Connection, quick: bool, windows: int) -> None:  # pragma: no cover (another process)
     torch.set_num_threads(1)
     config = TINY if quick else SHIPPED
     network = cast("NeuroVE", bundle.untrained(0, config).network.eval())
-    engine, spikes = Engine(network), draw(config, 1)
-    told.send(_share(engine, network.initial_state(1), spikes, windows))
+    engine, spikes = Engine(network), random_input(config, 1)
+    pipe_end.send(_share(engine, network.initial_state(1), spikes, windows))
     while True:
         try:
-            told.recv()
+            pipe_end.recv()
         except EOFError:
             return
-        told.send(_share(engine, network.initial_state(1), spikes, windows))
+        pipe_end.send(_share(engine, network.initial_state(1), spikes, windows))
 
 
 def _share(engine: Engine, state: NetworkState, spikes: torch.Tensor, windows: int) -> _Share:  # pragma: no cover

@@ -1,13 +1,14 @@
-"""The recurrence of the sine experiment: the fused path against the same network out of plain PyTorch steps."""
+"""The recurrence of the sine experiment: the fused path against the same network in plain PyTorch steps."""
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from neurove_core import recurrence
 from neurove_core.bench import Row, interleaved
-from neurove_core.cells import ASLSTMParams, ASLSTMState, aslstm_step, readout_step
-from neurove_core.neurons import diffuse
+from neurove_core.spiking.alif import diffuse
+from neurove_core.spiking.aslstm import ASLSTMParams, ASLSTMState, aslstm_step
+from neurove_core.spiking.fused import recurrence
+from neurove_core.spiking.readout import readout_step
 
 HIDDEN, BATCH, STEPS = 51, 16, 100
 V_TH = 0.3
@@ -15,7 +16,7 @@ CONSTANTS = recurrence.Constants(alpha=0.5, width=0.25)
 
 
 def compare(rounds: int = 9) -> list[Row]:
-    """Forward, and forward with backward, over STEPS steps at batch BATCH: two ASLSTM layers of HIDDEN, a readout."""
+    """Forward, and forward with backward, over STEPS steps at batch BATCH: two ASLSTM layers and a readout."""
     draw = np.random.default_rng(0)
     weights = _weights(draw)
     x = np.sin(np.arange(STEPS)[:, None] / 20 + draw.uniform(0, 6, BATCH)).astype(np.float32)
@@ -59,7 +60,7 @@ def compare(rounds: int = 9) -> list[Row]:
 
 
 def _equal(weights: recurrence.Weights, plain: "_Plain", x: recurrence.Array, state: recurrence.State) -> bool:
-    """Whether both fire alike and their answers differ by rounding alone."""
+    """Whether both have the same spikes, and outputs that differ only by rounding."""
     tape = recurrence.forward(recurrence.ASLSTM, weights, CONSTANTS, x, state, STEPS)
     with torch.no_grad():
         answers, spikes = plain.run(x)
@@ -88,7 +89,7 @@ def _weights(draw: np.random.Generator) -> recurrence.Weights:
 
 
 class _Plain:
-    """The same network out of `aslstm_step` and `readout_step`."""
+    """The same network built from `aslstm_step` and `readout_step`."""
 
     def __init__(self, weights: recurrence.Weights) -> None:
         def leaf(array: recurrence.Array) -> Tensor:
@@ -99,7 +100,7 @@ class _Plain:
         self._b_out, self._kappa = leaf(weights.b_out), leaf(weights.kappa)
 
     def run(self, x: recurrence.Array) -> tuple[Tensor, Tensor]:
-        """Answers (T, B) and spikes (T, 2, B, H)."""
+        """Outputs (T, B) and spikes (T, 2, B, H)."""
         states = [ASLSTMState(*(torch.zeros(x.shape[1], HIDDEN) for _ in range(3))) for _ in range(2)]
         y = torch.zeros(x.shape[1], 1)
         answers, spikes = [], []

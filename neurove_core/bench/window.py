@@ -1,4 +1,4 @@
-"""One window through the network, one training step, and many streams on one core."""
+"""Benchmarks of one window through the network, one training step, and many streams on one core."""
 
 import copy
 from collections.abc import Callable
@@ -7,31 +7,32 @@ from typing import Final, cast
 import torch
 from torch import Tensor
 
-from neurove_core import bundle, int8
 from neurove_core.bench import Row, interleaved, machine, peers, rows
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from neurove_core.engine import Engine
-from neurove_core.network import NetworkState, NeuroVE
-from neurove_core.neurons import plain
+from neurove_core.engine.engine import Engine
+from neurove_core.models import bundle
+from neurove_core.networks import quantisation
+from neurove_core.networks.neurove import NetworkState, NeuroVE
+from neurove_core.spiking.plain import plain
 
 REFERENCE = ModelConfig(
     window=WindowConfig(bins=10),
     canonical=CanonicalConfig(width=173, height=130),
     network=NetworkConfig(channels=(32, 64, 128, 256), features=256, hidden=256),
 )
-"""The network that research measured its peers with: 1.9 GFLOP a window at T = 8, a DAVIS346 at half its size."""
+"""The network on which the peers were measured: 1.9 GFLOP per window at T = 8, a DAVIS346 at half its size."""
 
 SHIPPED = ModelConfig()
 
 AT_PEAK: Final = "all its products at the matrix peak"
-"""Of this machine, in float32: what a window would take that leaves none out, and does nothing else."""
+"""Label of the limit: the time of all products of a window at the float32 peak of this machine, and nothing else."""
 
 TINY = ModelConfig(canonical=CanonicalConfig(width=24, height=16), network=NetworkConfig(channels=(4, 8), features=16))
-"""For --quick: does it run, and are the answers equal."""
+"""For --quick, which tests that everything runs and that the results are equal."""
 
 
 def window(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool) -> list[Row]:
-    """Latency of a window: the reference network with T = 8, and the shipped one as the service runs it, T = 1."""
+    """Latency of a window: the reference network at T = 8, and the shipped network at T = 1, as the service runs it."""
     shapes = {"tiny, T=3": (TINY, 3)} if quick else {"reference, T=8": (REFERENCE, 8), "shipped, T=1": (SHIPPED, 1)}
     found: list[Row] = []
     for name, (config, steps) in shapes.items():
@@ -50,41 +51,41 @@ def with_precision(config: ModelConfig, precision: str) -> ModelConfig:
 def _windows(
     name: str, config: ModelConfig, steps: int, rounds: int, missing: peers.Missing, *, with_peers: bool
 ) -> list[Row]:
-    """Where ours runs in int8 the peers run in float32, as their users do, and ours is compared to itself alone."""
+    """Rows of one network. If ours runs in int8, the peers run in float32, and only our own results are compared."""
     network = _network(config)
     quantised = config.network.precision == "int8"
     in_float32 = _network(with_precision(config, "float32")) if quantised else network
-    spikes, rest = draw(config, steps), network.initial_state(1)
-    given = int8.codes(spikes).contiguous() if quantised else spikes  # as the encoding lays them
+    spikes, initial = random_input(config, steps), network.initial_state(1)
+    given = quantisation.codes(spikes).contiguous() if quantised else spikes  # in the memory layout of the encoding
     engine = Engine(network)
     others = peers.networks(in_float32, missing) if with_peers else {}
-    runs: dict[str, Callable[[], object]] = {"ours": lambda: engine(given, rest)}
+    runs: dict[str, Callable[[], object]] = {"ours": lambda: engine(given, initial)}
     for peer, theirs in {"PyTorch, plain": network, **others}.items():
-        runs[peer] = _plainly(theirs, spikes, rest)
+        runs[peer] = _plainly(theirs, spikes, initial)
     with torch.inference_mode():
-        fired = engine.features(spikes, rest)[0]
-        equal: dict[str, bool | None] = {"PyTorch, plain": _agree(engine, network, spikes, rest)}
+        fired = engine.features(spikes, initial)[0]
+        equal: dict[str, bool | None] = {"PyTorch, plain": _agree(engine, network, spikes, initial)}
         with plain():
             for peer, theirs in others.items():
                 fires_alike = bool(torch.equal(peers.features(theirs, spikes), fired))
-                equal[peer] = None if quantised or peer in peers.ELSEWISE else fires_alike
+                equal[peer] = None if quantised or peer in peers.DIFFERENT_BY_DESIGN else fires_alike
         if quantised:
             wide = Engine(in_float32)
-            runs["ours, float32"], equal["ours, float32"] = lambda: wide(spikes, rest), None
+            runs["ours, float32"], equal["ours, float32"] = lambda: wide(spikes, initial), None
         times = interleaved({**runs, "peak": machine.peak()}, rounds)
-    if not quantised:  # no limit: where few fire most products are left out
+    if not quantised:  # int8 has no such limit: it skips most products when few neurons fire
         times[AT_PEAK] = times["peak"] * steps * machine.flops(config) / machine.PEAK_FLOPS
         equal[AT_PEAK] = None
     return rows(f"window {name}", times, equal)
 
 
 def train(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool) -> list[Row]:
-    """A training step, forward, backward and Adam: the reference network, T = 8, batch 4; the shipped one, T = 16."""
+    """A training step at batch 4, forward, backward and Adam: the reference network at T = 8, the shipped at T = 16."""
     shapes = {"tiny, T=3": (TINY, 3)} if quick else {"reference, T=8": (REFERENCE, 8), "shipped, T=16": (SHIPPED, 16)}
     found: list[Row] = []
     for name, (config, steps) in shapes.items():
         network = _network(config).requires_grad_().train()
-        spikes = draw(config, steps, batch=4)
+        spikes = random_input(config, steps, batch=4)
         others = peers.networks(network, missing) if with_peers else {}
         ours = _TrainingStep(network, spikes)
         runs: dict[str, Callable[[], object]] = {"ours": ours}
@@ -98,7 +99,7 @@ def train(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool)
             runs[peer] = _inside_plain(step)
         loss = ours.loss()
         equal: dict[str, bool | None] = {
-            peer: None if peer in peers.ELSEWISE else abs(value - loss) < 1e-4 * abs(loss)
+            peer: None if peer in peers.DIFFERENT_BY_DESIGN else abs(value - loss) < 1e-4 * abs(loss)
             for peer, value in losses.items()
         }
         found += rows(f"training step {name}, batch 4", interleaved(runs, rounds, warm_up=1), equal)
@@ -106,11 +107,11 @@ def train(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool)
 
 
 def streams(rounds: int, *, quick: bool) -> list[Row]:
-    """Streams on one core, milliseconds per window: eight in turn beside one alone, several at once beside in turn."""
+    """Time per window of streams on one core [ms]: eight in turn against one alone, and batches against in turn."""
     config = TINY if quick else SHIPPED
     network = _network(config)
     engine = Engine(network)
-    inputs = [draw(config, 1, seed=seed) for seed in range(8)]
+    inputs = [random_input(config, 1, seed=seed) for seed in range(8)]
     states = [network.initial_state(1) for _ in inputs]
 
     def in_turn() -> None:
@@ -122,8 +123,8 @@ def streams(rounds: int, *, quick: bool) -> list[Row]:
             states[0] = engine(inputs[0], states[0])[1]
 
     def at_once(count: int) -> Callable[[], object]:
-        joint, rest = torch.cat(inputs[:count], dim=1), [network.initial_state(1)] * count
-        return lambda: engine.together(joint, rest)
+        joint, initial = torch.cat(inputs[:count], dim=1), [network.initial_state(1)] * count
+        return lambda: engine.together(joint, initial)
 
     batches = {count: at_once(count) for count in (2, 4, 8)}
     runs = {f"{count} at once": run for count, run in batches.items()}
@@ -142,8 +143,8 @@ def streams(rounds: int, *, quick: bool) -> list[Row]:
     ]
 
 
-def draw(config: ModelConfig, steps: int, batch: int = 1, seed: int = 1) -> Tensor:
-    """Input (T, B, 2n, H, W) as counts of a window are encoded, channels last as the encoding lays it."""
+def random_input(config: ModelConfig, steps: int, batch: int = 1, seed: int = 1) -> Tensor:
+    """Random network input (T, B, 2n, H, W), encoded from counts, in the channels-last layout of the encoding."""
     shape = (steps, batch, 2 * config.window.bins, config.canonical.height, config.canonical.width)
     counts = torch.poisson(torch.full(shape, 0.3), generator=torch.Generator().manual_seed(seed))
     return counts.log1p().movedim(2, -1).contiguous().movedim(-1, 2)
@@ -169,13 +170,13 @@ def _inside_plain(run: Callable[[], object]) -> Callable[[], object]:
     return plainly
 
 
-def _agree(engine: Engine, network: NeuroVE, spikes: Tensor, rest: NetworkState) -> bool:
-    """Whether the engine fires as its plain form, bit for bit, and the network answers alike in the first window."""
-    fired = engine.features(spikes, rest)[0]
+def _agree(engine: Engine, network: NeuroVE, spikes: Tensor, initial: NetworkState) -> bool:
+    """Whether the spikes equal the reference implementation bit for bit, and the twists of the first window agree."""
+    fired = engine.features(spikes, initial)[0]
     with plain():
-        same = torch.equal(engine.features(spikes, rest)[0], fired)
-        expected = network(spikes[:1], rest)[0]
-    return bool(same and torch.allclose(engine(spikes[:1], rest)[0], expected, rtol=1e-3, atol=1e-4))
+        same = torch.equal(engine.features(spikes, initial)[0], fired)
+        expected = network(spikes[:1], initial)[0]
+    return bool(same and torch.allclose(engine(spikes[:1], initial)[0], expected, rtol=1e-3, atol=1e-4))
 
 
 class _TrainingStep:
@@ -183,11 +184,11 @@ class _TrainingStep:
 
     def __init__(self, network: NeuroVE, spikes: Tensor) -> None:
         self._network, self._spikes = copy.deepcopy(network), spikes
-        self._rest = self._network.initial_state(spikes.shape[1])
+        self._initial = self._network.initial_state(spikes.shape[1])
         self._optimizer = torch.optim.Adam(self._network.parameters(), lr=1e-4, fused=True)  # for peers too
 
     def loss(self) -> float:
-        """Before the step."""
+        """The loss before the step."""
         with torch.no_grad():
             return float(self._error())
 
@@ -197,4 +198,4 @@ class _TrainingStep:
         self._optimizer.step()
 
     def _error(self) -> Tensor:
-        return torch.mean((self._network(self._spikes, self._rest)[0] - 0.5).square())
+        return torch.mean((self._network(self._spikes, self._initial)[0] - 0.5).square())

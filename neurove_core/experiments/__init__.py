@@ -1,4 +1,4 @@
-"""The paper's experiments, each reproduced by one command: `neurove reproduce`. Nothing else imports them."""
+"""The paper's experiments. `neurove reproduce` runs each with one command; no other package imports them."""
 
 from pathlib import Path
 
@@ -6,7 +6,7 @@ from neurove_core.figures import unwritable
 
 
 def save_text(text: str, file: Path) -> Path:
-    """Write a text file, with the folders above it; returns its path.
+    """Write a text file, create the folders above it, and return its path.
 
     Raises:
         InvalidField: the file cannot be written.

@@ -1,10 +1,10 @@
-"""How often ALIF, LIF and LTC fire under one random current: the paper's firing-frequency figure, with rates.
+"""Firing rates of ALIF, LIF and LTC under the same random currents: the paper's firing-frequency figure, with numbers.
 
-Source: NeuroVE, section IV-B and its figure "Results of neuronal firing frequency". The paper gives no current, no
-threshold, no leak, no D and no number; those here are in this module's constants and in every file it writes.
+Source: NeuroVE, section IV-B and its figure "Results of neuronal firing frequency". The paper states no current, no
+threshold, no leak, no D and no rate. Those used here are constants of this module and appear in every file it writes.
 
-J adds positive drive wherever the potential that diffuses is positive on average, as it is here: that ALIF fires more
-than LIF is expected and says nothing about accuracy.
+J adds positive drive wherever the diffusing potential is positive on average, which is the case here. ALIF is therefore
+expected to fire more than LIF, and a higher rate says nothing about accuracy.
 """
 
 import json
@@ -18,20 +18,10 @@ from torch import Tensor
 
 from neurove_core.experiments import save_text
 from neurove_core.figures import blank_figure, save_figure
-from neurove_core.layers import require
-from neurove_core.neurons import (
-    LIF,
-    ALIFParams,
-    LIFParams,
-    LIFState,
-    LTCParams,
-    LTCState,
-    NeuronSteps,
-    alif_potential,
-    diffuse,
-    fire,
-    ltc_step,
-)
+from neurove_core.spiking.alif import ALIFParams, alif_potential, diffuse
+from neurove_core.spiking.layers import require
+from neurove_core.spiking.lif import LIF, LIFParams, LIFState, NeuronSteps, fire
+from neurove_core.spiking.ltc import LTCParams, LTCState, ltc_step
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -41,9 +31,9 @@ SEEDS = 10
 V_TH = 1.0
 DECAY = 0.5
 DIFFUSIONS = (0.1, 0.25, 0.5)
-LTC_V_TH = 0.5  # Yin's own
+LTC_V_TH = 0.5  # the value of Yin
 LTC_NEURONS = 64  # per seed, each with its own random time constant
-SHOWN_D = 0.25  # in the figure
+SHOWN_D = 0.25  # D of ALIF in the figure
 SHOWN_STEPS = 200
 
 CURRENTS = {
@@ -51,8 +41,10 @@ CURRENTS = {
     "normal": {"mean": 0.33, "sd": 0.28},
     "uniform": {"low": 0.0, "high": 1.0},
 }
-"""Ornstein-Uhlenbeck, normal, uniform. Chosen so that LIF fires as often as in the preparing study, which does not
-tell its currents; uniform from 0 to 1 needed no choice."""
+"""Ornstein-Uhlenbeck, normal and uniform currents, dimensionless. The preliminary study does not state its currents.
+
+The first two are chosen so that LIF fires as often as in that study; uniform from 0 to 1 needed no choice.
+"""
 
 STUDY: dict[str, dict[str, float]] = {
     "LIF": {"ou": 0.096, "normal": 0.080, "uniform": 0.232},
@@ -66,25 +58,25 @@ STUDY: dict[str, dict[str, float]] = {
     "LTC, v_th 1": {"ou": 0.003},
     "Eq. (6a) literal, no leak, D = 0": {"ou": 0.257},
 }
-"""Rates of the preparing study, whose seeds are others."""
+"""Rates [spikes per step] of the preliminary study, which used other seeds."""
 
 
 class Rate(NamedTuple):
-    """Spikes per neuron and step: mean over the seeds, and standard deviation between them."""
+    """Spikes per neuron and step: mean and standard deviation over the seeds."""
 
     mean: float
     sd: float
 
 
-class Report(NamedTuple):
-    """What one run measured."""
+class Results(NamedTuple):
+    """The rates of one run."""
 
-    seed: int  # of the first of SEEDS runs
+    seed: int  # the first of SEEDS seeds
     rates: dict[str, dict[str, Rate]]  # by neuron, then by current
 
 
-def run(seed: int = 0) -> Report:
-    """Measure every neuron under every current, with the seeds seed to seed + 9.
+def run(seed: int = 0) -> Results:
+    """Measure every neuron under every current, with the seeds `seed` to `seed` + 9.
 
     Raises:
         InvalidField: a seed below 0.
@@ -98,11 +90,20 @@ def run(seed: int = 0) -> Report:
         rates[neuron] = {
             kind: Rate(row.mean().item(), row.std().item()) for kind, row in zip(CURRENTS, of_kind, strict=True)
         }
-    return Report(seed, rates)
+    return Results(seed, rates)
 
 
 def random_current(kind: str, seed: int, steps: int = STEPS) -> Tensor:
-    """A random current (T,), dimensionless, of a kind of CURRENTS; Ornstein-Uhlenbeck begins at its mean."""
+    """A random current (T,), dimensionless; Ornstein-Uhlenbeck starts at its mean.
+
+    Args:
+        kind: a key of CURRENTS.
+        seed: of the random numbers.
+        steps: T.
+
+    Raises:
+        InvalidField: the kind is unknown.
+    """
     require(kind in CURRENTS, "reproduce firing", "kind", kind, f"must be one of {', '.join(CURRENTS)}")
     rng, law = np.random.default_rng(seed), CURRENTS[kind]
     if kind == "uniform":
@@ -118,10 +119,10 @@ def random_current(kind: str, seed: int, steps: int = STEPS) -> Tensor:
 
 @torch.no_grad()
 def responses(current: Tensor, seed: int) -> dict[str, NeuronSteps]:
-    """What every neuron does under B currents (T, B): by its name, spikes and potentials (T, B, N).
+    """Spikes and potentials (T, B, N) of every neuron, by its name, under B currents.
 
     Args:
-        current: of each of the B runs.
+        current: (T, B), one current per run.
         seed: of the random weights of LTC.
     """
     x = current[..., None]
@@ -140,7 +141,7 @@ def responses(current: Tensor, seed: int) -> dict[str, NeuronSteps]:
 
 
 def lif_params(decay: float = DECAY) -> LIFParams:
-    """The part that LIF and ALIF share, so that D is all they differ in."""
+    """The parameters that LIF and ALIF share, so that they differ only in D."""
     return LIFParams(decay, V_TH)
 
 
@@ -152,7 +153,7 @@ def lif(x: Tensor) -> NeuronSteps:
 
 
 def alif(x: Tensor, v_before: Tensor, params: ALIFParams) -> NeuronSteps:
-    """ALIF neurons as neurons.alif_step with f the identity, on currents and the potentials of neighbours (T, B, 1)."""
+    """ALIF neurons as `alif_step` with f the identity, for currents and neighbour potentials (T, B, 1)."""
     state, steps = LIFState(torch.zeros_like(x[0])), []
     for current, neighbour in zip(x, v_before, strict=True):
         v = alif_potential(diffuse(current, neighbour, params.d_space), state, params)
@@ -162,9 +163,9 @@ def alif(x: Tensor, v_before: Tensor, params: ALIFParams) -> NeuronSteps:
 
 
 def own_before_reset(x: Tensor, d: float) -> NeuronSteps:
-    """ALIF neurons whose own potential diffuses to their next step as it was before the reset, as Eq. (9) in ASLSTM.
+    """ALIF neurons whose own potential before the reset diffuses to the next step, as in Eq. (9) of ASLSTM.
 
-    A neuron that fired keeps D v of what the reset took: that is why this reading fires most.
+    A neuron that fired keeps D v in spite of the reset. This reading therefore has the highest rate.
     """
     params = lif_params()
     state, v, steps = LIFState(torch.zeros_like(x[0])), torch.zeros_like(x[0]), []
@@ -176,10 +177,18 @@ def own_before_reset(x: Tensor, d: float) -> NeuronSteps:
 
 
 def ltc(x: Tensor, seed: int, v_th: float) -> NeuronSteps:
-    """LTC neurons without synapses: d is the current itself, the weights of the time constant are random per neuron.
+    """LTC neurons without synapses: d is the current itself, and the weights of the time constant are random.
 
-    Each of the N = LTC_NEURONS sees only itself: its W_a [d, m] has one weight for d and one for m, from
-    U(-1, 1)/sqrt(2), no bias. Currents (T, B, 1) to spikes and potentials after the reset (T, B, N).
+    The N = LTC_NEURONS neurons are independent: W_a [d, m] of each has one weight for d and one for m, drawn from
+    U(-1, 1)/sqrt(2), and no bias.
+
+    Args:
+        x: currents (T, B, 1).
+        seed: of the random weights.
+        v_th: threshold.
+
+    Returns:
+        spikes and potentials after the reset (T, B, N).
     """
     rng, n = np.random.default_rng([seed, 1]), LTC_NEURONS
     w_d, w_m = (torch.from_numpy(rng.uniform(-1, 1, n) / math.sqrt(2)) for _ in range(2))
@@ -200,75 +209,76 @@ def ltc(x: Tensor, seed: int, v_th: float) -> NeuronSteps:
 
 
 def stacked(steps: list[tuple[Tensor, Tensor]]) -> NeuronSteps:
-    """Spikes and potentials of single steps as sequences."""
+    """Stack the spikes and potentials of single steps into sequences."""
     spikes, potentials = zip(*steps, strict=True)
     return NeuronSteps(torch.stack(spikes), torch.stack(potentials))
 
 
-def to_json(report: Report) -> str:
-    """The report for machines: set-up, rates, and the preparing study's rates."""
+def to_json(results: Results) -> str:
+    """The results as JSON: the set-up, the rates, and the rates of the preliminary study."""
     about = {
-        "command": f"neurove reproduce firing --seed {report.seed}",
-        "seeds": [report.seed, report.seed + SEEDS - 1],
+        "command": f"neurove reproduce firing --seed {results.seed}",
+        "seeds": [results.seed, results.seed + SEEDS - 1],
         "steps": STEPS,
         "v_th": V_TH,
         "decay": DECAY,
         "currents": CURRENTS,
         "rates": {
-            neuron: {kind: rate._asdict() for kind, rate in by_kind.items()} for neuron, by_kind in report.rates.items()
+            neuron: {kind: rate._asdict() for kind, rate in by_kind.items()}
+            for neuron, by_kind in results.rates.items()
         },
         "study": STUDY,
     }
     return json.dumps(about, indent=2) + "\n"
 
 
-def to_markdown(report: Report) -> str:
-    """The rates as a table: mean over the seeds, deviation between them, and the preparing study's in brackets."""
+def to_markdown(results: Results) -> str:
+    """The rates as a Markdown table: mean, standard deviation, and the rate of the preliminary study in brackets."""
     lines = [
-        f"Spikes per step: mean ± standard deviation over {SEEDS} seeds ({report.seed} to {report.seed + SEEDS - 1}) "
-        f"of {STEPS} steps; in brackets the preparing study's. LIF and ALIF: v_th {V_TH:g}, leak {DECAY:g}.",
+        f"Spikes per step: mean ± standard deviation over {SEEDS} seeds ({results.seed} to {results.seed + SEEDS - 1}) "
+        f"of {STEPS} steps; in brackets those of the preliminary study. LIF and ALIF: v_th {V_TH:g}, leak {DECAY:g}.",
         "",
         f"| neuron | {' | '.join(CURRENTS)} |",
         f"| --- | {' | '.join('---' for _ in CURRENTS)} |",
     ]
-    for neuron, by_kind in report.rates.items():
+    for neuron, by_kind in results.rates.items():
         cells = (cell(rate, STUDY.get(neuron, {}).get(kind)) for kind, rate in by_kind.items())
         lines.append(f"| {neuron} | {' | '.join(cells)} |")
     lines += [
         "",
         "ALIF own v: D v(t-1) of the same neuron before its reset, as (9) in ASLSTM; after reset: as `alif_step`;",
         "neighbour v: D V_i of a LIF neuron under the same current, before its reset. The literal, leakless Eq. (6a)",
-        "is own v after reset at D = 0.5, for 0.5 + 0.5 = 1.",
+        "equals own v after reset at D = 0.5, because 0.5 + 0.5 = 1.",
         "",
-        "J adds positive drive, so ALIF firing more than LIF is expected. LTC fires about as often as LIF at its own",
-        "threshold of 0.5, for its potential averages the current, where LIF's sums it up to twice as high.",
+        "J adds positive drive, so ALIF is expected to fire more than LIF. LTC at its own threshold of 0.5 fires about",
+        "as often as LIF, because its potential averages the current, while that of LIF sums it up to twice as high.",
     ]
     return "\n".join(lines) + "\n"
 
 
 def cell(rate: Rate, study: float | None) -> str:
-    """One number of the table."""
+    """One cell of the table."""
     return f"{rate.mean:.3f} ± {rate.sd:.3f}" + ("" if study is None else f" ({study:.3f})")
 
 
-def save(report: Report, out: Path) -> list[Path]:
-    """Write firing.json, firing.md, firing.png and firing.svg into a folder; returns their paths.
+def save(results: Results, out: Path) -> list[Path]:
+    """Write firing.json, firing.md, firing.png and firing.svg into a folder and return their paths.
 
     Raises:
-        MissingExtra: matplotlib is not installed; then nothing is written.
+        MissingExtra: matplotlib is not installed, and nothing is written.
         InvalidField: a file cannot be written.
     """
-    figure = draw(report.seed)
+    figure = draw(results.seed)
     return [
-        save_text(to_json(report), out / "firing.json"),
-        save_text(to_markdown(report), out / "firing.md"),
+        save_text(to_json(results), out / "firing.json"),
+        save_text(to_markdown(results), out / "firing.md"),
         *save_figure(figure, out / "firing"),
     ]
 
 
 @torch.no_grad()
 def draw(seed: int) -> "Figure":
-    """The paper's figure: one random current, and what ALIF, LIF and LTC make of it; the first SHOWN_STEPS steps.
+    """The paper's figure: one random current and the responses of ALIF, LIF and LTC, for the first SHOWN_STEPS steps.
 
     Raises:
         MissingExtra: matplotlib is not installed.

@@ -1,10 +1,13 @@
-"""How settled a model's first estimates are after a change of model: cold, with the old state, primed with N windows.
+"""Error of the first estimates after a model swap, for several start states of the new model.
 
-Not of the paper. What a change costs is measured against a run of the new model that was never swapped, on streets that
-the default model has not seen, in standard deviations of that run's own estimates, per axis. The old model of the
-carried state is the new one with every weight moved by 2 %: about as far as two trainings of one model lie apart at
-their end. The error of the first estimate after N windows from rest is all that N decides (decision 29). Beside it
-stands the error against the truth, which is what a robot feels.
+The start state is cold (the zero state), carried (the state of the old model), or primed (N windows replayed from the
+zero state). N affects only the error of the first estimate after these N windows (decision 29). This experiment is not
+in the paper.
+
+The reference is a run of the new model that was never swapped, on streets that the default model has not seen. Errors
+against it are given in standard deviations of the estimates of that run, per axis. The old model is the new one with
+every weight shifted by 2 %, which is about the difference between two trainings of one model. The errors against the
+ground truth are given too, because they are what a robot experiences.
 """
 
 import json
@@ -18,52 +21,52 @@ import torch
 from numpy.typing import NDArray
 
 from neurove_core import models
-from neurove_core.bundle import Bundle, from_bytes
 from neurove_core.estimator import Estimator, StreamState
 from neurove_core.experiments import save_text
 from neurove_core.figures import blank_figure, save_figure
-from neurove_core.layers import require
+from neurove_core.ingest.windows import Window, WindowsState, push
+from neurove_core.models.bundle import Bundle, from_bytes
 from neurove_core.sim.simulate import Simulation
 from neurove_core.sim.source import simulation_of
+from neurove_core.spiking.layers import require
 from neurove_core.training.data import true_twists
-from neurove_core.windows import Window, WindowsState, push
-from protocol import Sensor
+from neurove_protocol import Sensor
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PRIMED = (8, 16, 32, 64)
-SETTLED = 0.02  # of the standard deviation of the estimates
-SHIFT = 0.02  # of each weight, between the old model and the new one
-FIRST_SEED = 5000  # the default model has seen no street of these seeds
-AFTER = 48  # windows after the change that are looked at
+SETTLED = 0.02  # largest error of a settled estimate [standard deviations]
+SHIFT = 0.02  # relative shift of each weight between the old and the new model
+FIRST_SEED = 5000  # the default model was trained on no street of these seeds
+AFTER = 48  # evaluated windows after a swap
 CAMERA = "davis346-half"
 SWAPS = 4  # per street
-APART = 12  # windows between them
+SWAP_INTERVAL = 12  # windows between swaps
 NEVER = "never swapped"
 
 Array = NDArray[np.float64]
 
 
-class Report(NamedTuple):
-    """What one run measured: by way of changing, the error of the first windows after it, in standard deviations."""
+class Results(NamedTuple):
+    """Errors of the windows after a swap, by start state; in standard deviations, except `off_truth`."""
 
     model: str
     digest: str
     streets: int
     swaps: int
     seconds: float
-    errors: dict[str, list[float]]  # RMS over axes, bins and swaps, of each window after the change
-    worst: dict[str, list[float]]  # of the worst axis, RMS over bins and swaps
-    off_truth: dict[str, dict[str, list[float]]]  # "m/s" and "deg/s": by way, NEVER among them, RMSE of each window
-    least_primed: int | None  # least N whose first estimate is within SETTLED; None where none is
+    errors: dict[str, list[float]]  # RMS over axes, bins and swaps, for each window after the swap
+    worst: dict[str, list[float]]  # the same for the worst axis, RMS over bins and swaps
+    off_truth: dict[str, dict[str, list[float]]]  # by "m/s" and "deg/s", then start state or NEVER: RMSE per window
+    least_primed: int | None  # least N whose first estimate is within SETTLED; None if there is none
 
 
-class _Answers(NamedTuple):
-    """What was said on one street."""
+class _StreetEstimates(NamedTuple):
+    """The estimates on one street."""
 
-    variance: Array  # (6) of the run that was never swapped
-    of: dict[str, list[Array]]  # by way of changing, for each change the answers (AFTER, n, 6) after it
+    variance: Array  # (6) of the estimates of the run that was never swapped
+    by_start: dict[str, list[Array]]  # by start state or NEVER: twists (AFTER, n, 6) after each swap
 
 
 def run(
@@ -71,62 +74,70 @@ def run(
     streets: int = 6,
     primed: Iterable[int] = PRIMED,
     progress: Callable[[str], None] = lambda _: None,
-) -> Report:
-    """Change to a model on some streets, in every way, and look at its first estimates.
+) -> Results:
+    """Swap to a model on some streets from every start state and measure the errors of its estimates.
 
     Args:
-        model: name of a built-in model, or a bundle's file.
-        streets: held-out ones, of seeds FIRST_SEED and up.
+        model: name of a built-in model, or the file of a bundle.
+        streets: number of held-out streets, with seeds from FIRST_SEED.
         primed: numbers of windows to replay.
-        progress: told the name of each street as it is done.
+        progress: is called with the name of each finished street.
 
     Raises:
-        InvalidField: no street, or no number of windows. BadModel: the model can not be loaded.
+        InvalidField: there is no street or no number of windows. BadModel: the model cannot be loaded.
     """
     replayed = sorted(set(primed))
     require(streets >= 1, "reprime", "streets", streets, "must be at least 1")
     require(bool(replayed) and replayed[0] >= 1, "reprime", "primed", replayed, "must be numbers of windows above 0")
     bundle = models.find(model)
     new, old = Estimator(bundle), Estimator(shifted(bundle))
-    swaps_at = [replayed[-1] + 16 + i * APART for i in range(SWAPS)]
+    swaps_at = [replayed[-1] + 16 + i * SWAP_INTERVAL for i in range(SWAPS)]
     windows = swaps_at[-1] + AFTER
     seconds = windows * bundle.config.window.duration_us / 1e6
-    apart: dict[str, list[Array]] = {}
-    off: dict[str, list[Array]] = {}
+    swap_errors: dict[str, list[Array]] = {}
+    truth_errors: dict[str, list[Array]] = {}
     for street in range(streets):
         simulation = simulation_of(f"sim://street?seed={FIRST_SEED + street}&camera={CAMERA}&seconds={seconds + 0.1:g}")
-        answers = _ways(new, old, windows_of(simulation, new)[:windows], swaps_at, replayed)
+        estimates = _estimates_on_street(new, old, windows_of(simulation, new)[:windows], swaps_at, replayed)
         truth = true_twists(simulation.trajectory, windows, new.config)
-        units = np.array([simulation.lens.height_m] * 3 + [1.0] * 3)  # it answers for a camera at 1 m
-        for way, runs in answers.of.items():
-            for at, said, never in zip(swaps_at, runs, answers.of[NEVER], strict=True):
-                apart.setdefault(way, []).append(((said - never) ** 2).mean(axis=1) / answers.variance)
-                off.setdefault(way, []).append(((said * units - truth[at : at + AFTER]) ** 2).mean(axis=1))
+        units = np.array([simulation.lens.height_m] * 3 + [1.0] * 3)  # the estimates are for a camera height of 1 m
+        for start, runs in estimates.by_start.items():
+            for at, estimate, never in zip(swaps_at, runs, estimates.by_start[NEVER], strict=True):
+                swap_errors.setdefault(start, []).append(((estimate - never) ** 2).mean(axis=1) / estimates.variance)
+                truth_errors.setdefault(start, []).append(
+                    ((estimate * units - truth[at : at + AFTER]) ** 2).mean(axis=1)
+                )
         progress(simulation.name)
-    del apart[NEVER]
-    means = {way: np.mean(errors, axis=0) for way, errors in apart.items()}  # (AFTER, 6)
-    rms = {way: np.sqrt(mean.mean(axis=1)).tolist() for way, mean in means.items()}
+    del swap_errors[NEVER]
+    means = {start: np.mean(errors, axis=0) for start, errors in swap_errors.items()}  # (AFTER, 6)
+    rms = {start: np.sqrt(mean.mean(axis=1)).tolist() for start, mean in means.items()}
     settled = [n for n in replayed if rms[_name(n)][0] <= SETTLED]
-    return Report(
+    return Results(
         model=bundle.name,
         digest=bundle.digest,
         streets=streets,
         swaps=streets * SWAPS,
         seconds=seconds,
         errors=rms,
-        worst={way: np.sqrt(mean.max(axis=1)).tolist() for way, mean in means.items()},
-        off_truth={"m/s": _lengths(off, slice(0, 3), 1.0), "deg/s": _lengths(off, slice(3, 6), 180 / np.pi)},
+        worst={start: np.sqrt(mean.max(axis=1)).tolist() for start, mean in means.items()},
+        off_truth={
+            "m/s": _lengths(truth_errors, slice(0, 3), 1.0),
+            "deg/s": _lengths(truth_errors, slice(3, 6), 180 / np.pi),
+        },
         least_primed=settled[0] if settled else None,
     )
 
 
-def _lengths(off: dict[str, list[Array]], axes: slice, unit: float) -> dict[str, list[float]]:
-    """Root of the mean squared length of a group of axes, by way and window, in another unit."""
-    return {way: (unit * np.sqrt(np.mean(one, axis=0)[:, axes].sum(axis=1))).tolist() for way, one in off.items()}
+def _lengths(truth_errors: dict[str, list[Array]], axes: slice, unit: float) -> dict[str, list[float]]:
+    """RMS length of the error over some axes, by start state and window, times a unit factor."""
+    return {
+        start: (unit * np.sqrt(np.mean(one, axis=0)[:, axes].sum(axis=1))).tolist()
+        for start, one in truth_errors.items()
+    }
 
 
 def shifted(bundle: Bundle, share: float = SHIFT) -> Bundle:
-    """A model beside another: every weight is moved by a normal draw of so much of itself."""
+    """A copy of a model with every weight shifted by a normal random share of itself, of this standard deviation."""
     draw = torch.Generator().manual_seed(0)
     moved = from_bytes(bundle.to_bytes(), bundle.name)
     with torch.no_grad():
@@ -136,42 +147,44 @@ def shifted(bundle: Bundle, share: float = SHIFT) -> Bundle:
 
 
 def windows_of(simulation: Simulation, estimator: Estimator) -> list[Window]:
-    """The windows of a simulation as the service cuts them for a model."""
+    """The windows of a simulation, split as the service splits them for a model."""
     state, windows = estimator.initial_state(simulation.sensor, simulation.lens.info), []
-    cut = WindowsState()
+    window_state = WindowsState()
     for step in simulation.steps():
         config = estimator.config
-        pushed = push(step.events, step.stop_us, cut, state.lut, config.window, config.canonical)
-        cut = pushed.state
+        pushed = push(step.events, step.stop_us, window_state, state.lut, config.window, config.canonical)
+        window_state = pushed.state
         windows += pushed.windows
     return windows
 
 
-def _ways(new: Estimator, old: Estimator, windows: list[Window], swaps_at: list[int], primed: list[int]) -> _Answers:
-    """Follow one street in every way of changing."""
-    never, _ = _said(new, windows, _rest(new))
+def _estimates_on_street(
+    new: Estimator, old: Estimator, windows: list[Window], swaps_at: list[int], primed: list[int]
+) -> _StreetEstimates:
+    """Run one street from every start state at every swap."""
+    never, _ = _estimates(new, windows, _zero_state(new))
     variance = never.reshape(-1, 6).var(axis=0)
-    carried = _rest(old)
+    carried = _zero_state(old)
     found: dict[str, list[Array]] = {NEVER: [never[at : at + AFTER] for at in swaps_at]}
     done = 0
     for at in swaps_at:
-        _, carried = _said(old, windows[done:at], carried)
+        _, carried = _estimates(old, windows[done:at], carried)
         done = at
-        starts = {"cold": _rest(new), "carried": carried}
-        starts |= {_name(n): _said(new, windows[at - n : at], _rest(new))[1] for n in primed}
-        for way, state in starts.items():
-            said, _ = _said(new, windows[at : at + AFTER], state)
-            found.setdefault(way, []).append(said)
-    return _Answers(variance, found)
+        starts = {"cold": _zero_state(new), "carried": carried}
+        starts |= {_name(n): _estimates(new, windows[at - n : at], _zero_state(new))[1] for n in primed}
+        for start, state in starts.items():
+            estimate, _ = _estimates(new, windows[at : at + AFTER], state)
+            found.setdefault(start, []).append(estimate)
+    return _StreetEstimates(variance, found)
 
 
-def _said(estimator: Estimator, windows: list[Window], state: StreamState) -> tuple[Array, StreamState]:
-    """Answers (W, n, 6) to windows, and the state after them."""
+def _estimates(estimator: Estimator, windows: list[Window], state: StreamState) -> tuple[Array, StreamState]:
+    """Twists (W, n, 6) for W windows, and the state after them."""
     estimates, state = estimator.follow(windows, state)
     return np.array([one.twists for one in estimates]), state
 
 
-def _rest(estimator: Estimator) -> StreamState:
+def _zero_state(estimator: Estimator) -> StreamState:
     grid = estimator.config.canonical
     return estimator.initial_state(Sensor(grid.width, grid.height))
 
@@ -180,68 +193,71 @@ def _name(primed: int) -> str:
     return f"primed {primed}"
 
 
-def to_json(report: Report) -> str:
-    """The report for machines."""
-    about: dict[str, Any] = report._asdict()
-    about |= {"errors": _rounded(report.errors), "worst": _rounded(report.worst)}
-    about["off_truth"] = {unit: _rounded(ways) for unit, ways in report.off_truth.items()}
+def to_json(results: Results) -> str:
+    """The results as JSON."""
+    about: dict[str, Any] = results._asdict()
+    about |= {"errors": _rounded(results.errors), "worst": _rounded(results.worst)}
+    about["off_truth"] = {unit: _rounded(by_start) for unit, by_start in results.off_truth.items()}
     return json.dumps(about) + "\n"
 
 
-def _rounded(ways: dict[str, list[float]]) -> dict[str, list[float]]:
-    return {way: [round(one, 5) for one in errors] for way, errors in ways.items()}
+def _rounded(by_start: dict[str, list[float]]) -> dict[str, list[float]]:
+    return {start: [round(one, 5) for one in errors] for start, errors in by_start.items()}
 
 
-def to_markdown(report: Report) -> str:
-    """The report as a table: windows after the change in the columns."""
+def to_markdown(results: Results) -> str:
+    """The results as Markdown tables, with the windows after the swap in the columns."""
     shown = [0, 1, 4, 8, 16, 32]
     lines = [
-        f"Model {report.model} ({report.digest[:12]}), {report.swaps} changes on {report.streets} held-out streets. "
-        "Error of the estimates after a change against a run that was never swapped, RMS in standard deviations.",
+        f"Model {results.model} ({results.digest[:12]}), {results.swaps} swaps on {results.streets} held-out "
+        "streets. Error of the estimates after a swap against a run that was never swapped, RMS in standard "
+        "deviations.",
         "",
-        "| way | " + " | ".join("first" if i == 0 else f"{i} windows later" for i in shown) + " | first, worst axis |",
+        "| start | "
+        + " | ".join("first" if i == 0 else f"{i} windows later" for i in shown)
+        + " | first, worst axis |",
         "| --- |" + " --- |" * (len(shown) + 1),
     ]
-    for way, errors in report.errors.items():
+    for start, errors in results.errors.items():
         cells = [f"{errors[i]:.4f}" for i in shown if i < len(errors)]
-        lines.append(f"| {way} | {' | '.join(cells)} | {report.worst[way][0]:.4f} |")
-    least = "no N of these" if report.least_primed is None else f"N = {report.least_primed}"
+        lines.append(f"| {start} | {' | '.join(cells)} | {results.worst[start][0]:.4f} |")
+    least = "no N of these" if results.least_primed is None else f"N = {results.least_primed}"
     lines += ["", f"Least N whose first estimate is within {100 * SETTLED:g} % of the standard deviation: {least}.", ""]
     lines += ["RMSE of the same estimates against the truth, linear [m/s] / angular [deg/s].", ""]
-    lines += ["| way | " + " | ".join("first" if i == 0 else f"{i} windows later" for i in shown) + " | all |"]
+    lines += ["| start | " + " | ".join("first" if i == 0 else f"{i} windows later" for i in shown) + " | all |"]
     lines += ["| --- |" + " --- |" * (len(shown) + 1)]
-    for way, linear in report.off_truth["m/s"].items():
-        both = linear, report.off_truth["deg/s"][way]
+    for start, linear in results.off_truth["m/s"].items():
+        both = linear, results.off_truth["deg/s"][start]
         cells = [" / ".join(f"{one[i]:.2f}" for one in both) for i in shown if i < len(linear)]
         cells.append(" / ".join(f"{np.sqrt(np.mean(np.square(one))):.2f}" for one in both))
-        lines.append(f"| {way} | {' | '.join(cells)} |")
+        lines.append(f"| {start} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
-def draw(report: Report) -> "Figure":
-    """The error of the windows after a change, by way of changing.
+def draw(results: Results) -> "Figure":
+    """Plot the error of the windows after a swap, by start state.
 
     Raises:
         MissingExtra: matplotlib is not installed.
     """
     figure = blank_figure(7.0, 4.0)
     axes = figure.subplots()
-    for way, errors in report.errors.items():
-        axes.semilogy(np.arange(len(errors)), np.maximum(errors, 1e-7), label=way, lw=1.5)
+    for start, errors in results.errors.items():
+        axes.semilogy(np.arange(len(errors)), np.maximum(errors, 1e-7), label=start, lw=1.5)
     axes.axhline(SETTLED, color="black", lw=0.8, ls="--", label=f"{100 * SETTLED:g} %")
-    axes.set_xlabel("windows after the change of model")
+    axes.set_xlabel("windows after the model swap")
     axes.set_ylabel("error [standard deviations]")
     axes.legend(ncols=2, fontsize=8)
     axes.grid(visible=True, alpha=0.3)
     return figure
 
 
-def save(report: Report, folder: Path) -> list[Path]:
+def save(results: Results, folder: Path) -> list[Path]:
     """Write repriming.json, repriming.md, repriming.png and repriming.svg.
 
     Raises:
         InvalidField: a file cannot be written. MissingExtra: matplotlib is not installed.
     """
-    files = [save_text(to_json(report), folder / "repriming.json")]
-    files.append(save_text(to_markdown(report), folder / "repriming.md"))
-    return files + save_figure(draw(report), folder / "repriming")
+    files = [save_text(to_json(results), folder / "repriming.json")]
+    files.append(save_text(to_markdown(results), folder / "repriming.md"))
+    return files + save_figure(draw(results), folder / "repriming")

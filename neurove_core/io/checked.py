@@ -5,8 +5,8 @@ from pathlib import Path
 
 from neurove_core.io.errors import BrokenRecording
 from neurove_core.io.recording import CHUNK_EVENTS, in_chunks, whole
-from protocol.errors import EventOutsideSensor, TimeBackwards
-from protocol.events import Events, Sensor, check_events
+from neurove_protocol.errors import EventOutsideSensor, TimeBackwards
+from neurove_protocol.events import Events, Sensor, check_events
 
 _ENOUGH = CHUNK_EVENTS // 4
 

@@ -1,22 +1,26 @@
-"""What can be wrong with a recording."""
+"""Errors of recordings: RecordingError and its cases."""
 
 from pathlib import Path
 
-from protocol.errors import NeuroVEError
+from neurove_protocol.errors import EXIT_FAILURE, NeuroVEError
 
 
-class UnknownSource(NeuroVEError):
-    """What was given names no recording that can be read."""
+class RecordingError(NeuroVEError):
+    """A recording, or a source of events, cannot be read."""
+
+
+class UnknownSource(RecordingError):
+    """The source is not a recording that can be read."""
 
     code = "unknown_source"
 
-    def __init__(self, source: str | Path, supported: tuple[str, ...], why: str) -> None:
-        known = "; ".join(supported)
-        super().__init__(f"source {str(source)!r}: {why}; supported are {known}", value=str(source), why=why)
+    def __init__(self, source: str | Path, why: str, supported: tuple[str, ...] = ()) -> None:
+        known = f"; supported sources: {'; '.join(supported)}" if supported else ""
+        super().__init__(f"source {str(source)!r}: {why}{known}", value=str(source), why=why)
 
 
-class MissingGeometry(NeuroVEError):
-    """The recording does not say how large its sensor is, and nobody else did."""
+class MissingGeometry(RecordingError):
+    """Neither the recording nor the caller gives the sensor size."""
 
     code = "missing_geometry"
 
@@ -24,16 +28,17 @@ class MissingGeometry(NeuroVEError):
         super().__init__(f"{path}: its header has no sensor geometry; give --sensor WIDTHxHEIGHT", value=str(path))
 
 
-class BrokenRecording(NeuroVEError):
-    """The recording can not be read beyond a place; what lies before it is whole."""
+class BrokenRecording(RecordingError):
+    """The recording is damaged at some place; everything before it was read."""
 
     code = "broken_recording"
+    exit_code = EXIT_FAILURE
 
     def __init__(self, path: Path, where: str, why: str) -> None:
         super().__init__(f"{path}: broken at {where}: {why}", value=str(path), where=where, why=why)
 
 
-class NoCarlaServer(NeuroVEError):
+class NoCarlaServer(RecordingError):
     """No CARLA simulator answers."""
 
     code = "no_carla_server"

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 from neurove_core.io.errors import BrokenRecording
-from protocol.events import Events
+from neurove_protocol.events import Events
 
 PACKET_US: Final = 4_000
 PACKET_EVENTS: Final = 20_000

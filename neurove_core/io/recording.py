@@ -8,32 +8,16 @@ from typing import Final, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.geometry import Poses, Twists
+from neurove_core.geometry.motion import Poses, Twists
 from neurove_core.io.errors import UnknownSource
-from protocol.camera import CameraInfo
-from protocol.events import Events, Sensor
+from neurove_protocol.camera import CameraInfo
+from neurove_protocol.events import Events, Sensor
 
 CHUNK_EVENTS: Final = 1 << 18
 """Most events in one chunk; 13 bytes each, so 3.4 MB."""
 
 BLOCK_BYTES: Final = 4 << 20
 """How much of a file is read at once [bytes]."""
-
-SUPPORTED: Final = (
-    "FILE.aedat4 (DV)",
-    "FILE.aedat (jAER's AEDAT 2.0)",
-    "FILE.raw (Prophesee EVT2, EVT3), FILE.dat (Prophesee DAT)",
-    "FILE.es (Event Stream)",
-    "FILE.mcap (our own, of `neurove record` and `neurove convert`)",
-    "FILE.bag (ROS 1), FILE.db3, FILE.mcap or their folder (ROS 2)",
-    "FILE.mat (eventVision-evbench)",
-    "FILE.npz (CARLA's event camera)",
-    "a folder with events.txt, a FILE.zip with one, or FILE.txt (Event Camera Dataset)",
-    "FILE.h5, FILE.hdf5 (MVSEC, DSEC, M3ED)",
-    "sim://SCENE?trajectory=...&seed=... (built-in simulator)",
-    "pattern:// (built-in)",
-)
-"""The sources that `open_source` knows."""
 
 
 class Imu(NamedTuple):
@@ -178,7 +162,7 @@ def refuse_topic(source: str | Path, topic: str | None) -> None:
         UnknownSource: a topic is given.
     """
     if topic is not None:
-        raise UnknownSource(source, SUPPORTED, f"it has one event stream and no topic {topic!r}")
+        raise UnknownSource(source, f"it has one event stream and no topic {topic!r}")
 
 
 def whole(events: Events, sensor: Sensor, not_before_us: int | None) -> Events:
@@ -192,6 +176,6 @@ def whole(events: Events, sensor: Sensor, not_before_us: int | None) -> Events:
     return events.span(0, events.n if good.all() else int(good.argmin()))
 
 
-def room(n: int) -> Events:
+def empty_events(n: int) -> Events:
     """Columns for a decoder to write this many events into."""
     return Events(np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8))

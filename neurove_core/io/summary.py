@@ -7,11 +7,11 @@ from typing import Any, Final, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.geometry import Twists
+from neurove_core.geometry.motion import Twists
 from neurove_core.io.errors import BrokenRecording
 from neurove_core.io.recording import Imu, Recording
-from protocol.errors import InvalidField
-from protocol.events import Events, Sensor
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import Events, Sensor
 
 PEAK_US: Final = 10_000
 """The peak rate is that of the busiest of these, counted from the first event on [us]."""

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from neurove_core.figures import blank_figure, write_figure
 from neurove_core.io.summary import SLICE_US, Survey
-from protocol.errors import InvalidField
+from neurove_protocol.errors import InvalidField
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

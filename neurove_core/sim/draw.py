@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.figures import blank_figure, write_figure
-from neurove_core.sim.camera import as_image, rays_of
+from neurove_core.sim.render.camera import as_image, rays_of
 from neurove_core.sim.simulate import INTERVAL_US, Simulation
-from protocol.errors import InvalidField
-from protocol.events import Events, Sensor
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import Events, Sensor
 
 EVENTS_US: Final = 60_000
 """How long events are collected for the picture."""

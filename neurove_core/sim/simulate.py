@@ -9,31 +9,31 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.geometry import Twists
+from neurove_core.geometry.motion import Twists
 from neurove_core.io.recording import EventsOnly, in_chunks
-from neurove_core.sim.camera import Camera, Rays, rays_of
-from neurove_core.sim.cull import Candidates, candidates_of
-from neurove_core.sim.interval import GRIDS, run_tiles, tile_speeds
-from neurove_core.sim.path import Moving
-from neurove_core.sim.pixels import (
+from neurove_core.sim.motion.trajectory import Mounted, Trajectory
+from neurove_core.sim.render.camera import Camera, Rays, rays_of
+from neurove_core.sim.render.cull import Candidates, candidates_of
+from neurove_core.sim.render.interval import GRIDS, run_tiles, tile_speeds
+from neurove_core.sim.render.pixels import (
     USUAL,
     PixelConfig,
     Pixels,
     PixelState,
     add_noise,
-    at_rest,
     low_pass,
     make_pixels,
-    put_in_order,
+    settled_state,
+    sort_events,
 )
-from neurove_core.sim.render import render_all
-from neurove_core.sim.scene import Scene, named_scene
-from neurove_core.sim.textures import make_textures
-from neurove_core.sim.trajectory import Mounted, Trajectory
-from neurove_core.sim.views import Backdrop, World, views_of
-from protocol.camera import CameraInfo
-from protocol.errors import InvalidField
-from protocol.events import Events, Sensor
+from neurove_core.sim.render.render import render_all
+from neurove_core.sim.render.views import Backdrop, World, views_of
+from neurove_core.sim.world.path import CameraPath
+from neurove_core.sim.world.scene import Scene, named_scene
+from neurove_core.sim.world.textures import make_textures
+from neurove_protocol.camera import CameraInfo
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import Events, Sensor
 
 INTERVAL_US: Final = 20_000
 """How much time is simulated at once; a chunk of events."""
@@ -54,7 +54,7 @@ class Step(NamedTuple):
     twists: Twists  # at the renders, the interval's end the last of them; exact, of the trajectory
     renders: float  # pictures rendered, in whole sensors: tiles are rendered at their own rates
 
-    def later(self, shift_us: int) -> "Step":
+    def shifted(self, shift_us: int) -> "Step":
         """The same with all times shifted."""
         events, twists = (part._replace(t=part.t + shift_us) for part in (self.events, self.twists))
         return Step(self.start_us + shift_us, self.stop_us + shift_us, events, twists, self.renders)  # type: ignore[arg-type]
@@ -76,13 +76,15 @@ class Simulation(EventsOnly):
     """
 
     scene: str
-    make_scene: Callable[[Moving, int], Scene]
-    trajectory: Moving  # of the camera, as it is mounted
+    make_scene: Callable[[CameraPath, int], Scene]
+    trajectory: CameraPath  # of the camera, as it is mounted
     lens: Camera
     pixels: PixelConfig
     seed: int
     duration_s: float  # infinite for one without end
-    following: Callable[[int], Moving] | None = None  # the trajectories that come after the first, by number from 1 on
+    next_trajectory: Callable[[int], CameraPath] | None = (
+        None  # the trajectories that come after the first, by number from 1 on
+    )
     motion_px: float = MOTION_PX  # training trades a little of each event's time for speed with more than the usual
 
     @property
@@ -127,26 +129,26 @@ class Simulation(EventsOnly):
         Args:
             start_s: when to begin; the pixels are then as after a long past, as they else are at 0.
         """
-        if self.following is None or start_s:
-            yield from _Film(self, self.trajectory, self.seed, start_s).run(round(start_s * 1e6), self.duration_s)
+        if self.next_trajectory is None or start_s:
+            yield from _Playback(self, self.trajectory, self.seed, start_s).run(round(start_s * 1e6), self.duration_s)
             return
         shift_us, trajectory = 0, self.trajectory
         for number in itertools.count(1):
             stop_us = math.floor(trajectory.duration_s * 1e6) // INTERVAL_US * INTERVAL_US
-            for step in _Film(self, trajectory, self.seed + number - 1).run(0, stop_us * 1e-6):
-                yield step.later(shift_us)
-            shift_us, trajectory = shift_us + stop_us, self.following(number)
+            for step in _Playback(self, trajectory, self.seed + number - 1).run(0, stop_us * 1e-6):
+                yield step.shifted(shift_us)
+            shift_us, trajectory = shift_us + stop_us, self.next_trajectory(number)
 
     def view(self, t_s: float) -> View:
         """What the camera sees at this time, pixel by pixel as `rays_of` orders them."""
-        film = _Film(self, self.trajectory, self.seed, t_s)
+        film = _Playback(self, self.trajectory, self.seed, t_s)
         return View(film.state.light, film.depth)
 
 
-class _Film:
+class _Playback:
     """One reading of a simulation: what it carries from interval to interval."""
 
-    def __init__(self, simulation: Simulation, trajectory: Moving, seed: int, t_s: float = 0.0) -> None:
+    def __init__(self, simulation: Simulation, trajectory: CameraPath, seed: int, t_s: float = 0.0) -> None:
         self._simulation, self._trajectory = simulation, trajectory
         self._rays: Rays = rays_of(simulation.lens.info)
         self._margin = float(max(self._rays.step_x.max(), self._rays.step_y.max()))
@@ -156,7 +158,7 @@ class _Film:
         self._pixels: Pixels = make_pixels(simulation.pixels, self._rays.x.size, simulation.seed)
         self._weights: dict[tuple[int, int], NDArray[np.float64]] = {}
         self.depth = np.full(self._rays.x.size, np.inf, np.float32)
-        self.state: PixelState = at_rest(self._pixels, self._first_render(t_s))
+        self.state: PixelState = settled_state(self._pixels, self._first_render(t_s))
 
     def _first_render(self, t_s: float) -> NDArray[np.float32]:
         world, when = self._world(t_s), np.array([t_s])
@@ -207,12 +209,12 @@ class _Film:
             parts,
             float(span_us),
             weights,
-            self._pixels.made,
+            self._pixels.mismatch,
             self.state,
             self.depth,
         )
         found = add_noise(self._pixels, start_us, stop_us, found)
-        found = put_in_order(found, start_us, span_us, config.refractory_us, self.state.last_us)
+        found = sort_events(found, start_us, span_us, config.refractory_us, self.state.last_us)
         t, pixel = found.t[: found.n] + np.int64(start_us), found.pixel[: found.n]
         events = Events(t, self._rays.column[pixel], self._rays.row[pixel], found.p[: found.n])
         rendered = when[steps // int(parts.max()) :: steps // int(parts.max())]

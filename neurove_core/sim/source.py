@@ -5,15 +5,16 @@ from typing import Final
 from urllib.parse import parse_qsl, urlsplit
 
 from neurove_core.io.errors import UnknownSource
-from neurove_core.io.recording import SUPPORTED
-from neurove_core.sim.camera import DEFAULT_CAMERA, DEFAULT_HEIGHT_M, named_camera
-from neurove_core.sim.curves import Mounted, Trajectory
-from neurove_core.sim.pixels import PixelConfig
-from neurove_core.sim.scene import named_scene
+from neurove_core.io.format import UrlFormat
+from neurove_core.io.recording import refuse_topic
+from neurove_core.sim.motion.curves import Mounted, Trajectory
+from neurove_core.sim.motion.trajectory import parse_trajectory
+from neurove_core.sim.render.camera import DEFAULT_CAMERA, DEFAULT_HEIGHT_M, named_camera
+from neurove_core.sim.render.pixels import PixelConfig
 from neurove_core.sim.simulate import Simulation
-from neurove_core.sim.trajectory import parse_trajectory
-from protocol.errors import InvalidField
-from protocol.events import Sensor
+from neurove_core.sim.world.scene import named_scene
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import Sensor
 
 DEFAULT_SCENE: Final = "street"
 TRAJECTORY_OF: Final = {
@@ -53,7 +54,7 @@ def simulation_of(url: str, sensor: Sensor | None = None) -> Simulation:
     unknown = sorted(query.keys() - set(_FIELDS))
     if parts.scheme != "sim" or parts.path.strip("/") or unknown:
         why = f"unknown parameter {unknown[0]!r}" if unknown else "sim://SCENE?trajectory=...&seed=... is expected"
-        raise UnknownSource(url, SUPPORTED, why)
+        raise UnknownSource(url, why)
     scene = parts.netloc or DEFAULT_SCENE
     make_scene = named_scene(scene)
     seed = _seed(url, query.get("seed", "0"))
@@ -71,9 +72,9 @@ def simulation_of(url: str, sensor: Sensor | None = None) -> Simulation:
         return Mounted(parse_trajectory(named, None if math.isinf(seconds) else seconds), *mount)
 
     first = trajectory(0)
-    following = trajectory if math.isinf(seconds) and text in _SEEDED else None
-    duration_s = math.inf if following else min(seconds, first.duration_s)
-    return Simulation(scene, make_scene, first, camera, PixelConfig(), seed, duration_s, following)
+    next_trajectory = trajectory if math.isinf(seconds) and text in _SEEDED else None
+    duration_s = math.inf if next_trajectory else min(seconds, first.duration_s)
+    return Simulation(scene, make_scene, first, camera, PixelConfig(), seed, duration_s, next_trajectory)
 
 
 def _seed(url: str, text: str) -> int:
@@ -90,3 +91,11 @@ def _number(url: str, query: dict[str, str], field: str, default: float) -> floa
     if math.isnan(value):
         raise InvalidField(url, field, query[field], "a number is expected")
     return value
+
+
+def _open(url: str, sensor: Sensor | None, topic: str | None) -> Simulation:
+    refuse_topic(url, topic)
+    return simulation_of(url, sensor)
+
+
+FORMAT = UrlFormat("sim://SCENE?trajectory=...&seed=... (built-in simulator)", "sim", _open)

@@ -1,1 +1,1 @@
-"""Training: what a network learns from, how it learns, and what is kept of it on the way."""
+"""Training: sequences, augmentation, the loop, checkpoints, and the calibration of the uncertainty."""

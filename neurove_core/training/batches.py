@@ -1,4 +1,4 @@
-"""Segments of sequences side by side, as the loop learns from them: drawn at random, mirrored, flipped, disturbed."""
+"""Batches of random segments of sequences, with augmentation: mirrored, flipped, sped up, and with disturbances."""
 
 import math
 from typing import Final, NamedTuple
@@ -12,13 +12,13 @@ from neurove_core.training.config import RecipeConfig
 from neurove_core.training.data import Sequences
 
 _MIRRORED = np.array([-1, 1, 1, 1, -1, -1], np.float32)
-"""What a mirror across x makes of a twist; see `mirrored`."""
+"""Factors of a twist in a mirror across x; see `mirrored`."""
 
-_SEEN_FIRST: Final = 4  # so many windows at least before the feed thins or ends, else there is no speed to go on with
+_SEEN_FIRST: Final = 4  # least number of complete windows before a disturbance; they give the network a speed to hold
 
 
 class Segment(NamedTuple):
-    """S consecutive windows of B streams, each from a state at rest."""
+    """S consecutive windows of B streams; each stream starts from the zero state."""
 
     counts: Tensor  # (S, B, 2n, H, W) uint8
     twists: Tensor  # (S, B, n, 6): vx vy vz per metre of camera height [1/s], wx wy wz [rad/s]
@@ -26,7 +26,7 @@ class Segment(NamedTuple):
 
 
 def draw(rng: np.random.Generator, sequences: Sequences, recipe: RecipeConfig) -> Segment:
-    """A segment for each stream of a batch, from any sequence and any place in it."""
+    """Draw a segment for each stream of a batch, from a random sequence and a random position in it."""
     counts, twists, heights = [], [], []
     for _ in range(recipe.batch):
         index = int(rng.integers(len(sequences)))
@@ -50,17 +50,17 @@ def draw(rng: np.random.Generator, sequences: Sequences, recipe: RecipeConfig) -
 def augment(
     rng: np.random.Generator, counts: NDArray[np.uint8], twists: NDArray[np.float32], recipe: RecipeConfig
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """One stream's segment as another camera could have seen it.
+    """Apply random augmentations to the segment of one stream.
 
     Args:
         rng: of the run.
         counts: (S, 2n, H, W).
         twists: (S, n, 6).
-        recipe: how often each change is made.
+        recipe: probability and size of each change.
     """
     if _happens(rng, recipe.still):
-        rest = at_rest(rng, counts.shape, math.exp(rng.uniform(*np.log(recipe.still_noise))))
-        return with_hot_pixels(rng, rest, recipe) if _happens(rng, recipe.hot) else rest, np.zeros_like(twists)
+        seen = stationary(rng, counts.shape, math.exp(rng.uniform(*np.log(recipe.still_noise))))
+        return with_hot_pixels(rng, seen, recipe) if _happens(rng, recipe.hot) else seen, np.zeros_like(twists)
     chance = rng.uniform(size=5)
     gain, noise = math.exp(rng.uniform(*np.log(recipe.gain))), rng.uniform(0, recipe.noise_max)
     if chance[0] < recipe.mirror:
@@ -70,9 +70,9 @@ def augment(
     if chance[1] < recipe.polarity_flip:
         counts = polarity_flipped(counts)
     if chance[2] < recipe.regained:
-        counts = regained(rng, counts, gain)
+        counts = with_gain(rng, counts, gain)
     if chance[3] < recipe.noisy:
-        counts = noisy(rng, counts, noise)
+        counts = with_noise(rng, counts, noise)
     if _happens(rng, recipe.lopsided):
         counts = lopsided(rng, counts, math.exp(rng.uniform(*np.log(recipe.lopsided_by))))
     if _happens(rng, recipe.hot):
@@ -80,25 +80,28 @@ def augment(
     if _happens(rng, recipe.thinned):
         counts = thinned(rng, counts, recipe)
     if _happens(rng, recipe.holes):
-        counts = with_holes(rng, counts, recipe)
+        counts = with_gaps(rng, counts, recipe)
     return counts, twists
 
 
 def _happens(rng: np.random.Generator, share: float) -> bool:
-    """Whether it happens this time; what never does draws no number, so a recipe without it draws as it always did."""
+    """Return True with this probability.
+
+    With probability 0 no number is drawn, so that a recipe without this augmentation keeps its random sequence.
+    """
     return share > 0 and bool(rng.uniform() < share)
 
 
 def lopsided(rng: np.random.Generator, counts: NDArray[np.uint8], ratio: float) -> NDArray[np.uint8]:
-    """Counts (S, 2n, H, W) of pixels whose thresholds differ: ON over OFF becomes so many times what it was."""
+    """Multiply the ratio of ON to OFF events in counts (S, 2n, H, W) by `ratio`, as unequal thresholds do."""
     seen = counts.copy(order="C")
     for polarity, gain in ((0, ratio**-0.5), (1, ratio**0.5)):
-        seen[:, polarity::2] = regained(rng, seen[:, polarity::2], gain)
+        seen[:, polarity::2] = with_gain(rng, seen[:, polarity::2], gain)
     return seen
 
 
 def with_hot_pixels(rng: np.random.Generator, counts: NDArray[np.uint8], recipe: RecipeConfig) -> NDArray[np.uint8]:
-    """Counts (S, 2n, H, W) with cells that fire all the time, three in the mean, each with a rate and a share of ON."""
+    """Add hot cells to counts (S, 2n, H, W): three on average, each with its own rate and share of ON events."""
     seen = counts.copy(order="C")
     segment, channels, rows, columns = seen.shape
     for _ in range(1 + rng.poisson(2.0)):
@@ -110,14 +113,17 @@ def with_hot_pixels(rng: np.random.Generator, counts: NDArray[np.uint8], recipe:
 
 
 def thinned(rng: np.random.Generator, counts: NDArray[np.uint8], recipe: RecipeConfig) -> NDArray[np.uint8]:
-    """A segment (S, 2n, H, W) that has few events from some window on, while the camera moves as before."""
+    """Remove most events of a segment (S, 2n, H, W) from a random window on; the motion of the camera is unchanged."""
     first, seen = int(rng.integers(_SEEN_FIRST, max(_SEEN_FIRST + 1, len(counts) // 2))), counts.copy(order="C")
-    seen[first:] = regained(rng, seen[first:], math.exp(rng.uniform(*np.log(recipe.thinned_to))))
+    seen[first:] = with_gain(rng, seen[first:], math.exp(rng.uniform(*np.log(recipe.thinned_to))))
     return seen
 
 
-def with_holes(rng: np.random.Generator, counts: NDArray[np.uint8], recipe: RecipeConfig) -> NDArray[np.uint8]:
-    """A segment (S, 2n, H, W) with holes in its feed, while the camera moves on: something was seen before each."""
+def with_gaps(rng: np.random.Generator, counts: NDArray[np.uint8], recipe: RecipeConfig) -> NDArray[np.uint8]:
+    """Put gaps into a segment (S, 2n, H, W): windows without events while the camera keeps moving.
+
+    Complete windows come before each gap.
+    """
     seen, at = counts.copy(order="C"), 0
     while at < len(seen):
         at += int(rng.integers(_SEEN_FIRST, 4 * _SEEN_FIRST))
@@ -128,18 +134,19 @@ def with_holes(rng: np.random.Generator, counts: NDArray[np.uint8], recipe: Reci
 
 
 def mirrored(counts: NDArray[np.uint8], twists: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """What a camera in a mirrored world would see: x runs the other way; vx, wy and wz change their sign.
+    """Mirror counts and twists across x, as a camera in a mirrored world: vx, wy and wz change their sign.
 
-    The angular velocity is an axial vector: in a mirror across x its x component stays and the others turn around.
+    The angular velocity is an axial vector. A mirror across x keeps its x component and inverts the other two.
     """
     return counts[..., ::-1], twists * _MIRRORED
 
 
 def doubled(counts: NDArray[np.uint8], twists: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """The same motion at twice the speed: two bins become one, and half as many windows are left.
+    """Double the speed of the motion: two bins become one, and half of the windows remain.
 
-    Events come from changes of brightness, not from time, so but for noise and dead times this is what would be seen.
-    So speed is not told by the scene: a street has been gone through at several.
+    Changes of brightness cause events, independently of the time they take. Except for noise and refractory times, the
+    result is therefore what a camera at twice the speed sees. The network sees one scene at several speeds, so that it
+    does not derive the speed from the scene.
 
     >>> counts = np.arange(8, dtype=np.uint8).reshape(2, 4, 1, 1)  # 2 windows of 2 bins, OFF and ON of each
     >>> doubled(counts, np.ones((2, 2, 6), np.float32))[0].ravel().tolist()
@@ -154,7 +161,7 @@ def doubled(counts: NDArray[np.uint8], twists: NDArray[np.float32]) -> tuple[NDA
 
 
 def backwards(counts: NDArray[np.uint8], twists: NDArray[np.float32]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """The film run backwards: what got brighter gets darker, and every velocity turns around.
+    """Reverse time: ON events become OFF events, and every velocity changes its sign.
 
     >>> counts = np.arange(8, dtype=np.uint8).reshape(2, 4, 1, 1)
     >>> backwards(counts, np.ones((2, 2, 6), np.float32))[0].ravel().tolist()
@@ -164,26 +171,26 @@ def backwards(counts: NDArray[np.uint8], twists: NDArray[np.float32]) -> tuple[N
 
 
 def polarity_flipped(counts: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """ON as OFF: a world whose dark is bright, moving as before."""
+    """Swap ON and OFF, as in a world of inverted brightness with the same motion."""
     bins = counts.shape[1] // 2
     return counts[:, np.arange(2 * bins) ^ 1]
 
 
-def regained(rng: np.random.Generator, counts: NDArray[np.uint8], gain: float) -> NDArray[np.uint8]:
-    """Each count times a gain, rounded at random so that the mean is exact; saturating as a window does."""
+def with_gain(rng: np.random.Generator, counts: NDArray[np.uint8], gain: float) -> NDArray[np.uint8]:
+    """Multiply each count by a gain; random rounding keeps the mean, and counts saturate at 255."""
     scaled = counts.copy(order="C").reshape(-1)
     seen = np.flatnonzero(scaled)
     scaled[seen] = np.minimum(scaled[seen] * gain + rng.uniform(size=seen.size), 255).astype(np.uint8)
     return scaled.reshape(counts.shape)
 
 
-def at_rest(rng: np.random.Generator, shape: tuple[int, ...], mean: float) -> NDArray[np.uint8]:
-    """What a camera sees that stands still in a world that does: the noise of its pixels, some louder than others.
+def stationary(rng: np.random.Generator, shape: tuple[int, ...], mean: float) -> NDArray[np.uint8]:
+    """Draw the counts of a stationary camera in a static scene: noise only, with a different rate for each cell.
 
     Args:
         rng: of the run.
         shape: (S, 2n, H, W) of the counts.
-        mean: events per cell and bin; each cell and polarity has a rate of its own, exponentially distributed.
+        mean: events per cell and bin; the rates of the cells and polarities are exponentially distributed.
     """
     segment, channels, rows, columns = shape
     rates = mean * rng.standard_exponential((2, rows, columns), np.float32)
@@ -191,8 +198,8 @@ def at_rest(rng: np.random.Generator, shape: tuple[int, ...], mean: float) -> ND
     return np.minimum(drawn, 255).astype(np.uint8)
 
 
-def noisy(rng: np.random.Generator, counts: NDArray[np.uint8], mean: float) -> NDArray[np.uint8]:
-    """Random events added, `mean` of them per cell and bin."""
+def with_noise(rng: np.random.Generator, counts: NDArray[np.uint8], mean: float) -> NDArray[np.uint8]:
+    """Add random events, `mean` per cell and bin."""
     added = counts.copy(order="C").reshape(-1)
     where = rng.integers(added.size, size=rng.poisson(mean * added.size))
     where = where[added[where] < 200]  # so that no count wraps around

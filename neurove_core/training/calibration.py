@@ -1,13 +1,14 @@
-"""How far off a trained model is: its spread fitted on sequences that it never saw, its weights as they are.
+"""Fit the uncertainty of a trained model on sequences that it was not trained on; its weights stay the same.
 
-Six output neurons are added that read what those of the velocity read. Their rows are fitted so that exp of their
-potential is the size of the error (the likelihood of a Laplace distribution, a convex problem), with a penalty on the
-weights that leaves a few directions of the last layer. Then one factor per axis makes the intervals of LEVEL hold that
-share of the errors: each sequence is judged by a fit that did not see it (cross-conformal prediction, Vovk 2015).
+Six output neurons are added, with the same inputs as the velocity outputs. Their rows are fitted so that exp of their
+potential is the size of the error. The fit maximises the likelihood of a Laplace distribution, which is a convex
+problem; a penalty on the weights leaves a few directions of the last layer. Then one factor per axis makes the
+intervals of LEVEL contain that share of the errors. Each sequence is evaluated by a fit that did not use it
+(cross-conformal prediction, Vovk 2015).
 
-The sequences are like those of training, and drives at full speed, and such that are hard: no texture on the ground,
-dark, noisy. Each is seen four times: as it is, in a mirror with holes in the feed, with few events, with many random
-ones; always from a state at rest.
+There are three sets of sequences: sequences like those of training, drives at full speed, and hard sequences without
+ground texture, dark or noisy. The model sees each sequence four times: unchanged, mirrored with gaps in the events,
+with few events, and with many random events. It always starts from the zero state.
 """
 
 import copy
@@ -21,66 +22,66 @@ import torch
 from numpy.typing import NDArray
 from torch import nn
 
-from neurove_core import golden
-from neurove_core.bundle import PER_HEIGHT, Bundle
-from neurove_core.encoding import to_spikes
-from neurove_core.engine import Engine
+from neurove_core import self_test
+from neurove_core.engine.engine import Engine
 from neurove_core.estimator import Estimator
-from neurove_core.network import NeuroVE
-from neurove_core.training.batches import mirrored, noisy, regained
+from neurove_core.models.bundle import PER_HEIGHT, Bundle
+from neurove_core.models.uncertainty import LEVEL, LEVELS, Uncertainty, half_width
+from neurove_core.networks.encoding import to_spikes
+from neurove_core.networks.neurove import NeuroVE
+from neurove_core.training.batches import mirrored, with_gain, with_noise
 from neurove_core.training.config import DataConfig, TrainingConfig
 from neurove_core.training.data import Cache, Sequences
 from neurove_core.training.loop import commit
-from neurove_core.uncertainty import LEVEL, LEVELS, Uncertainty, half_width
-from protocol.errors import BadModel, InvalidField
-from protocol.velocity import AXES
+from neurove_protocol.errors import BadModel, InvalidField
+from neurove_protocol.velocity import AXES
 
 SEQUENCES: Final = 96
 UNCERTAIN_ABOVE: Final = 0.3
-"""Of the linear sigma over the speed: from here on an estimate is flagged (decision 48)."""
+"""An estimate is flagged as uncertain if its linear sigma over its speed exceeds this (decision 48)."""
 
-SEEN: Final = ("as it is", "holes", "few events", "noise")
-"""The ways in which each sequence is seen."""
+VARIANTS: Final = ("unchanged", "gaps", "few events", "noise")
+"""Variants of each sequence."""
 
-_SECONDS: Final = 3.0  # many short sequences tell more than few long ones: what errs, errs for a whole sequence
-_SEED_SHIFT: Final = 450_000_000  # from the seeds of training to these
+_SECONDS: Final = 3.0  # many short sequences say more than a few long ones, because errors persist within a sequence
+_SEED_SHIFT: Final = 450_000_000  # distance from the seeds of training
 _SEEDS: Final = 900_000_000
-_KIND_SEEDS: Final = 1_000_000  # from one kind of sequences to the next
+_KIND_SEEDS: Final = 1_000_000  # distance between the sets of sequences
 _FOLDS: Final = 4
-_PENALTY: Final = 0.003  # on the weights of the spread, whose inputs have variance 1 in the mean
+_PENALTY: Final = 0.003  # on the weights of the spread; its inputs have variance 1 on average
 _NEWTON_STEPS: Final = 50
-_CLIPPED: Final = 3.0  # errors count so many sigma at most in the correlation: one wild sequence does not make it
-_SHRUNK: Final = 0.02  # towards no correlation: what makes it positive definite
+_CLIPPED: Final = 3.0  # limit of an error in the correlation, in sigma, so that one bad sequence does not dominate
+_SHRUNK: Final = 0.02  # shrinkage towards no correlation; it makes the matrix positive definite
 
 Array = NDArray[np.float64]
 
 
-class Watched(NamedTuple):
-    """What a model did on one sequence seen in one way, over T windows."""
+class SequenceErrors(NamedTuple):
+    """Inputs of the spread and errors of a model on one variant of a sequence, over T windows."""
 
-    inputs: Array  # (T, N + 1): potential that the spread's neurons would have by each weight alone, and by the bias
-    error: Array  # (T, n, 6) answer less truth, in units of the bundle's scale
+    inputs: Array  # (T, N + 1): potential of a spread neuron for each weight alone, and for the bias alone
+    error: Array  # (T, n, 6) estimate minus truth, in units of the bundle's scale
     sequence: int
-    seen: str  # one of SEEN
+    variant: str  # one of VARIANTS
     hard: bool
 
 
 @dataclass(frozen=True)
-class Calibrated:
-    """A bundle with its uncertainty, and how well that held on what was not used to fit it."""
+class Calibration:
+    """A bundle with its uncertainty, and the coverage on sequences that the fit did not use."""
 
     bundle: Bundle
     report: dict[str, Any]
 
 
-def kinds(config: TrainingConfig, sequences: int) -> list[tuple[TrainingConfig, bool]]:
-    """What is simulated to calibrate a model of this configuration, and whether it is hard.
+def calibration_sets(config: TrainingConfig, sequences: int) -> list[tuple[TrainingConfig, bool]]:
+    """Return the configurations of the three calibration sets, each with whether it is hard.
 
     Raises:
-        InvalidField: there are not enough sequences for each fold of each kind.
+        InvalidField: there are too few sequences for the folds of each set.
     """
     if sequences < 4 * _FOLDS:
-        raise InvalidField("calibration", "sequences", sequences, f"at least {4 * _FOLDS}")
+        raise InvalidField("calibration", "sequences", sequences, f"must be at least {4 * _FOLDS}")
     fast, hard = sequences // 4, sequences // 4
     seed = (config.data.seed + _SEED_SHIFT) % (_SEEDS - 3 * _KIND_SEEDS)
     drives = {"slowed_drive": (1.0, 1.0), "scenes": {"street": 1.0}}
@@ -100,62 +101,74 @@ def kinds(config: TrainingConfig, sequences: int) -> list[tuple[TrainingConfig, 
 
 
 def fill(config: TrainingConfig, folder: Path, sequences: int, workers: int = 1) -> Iterator[str]:
-    """Simulate what is missing of the sequences; yields the name of each as it is done."""
-    for one, _ in kinds(config, sequences):
+    """Simulate the missing calibration sequences, and yield the name of each one when it is done."""
+    for one, _ in calibration_sets(config, sequences):
         yield from Cache(folder, one).fill(workers)
 
 
-def calibrate(bundle: Bundle, config: TrainingConfig, folder: Path, sequences: int = SEQUENCES) -> Calibrated:
-    """Give a model its uncertainty; one that it already has is replaced.
+def calibrate(bundle: Bundle, config: TrainingConfig, folder: Path, sequences: int = SEQUENCES) -> Calibration:
+    """Fit the uncertainty of a model; an existing one is replaced.
 
     Args:
-        bundle: trained, its linear part per metre of height.
-        config: that it was trained by; its model must be the bundle's.
+        bundle: trained, with its linear part per metre of height.
+        config: configuration that trained the model; its windows and canonical camera must be those of the bundle.
         folder: of the sequences, filled by `fill`.
-        sequences: how many.
+        sequences: number of sequences.
 
     Raises:
-        BadModel: it is no NeuroVE or not of this configuration, or its linear part is not per metre of height.
+        BadModel: the kind of the network is not `neurove`, the model does not fit the configuration, or its linear part
+            is not per metre of height.
         BrokenRecording: a sequence is missing or broken.
     """
     if (bundle.config.window, bundle.config.canonical) != (config.model.window, config.model.canonical):
-        raise BadModel(bundle.name, "its windows or its canonical camera are not those of the configuration")
+        raise BadModel(bundle.name, "its windows or its canonical camera differ from those of the configuration")
     if bundle.linear_unit != PER_HEIGHT:
-        raise BadModel(bundle.name, f"linear_unit={bundle.linear_unit!r}: the sequences' truth is in {PER_HEIGHT!r}")
-    parts = [(Cache(folder, one).open(), hard) for one, hard in kinds(config, sequences)]
-    first = kinds(config, sequences)[0][0].data
-    about = (
+        raise BadModel(
+            bundle.name, f"linear_unit={bundle.linear_unit!r}: the truth of the sequences is in {PER_HEIGHT!r}"
+        )
+    parts = [(Cache(folder, one).open(), hard) for one, hard in calibration_sets(config, sequences)]
+    first = calibration_sets(config, sequences)[0][0].data
+    provenance = (
         f"neurove calibrate: {sequences} simulated sequences of {first.seconds:g} s from seed {first.seed}, each seen "
-        f"{len(SEEN)} times, {_FOLDS} folds, commit {commit() or 'unknown'}"
+        f"{len(VARIANTS)} times, {_FOLDS} folds, commit {commit() or 'unknown'}"
     )
-    return fitted(bundle, list(watch(bundle, parts)), about)
+    return with_uncertainty(bundle, list(collect_errors(bundle, parts)), provenance)
 
 
-def fitted(bundle: Bundle, watched: list[Watched], about: str) -> Calibrated:
-    """A bundle whose spread is fitted on what it did; `about` says in one line what that was.
+def with_uncertainty(bundle: Bundle, errors: list[SequenceErrors], provenance: str) -> Calibration:
+    """Fit the spread of a bundle on its errors, and return the bundle with its uncertainty.
 
-    Its golden test, where it has one, is recorded anew: it is of the model as it will be saved.
+    The golden test, if there is one, is recorded again, because the last layer has changed.
+
+    Args:
+        bundle: of kind `neurove`.
+        errors: on all variants of the calibration sequences.
+        provenance: one line that says what the sequences were; the uncertainty stores it.
+
+    Raises:
+        BadModel: the kind of the network is not `neurove`.
     """
-    held = [one for fold in range(_FOLDS) for one in _judge(watched, fold)]
-    usual = [(one, sigma) for one, sigma in held if one.seen == SEEN[0] and not one.hard]
+    held = [one for fold in range(_FOLDS) for one in _held_out(errors, fold)]
+    usual = [(one, sigma) for one, sigma in held if one.variant == VARIANTS[0] and not one.hard]
     ratio = np.concatenate([np.abs(one.error) / sigma[:, None] for one, sigma in usual]).reshape(-1, 6)
     factor = np.quantile(ratio, LEVEL, axis=0) / half_width(LEVEL)
-    weights = _fit(watched)
+    weights = _fit(errors)
     network = _copy(bundle)
     spread = network.add_spread()
     leak = 1 - float(torch.sigmoid(network.kappa_logit.detach()))
     with torch.no_grad():
         spread.weight.copy_(torch.from_numpy(weights[:-1].T))
-        spread.bias.copy_(torch.from_numpy(weights[-1] + np.log(factor) * leak))  # it adds up to log factor
-    uncertainty = Uncertainty(_correlation(usual, factor), UNCERTAIN_ABOVE, about)
+        # the leaky neuron integrates log(factor) * leak to log(factor)
+        spread.bias.copy_(torch.from_numpy(weights[-1] + np.log(factor) * leak))
+    uncertainty = Uncertainty(_correlation(usual, factor), UNCERTAIN_ABOVE, provenance)
     made = replace(bundle, network=network.eval(), uncertainty=uncertainty)
-    if made.golden:  # a wider last layer may round otherwise
-        made = replace(made, golden=golden.record(Estimator(made), made.golden.counts, made.golden.tolerance))
-    return Calibrated(made.with_digest(), _report(held, factor, about))
+    if made.golden:  # a wider last layer may round differently
+        made = replace(made, golden=self_test.record(Estimator(made), made.golden.counts, made.golden.tolerance))
+    return Calibration(made.with_digest(), _report(held, factor, provenance))
 
 
-def watch(bundle: Bundle, parts: list[tuple[Sequences, bool]]) -> Iterator[Watched]:
-    """Follow the model through all sequences, each seen in every way of SEEN; the bool says which are hard."""
+def collect_errors(bundle: Bundle, parts: list[tuple[Sequences, bool]]) -> Iterator[SequenceErrors]:
+    """Run a model on every variant of all sequences, and yield its errors; the bool marks the hard sets."""
     probe = _copy(bundle)
     width = probe.readout.in_features
     layer: nn.Linear = probe.add_spread(width + 1)
@@ -168,55 +181,57 @@ def watch(bundle: Bundle, parts: list[tuple[Sequences, bool]]) -> Iterator[Watch
         for index in range(len(found)):
             rng = np.random.default_rng((203, number))
             counts, twists = found.counts(index, 0, len(found.twists[index])), found.twists[index]
-            ways = seen_in_all_ways(rng, counts, twists)
-            spikes = to_spikes(torch.from_numpy(np.stack([way for way, _ in ways], 1)), bundle.config.network.encoding)
-            state, inputs, answers = probe.initial_state(len(ways)), [], []
+            variants = variants_of(rng, counts, twists)
+            spikes = to_spikes(
+                torch.from_numpy(np.stack([seen for seen, _ in variants], 1)), bundle.config.network.encoding
+            )
+            state, inputs, outputs = probe.initial_state(len(variants)), [], []
             for step in range(len(counts)):
-                answer, state = engine(spikes[step : step + 1], state)
+                output, state = engine(spikes[step : step + 1], state)
                 potential = probe.log_sigma(state)
                 assert potential is not None  # it was added above
                 inputs.append(potential.double().numpy())
-                answers.append(answer[0].double().numpy())
-            truth = np.stack([true for _, true in ways], 1)
-            error = np.stack(answers) - (truth - bundle.offset.double().numpy()) / bundle.scale.double().numpy()
-            for way, seen in enumerate(SEEN):
-                yield Watched(np.stack(inputs)[:, way], error[:, way], number, seen, hard)
+                outputs.append(output[0].double().numpy())
+            truth = np.stack([true for _, true in variants], 1)
+            error = np.stack(outputs) - (truth - bundle.offset.double().numpy()) / bundle.scale.double().numpy()
+            for stream, variant in enumerate(VARIANTS):
+                yield SequenceErrors(np.stack(inputs)[:, stream], error[:, stream], number, variant, hard)
             number += 1
 
 
-def seen_in_all_ways(
+def variants_of(
     rng: np.random.Generator, counts: NDArray[np.uint8], twists: NDArray[np.float32]
 ) -> list[tuple[NDArray[np.uint8], NDArray[np.float32]]]:
-    """A sequence (T, 2n, H, W) with its twists (T, n, 6) in the ways of SEEN, in their order."""
+    """Make the variants of a sequence (T, 2n, H, W) with its twists (T, n, 6), in the order of VARIANTS."""
     from_here, windows = int(rng.integers(2, max(3, len(counts) // 2))), len(counts)
     other, turned = mirrored(counts, twists)
-    holes, at = other.copy(order="C"), 0
+    gaps, at = other.copy(order="C"), 0
     while at < windows:
         at += int(rng.integers(4, 16))
         length = int(np.exp(rng.uniform(0, np.log(20))))
-        holes[at : at + length] = 0
+        gaps[at : at + length] = 0
         at += length
     few, many = counts.copy(order="C"), counts.copy(order="C")
-    few[from_here:] = regained(rng, few[from_here:], float(np.exp(rng.uniform(np.log(0.01), np.log(0.5)))))
-    many[from_here:] = noisy(rng, many[from_here:], float(np.exp(rng.uniform(np.log(0.01), np.log(0.4)))))
-    return [(counts, twists), (holes, turned), (few, twists), (many, twists)]
+    few[from_here:] = with_gain(rng, few[from_here:], float(np.exp(rng.uniform(np.log(0.01), np.log(0.5)))))
+    many[from_here:] = with_noise(rng, many[from_here:], float(np.exp(rng.uniform(np.log(0.01), np.log(0.4)))))
+    return [(counts, twists), (gaps, turned), (few, twists), (many, twists)]
 
 
 def laplace_scale(inputs: Array, size: Array, penalty: float) -> Array:
-    """Weights w (K) so that exp(inputs w) is the scale of errors of this mean size.
+    """Fit weights w (K) so that exp(inputs w) is the scale of errors of this mean size.
 
-    Minimises mean(size exp(-x w) + x w) + penalty / 2 * |w|^2 without the last weight, which is the bias', by Newton's
-    method: it is the negative log likelihood of a Laplace distribution, and convex.
+    Newton's method minimises mean(size exp(-x w) + x w) + penalty / 2 * |w|^2. This is the negative log likelihood of a
+    Laplace distribution, and convex. The penalty leaves out the last weight, which is that of the bias.
 
     Args:
-        inputs: (M, K), the last column is that of the bias.
-        size: (M) above 0 somewhere.
-        penalty: on inputs whose variance is 1 in the mean.
+        inputs: (M, K); the last column is that of the bias.
+        size: (M); some are above 0.
+        penalty: for inputs with variance 1 on average.
     """
     unit = float(np.sqrt(inputs[:, :-1].var(0).mean())) or 1.0
     x = inputs / np.append(np.full(inputs.shape[1] - 1, unit), 1.0)
     ridge = np.append(np.full(x.shape[1] - 1, penalty), 1e-9)
-    least = 1e-6 * size.mean() + 1e-12  # an error of 0 would pull the scale to 0
+    least = 1e-6 * size.mean() + 1e-12  # an error of 0 would give a scale of 0
     size = np.maximum(size, least)
     w = np.zeros(x.shape[1])
     w[-1] = np.log(size.mean()) / x[:, -1].mean()
@@ -241,24 +256,26 @@ def laplace_scale(inputs: Array, size: Array, penalty: float) -> Array:
 
 def _copy(bundle: Bundle) -> NeuroVE:
     if not isinstance(bundle.network, NeuroVE):
-        raise BadModel(bundle.name, f"kind={bundle.config.kind!r}: only a network of kind 'neurove' has an uncertainty")
+        raise BadModel(
+            bundle.name, f"kind={bundle.config.kind!r}: only a network of kind 'neurove' can have an uncertainty"
+        )
     return copy.deepcopy(bundle.network)
 
 
-def _fit(watched: list[Watched]) -> Array:
-    """Weights (N + 1, 6) of the spread."""
-    inputs = np.concatenate([one.inputs for one in watched])
-    size = np.concatenate([np.abs(one.error).mean(1) for one in watched])
+def _fit(errors: list[SequenceErrors]) -> Array:
+    """Fit the weights (N + 1, 6) of the spread."""
+    inputs = np.concatenate([one.inputs for one in errors])
+    size = np.concatenate([np.abs(one.error).mean(1) for one in errors])
     return np.stack([laplace_scale(inputs, size[:, axis], _PENALTY) for axis in range(6)], 1)
 
 
-def _judge(watched: list[Watched], fold: int) -> list[tuple[Watched, Array]]:
-    """The sequences of a fold with sigma (T, 6) by a fit on all others."""
-    weights = _fit([one for one in watched if one.sequence % _FOLDS != fold])
-    return [(one, np.exp(one.inputs @ weights)) for one in watched if one.sequence % _FOLDS == fold]
+def _held_out(errors: list[SequenceErrors], fold: int) -> list[tuple[SequenceErrors, Array]]:
+    """The sequences of a fold, with sigma (T, 6) from a fit on all other sequences."""
+    weights = _fit([one for one in errors if one.sequence % _FOLDS != fold])
+    return [(one, np.exp(one.inputs @ weights)) for one in errors if one.sequence % _FOLDS == fold]
 
 
-def _correlation(usual: list[tuple[Watched, Array]], factor: Array) -> torch.Tensor:
+def _correlation(usual: list[tuple[SequenceErrors, Array]], factor: Array) -> torch.Tensor:
     ratio = np.concatenate([one.error / (sigma * factor)[:, None] for one, sigma in usual]).reshape(-1, 6)
     clipped = np.clip(ratio, -_CLIPPED, _CLIPPED)
     spread = np.sqrt((clipped**2).mean(0)) + 1e-12
@@ -267,23 +284,23 @@ def _correlation(usual: list[tuple[Watched, Array]], factor: Array) -> torch.Ten
     return torch.tensor((found + found.T) / 2, dtype=torch.float32)
 
 
-def _report(held: list[tuple[Watched, Array]], factor: Array, about: str) -> dict[str, Any]:
-    """Coverage by axis, of each sequence by a fit that did not see it: as it is usual, and in each hard way."""
-    groups: dict[str, list[tuple[Watched, Array]]] = {}
+def _report(held: list[tuple[SequenceErrors, Array]], factor: Array, provenance: str) -> dict[str, Any]:
+    """Coverage by axis for each variant, and for the hard sets; each sequence by a fit that did not use it."""
+    groups: dict[str, list[tuple[SequenceErrors, Array]]] = {}
     for one, sigma in held:
-        groups.setdefault(f"hard scenes, {one.seen}" if one.hard else one.seen, []).append((one, sigma * factor))
-    told: dict[str, Any] = {
-        "provenance": about,
+        groups.setdefault(f"hard scenes, {one.variant}" if one.hard else one.variant, []).append((one, sigma * factor))
+    report: dict[str, Any] = {
+        "provenance": provenance,
         "level": LEVEL,
         "factor": dict(zip(AXES, factor.tolist(), strict=True)),
     }
-    told["groups"] = {}
+    report["groups"] = {}
     for name, group in groups.items():
         ratio = np.concatenate([np.abs(one.error) / sigma[:, None] for one, sigma in group]).reshape(-1, 6)
         middle = np.median(np.concatenate([sigma for _, sigma in group]), axis=0)
-        told["groups"][name] = {
+        report["groups"][name] = {
             axis: {"median_sigma_in_scale": float(middle[i])}
             | {str(level): float((ratio[:, i] <= half_width(level)).mean()) for level in LEVELS}
             for i, axis in enumerate(AXES)
         }
-    return told
+    return report

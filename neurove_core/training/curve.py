@@ -1,4 +1,4 @@
-"""The learning curve, to be looked at: live in TensorBoard, and as a figure at the end."""
+"""The learning curve: live in TensorBoard, and as a figure at the end of a run."""
 
 import logging
 from pathlib import Path
@@ -12,22 +12,22 @@ from neurove_core.extras import MissingExtra
 from neurove_core.figures import blank_figure, save_figure
 
 TENSORBOARD: Final = "tensorboard"
-"""Folder of the scalars, within a run's."""
+"""Folder of the scalars, inside the folder of a run."""
 
 FIGURE: Final = "curve"
-"""Stem of the figure's files, beside the run's account."""
+"""Name of the figure's files without suffix, in the folder of the run."""
 
 log = logging.getLogger(__name__)
 
-_SMOOTH: Final = 10  # points of the curve in a running mean
+_SMOOTH: Final = 10  # number of points in the running mean
 
 
 class Scalars:
-    """Writes each point of a curve for TensorBoard; without that library it says so once, and writes nothing.
+    """Write each point of a curve for TensorBoard. Without TensorBoard, log one warning and write nothing.
 
     Args:
         folder: of the run.
-        after_step: the run goes on from this update: what a run that was stopped wrote after it is not shown.
+        after_step: the run continues from this update. TensorBoard hides points after it that an interrupted run wrote.
     """
 
     def __init__(self, folder: Path, after_step: int = 0) -> None:
@@ -35,7 +35,7 @@ class Scalars:
         try:
             from torch.utils.tensorboard import SummaryWriter
         except ImportError:
-            log.warning("no curve for TensorBoard: %s", MissingExtra("tensorboard", "train").message)
+            log.warning("TensorBoard curve not written: %s", MissingExtra("tensorboard", "train").message)
             return
         self._writer = SummaryWriter(str(folder / TENSORBOARD), purge_step=after_step + 1)
 
@@ -47,7 +47,7 @@ class Scalars:
             self._writer.close()
 
     def add(self, point: dict[str, float]) -> None:
-        """A point of the curve: all its values over its `step`."""
+        """Write a point of the curve: all its values at its `step`."""
         if self._writer is None:
             return
         for name, value in point.items():
@@ -57,17 +57,20 @@ class Scalars:
 
 
 def draw_curve(curve: list[dict[str, float]], folder: Path, title: str) -> list[Path]:
-    """Write curve.png and curve.svg: both errors over the updates, and the learning rate; returns the files.
+    """Write curve.png and curve.svg, with both errors and the learning rate over the updates.
 
-    Without matplotlib it says so, and writes nothing.
+    Without matplotlib, log a warning and write nothing.
+
+    Returns:
+        the files that were written.
 
     Raises:
-        InvalidField: a file can not be written.
+        InvalidField: a file cannot be written.
     """
     try:
         figure = blank_figure(9, 6)
     except MissingExtra as missing:
-        log.warning("no figure of the curve: %s", missing.message)
+        log.warning("learning curve not drawn: %s", missing.message)
         return []
     step = np.array([point["step"] for point in curve])
     rows = (
@@ -81,7 +84,7 @@ def draw_curve(curve: list[dict[str, float]], folder: Path, title: str) -> list[
         if panel is panels[-1]:
             panel.plot(step, values, linewidth=1)
         else:
-            panel.plot(step, values, linewidth=0.6, alpha=0.5, label="mean since the point before")
+            panel.plot(step, values, linewidth=0.6, alpha=0.5, label="mean since the previous point")
             panel.plot(step, smooth(values, _SMOOTH), linewidth=1.5, label=f"mean of {_SMOOTH} points")
             panel.set_yscale("log")
         panel.set_ylabel(label)
@@ -93,7 +96,7 @@ def draw_curve(curve: list[dict[str, float]], folder: Path, title: str) -> list[
 
 
 def smooth(values: NDArray[np.float64], points: int) -> NDArray[np.float64]:
-    """The mean of each value (N,) and the ones before it, `points` in all; fewer at the beginning.
+    """Running mean of each value (N,) and the previous ones, over `points` values; fewer at the beginning.
 
     >>> smooth(np.array([4.0, 2.0, 0.0, 1.0]), 2).tolist()
     [4.0, 3.0, 1.0, 0.5]

@@ -1,7 +1,7 @@
-"""Sequences to learn from: per window the counts that the service would see, and how the camera truly moved.
+"""Training sequences: for each window the event counts and the true twists of the camera.
 
-A sequence is simulated once and kept in a file: safetensors, mapped into memory, so that a run needs no more of it than
-the segments it reads. The windows come from the very `windows.push` and look-up table that serve.
+A sequence is simulated once and kept in a safetensors file. The file is mapped into memory, so that a run reads only
+the segments that it needs. The windows come from the same `windows.push` and look-up table that the service uses.
 """
 
 import concurrent.futures
@@ -19,30 +19,30 @@ import safetensors
 import safetensors.numpy
 from numpy.typing import ArrayLike, NDArray
 
-from neurove_core import windows
 from neurove_core.config import ModelConfig
-from neurove_core.files import write_whole
-from neurove_core.geometry import lookup_table
+from neurove_core.files import write_atomically
+from neurove_core.geometry.camera import lookup_table
+from neurove_core.ingest import windows
+from neurove_core.ingest.windows import WindowsState
 from neurove_core.io.errors import BrokenRecording
-from neurove_core.sim.camera import Camera, named_camera
-from neurove_core.sim.path import Moving
-from neurove_core.sim.pixels import PixelConfig
-from neurove_core.sim.scene import named_scene
+from neurove_core.sim.motion.trajectory import Mounted, Trajectory, driving, hand_held, rotation
+from neurove_core.sim.render.camera import Camera, named_camera
+from neurove_core.sim.render.pixels import PixelConfig
 from neurove_core.sim.simulate import Simulation
-from neurove_core.sim.trajectory import Mounted, Trajectory, driving, hand_held, rotation
+from neurove_core.sim.world.path import CameraPath
+from neurove_core.sim.world.scene import named_scene
 from neurove_core.training.config import DataConfig, Span, TrainingConfig
-from neurove_core.windows import WindowsState
 
 FORMAT: Final = 1
-"""Of the files; part of their folder's name."""
+"""Version of the files; it is part of the name of their folder."""
 
 DRIVE_S: Final = 120.0
-"""A sequence is a part of a drive of this length."""
+"""Length of the drive that a sequence is a part of."""
 
-IN_A_HAND: Final = ("room", "plain-room")
-"""Scenes through which nothing drives."""
+HAND_HELD_SCENES: Final = ("room", "plain-room")
+"""Scenes for a hand-held camera."""
 
-_SAMPLES: Final = 4  # of the exact twist in each bin, whose mean is the bin's
+_SAMPLES: Final = 4  # samples of the exact twist per bin; the bin has their mean
 
 
 class Sequence(NamedTuple):
@@ -56,13 +56,13 @@ class Sequence(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Part(Trajectory):
-    """A trajectory from some time on, at a fraction of its speed.
+    """A part of a trajectory, at a fraction of its speed.
 
     Args:
-        trajectory: that it is a part of.
-        start_s: where it begins.
-        slowed: how many times slower it is.
-        duration_s: how long it lasts; the trajectory must last so long.
+        trajectory: the whole trajectory.
+        start_s: start of the part in the trajectory.
+        slowed: how many times slower the part is.
+        duration_s: duration of the part; the trajectory must cover it.
     """
 
     trajectory: Trajectory
@@ -72,20 +72,20 @@ class Part(Trajectory):
 
     @property
     def name(self) -> str:  # type: ignore[override]
-        """Of the trajectory, and which part of it."""
+        """Name of the trajectory, with start and speed."""
         return f"{self.trajectory.name} from {self.start_s:.1f} s, {self.slowed:.2f} times slower"
 
-    def placed(self, t_s: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def position_orientation(self, t_s: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """See `Trajectory`."""
-        return self.trajectory.placed(self.start_s + self._within(t_s) / self.slowed)
+        return self.trajectory.position_orientation(self.start_s + self._within(t_s) / self.slowed)
 
     def twist(self, t_s: ArrayLike) -> NDArray[np.float64]:
         """See `Trajectory`."""
         return self.trajectory.twist(self.start_s + self._within(t_s) / self.slowed) / self.slowed
 
 
-def drawn(config: DataConfig, index: int) -> Simulation:
-    """The simulation that sequence `index` of a configuration is; the same each time."""
+def draw_simulation(config: DataConfig, index: int) -> Simulation:
+    """Draw the simulation of sequence `index`; the same configuration and index give the same simulation."""
     rng = np.random.default_rng((config.seed, 201, index))
     seed = config.seed + index
     scene = _choice(rng, config.scenes)
@@ -102,11 +102,11 @@ def drawn(config: DataConfig, index: int) -> Simulation:
         cutoff_hz=log_uniform(rng, config.cutoff_hz),
         eps=log_uniform(rng, config.eps),
     )
-    in_a_hand = scene in IN_A_HAND
-    slowed = log_uniform(rng, config.slowed_hand if in_a_hand else config.slowed_drive)
+    hand_held_scene = scene in HAND_HELD_SCENES
+    slowed = log_uniform(rng, config.slowed_hand if hand_held_scene else config.slowed_drive)
     trajectory: Trajectory
-    if in_a_hand:
-        trajectory = _in_a_hand(rng, config, seed, slowed)
+    if hand_held_scene:
+        trajectory = _hand_held(rng, config, seed, slowed)
     else:
         trajectory = turning_part(rng, driving(seed, DRIVE_S + config.seconds), slowed, config.seconds)
     mounted = Mounted(trajectory, camera.height_m, camera.pitch_deg)
@@ -115,7 +115,7 @@ def drawn(config: DataConfig, index: int) -> Simulation:
 
 
 def sequence_of(simulation: Simulation, config: ModelConfig) -> Sequence:
-    """The windows of a simulation as the service cuts them, with the mean exact twist of each bin."""
+    """Split a simulation into windows as the service does, with the mean exact twist of each bin."""
     height_m = simulation.lens.height_m
     lut = lookup_table(config.canonical, simulation.sensor, simulation.lens.info)
     state, counts = WindowsState(), []
@@ -129,8 +129,8 @@ def sequence_of(simulation: Simulation, config: ModelConfig) -> Sequence:
     return Sequence(np.stack(counts), twists.astype(np.float32), height_m, name)
 
 
-def true_twists(trajectory: Moving, count: int, config: ModelConfig) -> NDArray[np.float64]:
-    """Mean exact twist (count, n, 6) [m/s, rad/s] of each bin of the first windows of a trajectory."""
+def true_twists(trajectory: CameraPath, count: int, config: ModelConfig) -> NDArray[np.float64]:
+    """Compute the mean exact twist (count, n, 6) [m/s, rad/s] of each bin of the first `count` windows."""
     bins = count * config.window.bins
     t_s = (np.arange(bins * _SAMPLES, dtype=np.float64) + 0.5) * (config.window.bin_us / _SAMPLES * 1e-6)
     twist: NDArray[np.float64] = trajectory.twist(t_s).reshape(count, config.window.bins, _SAMPLES, 6).mean(axis=2)
@@ -138,80 +138,80 @@ def true_twists(trajectory: Moving, count: int, config: ModelConfig) -> NDArray[
 
 
 class Cache:
-    """Simulated sequences in a folder; what is missing is made, what is there is read.
+    """Simulated sequences of a configuration in a folder; only missing sequences are simulated.
 
     Args:
-        folder: of all configurations; each has its own folder within.
-        config: whose sequences these are.
+        folder: shared by all configurations; each has its own folder inside.
+        config: of the run.
     """
 
     def __init__(self, folder: Path, config: TrainingConfig) -> None:
         self._config = config
         data = config.data.model_dump(exclude={"sequences", "recordings"})
         if config.data.spun_axis == DataConfig().spun_axis:
-            del data["spun_axis"]  # older than this setting is what was simulated as its default says
+            del data["spun_axis"]  # sequences that were simulated before this setting existed stay valid
         kind: list[Any] = [FORMAT, data]
         kind += [config.model.window.model_dump(), config.model.canonical.model_dump()]
         self.folder = folder / hashlib.sha256(json.dumps(kind, sort_keys=True).encode()).hexdigest()[:16]
 
     def path(self, index: int) -> Path:
-        """The file of a sequence."""
+        """File of a sequence."""
         return self.folder / f"{index:06d}.safetensors"
 
     def missing(self) -> list[int]:
-        """The sequences that are not there yet."""
+        """Indices of the sequences that do not exist yet."""
         return [index for index in range(self._config.data.sequences) if not self.path(index).exists()]
 
     def fill(self, workers: int = 1) -> Iterator[str]:
-        """Make all that is missing; yields the name of each as it is done.
+        """Simulate the missing sequences, and yield the name of each one when it is done.
 
-        Several processes, or several runs at once, may fill one folder: a file is whole or it is not there.
+        Several processes and several runs may fill one folder at once, because files are written atomically.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
         jobs = [(self._config, index, self.path(index)) for index in self.missing()]
         if workers <= 1:
             yield from map(_make, jobs)
             return
-        context = multiprocessing.get_context("spawn")  # torch's threads do not survive a fork
+        context = multiprocessing.get_context("spawn")  # the threads of torch do not survive a fork
         with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
             for done in concurrent.futures.as_completed([pool.submit(_make, job) for job in jobs]):
                 yield done.result()
 
     def open(self) -> "Sequences":
-        """All simulated sequences of the configuration.
+        """Open all simulated sequences of the configuration.
 
         Raises:
-            BrokenRecording: a file is not what this module wrote.
+            BrokenRecording: a file is missing or invalid.
         """
         return Sequences(self.paths())
 
     def paths(self) -> list[Path]:
-        """The files of all simulated sequences, there or not."""
+        """Files of all simulated sequences, whether they exist or not."""
         return [self.path(index) for index in range(self._config.data.sequences)]
 
 
 def _make(job: tuple[TrainingConfig, int, Path]) -> str:
     config, index, path = job
-    sequence = sequence_of(drawn(config.data, index), config.model)
+    sequence = sequence_of(draw_simulation(config.data, index), config.model)
     save(sequence, path)
     return sequence.name
 
 
 def save(sequence: Sequence, path: Path) -> None:
-    """Write a sequence's file; it is whole or it is not there."""
+    """Write a sequence to a file, atomically."""
     arrays: dict[str, NDArray[Any]] = {"counts": sequence.counts, "twists": sequence.twists}
-    about = {"height_m": repr(sequence.height_m), "name": sequence.name}
-    write_whole(path, safetensors.numpy.save(arrays, about))
+    metadata = {"height_m": repr(sequence.height_m), "name": sequence.name}
+    write_atomically(path, safetensors.numpy.save(arrays, metadata))
 
 
 class Sequences:
-    """Sequences in files, mapped: a slice is read when it is asked for.
+    """Sequences in memory-mapped files; counts are read on demand.
 
     Args:
         paths: of the files.
 
     Raises:
-        BrokenRecording: one is missing, or not what `save` writes.
+        BrokenRecording: a file is missing, or `save` did not write it.
     """
 
     def __init__(self, paths: list[Path]) -> None:
@@ -222,13 +222,13 @@ class Sequences:
         for path in paths:
             try:
                 file: Any = safetensors.safe_open(path, "numpy")
-                about = file.metadata()
-                twists, height_m = file.get_tensor("twists"), float(about["height_m"])
+                metadata = file.metadata()
+                twists, height_m = file.get_tensor("twists"), float(metadata["height_m"])
                 shape = file.get_slice("counts").get_shape()
             except (OSError, KeyError, TypeError, ValueError, safetensors.SafetensorError) as error:
-                raise BrokenRecording(path, "its header", f"no sequence to learn from: {error}") from None
+                raise BrokenRecording(path, "its header", f"not a training sequence: {error}") from None
             if len(shape) != 4 or shape[0] != len(twists) or shape[1] != 2 * twists.shape[1] or not height_m > 0:
-                why = f"counts {tuple(shape)} do not go with twists {twists.shape}"
+                why = f"counts {tuple(shape)} do not match twists {twists.shape}"
                 raise BrokenRecording(path, "its header", why)
             self._files.append(file)
             self.twists.append(twists)
@@ -238,25 +238,25 @@ class Sequences:
         return len(self._files)
 
     def counts(self, index: int, start: int, stop: int) -> NDArray[np.uint8]:
-        """Windows start to stop of a sequence (stop - start, 2n, H, W)."""
+        """Counts (stop - start, 2n, H, W) of windows start to stop of a sequence."""
         found: NDArray[np.uint8] = self._files[index].get_slice("counts")[start:stop]
         return found
 
 
-def _in_a_hand(rng: np.random.Generator, config: DataConfig, seed: int, slowed: float) -> Trajectory:
-    """A camera that is waved about, only turned, or only moved; or one that spins on a random axis."""
-    way = _choice(rng, config.hands)
-    if way == "spun":
+def _hand_held(rng: np.random.Generator, config: DataConfig, seed: int, slowed: float) -> Trajectory:
+    """Draw a trajectory in a room: waved, only turned, only moved, or spun about a random axis."""
+    motion = _choice(rng, config.hands)
+    if motion == "spun":
         axis = rng.standard_normal(3) * config.spun_axis
         rate = log_uniform(rng, config.spun_rad_s) * axis / np.linalg.norm(axis)
         wx, wy, wz = (float(one) for one in rate)
         return rotation(wx, wy, wz, config.seconds)
-    moved, turned = {"waved": (1.0, 1.0), "turned": (0.0, 1.0), "slid": (1.0, 0.0)}[way]
+    moved, turned = {"waved": (1.0, 1.0), "turned": (0.0, 1.0), "slid": (1.0, 0.0)}[motion]
     return Part(hand_held(seed, config.seconds, moved, turned), 0.0, slowed, config.seconds)
 
 
 def turning_part(rng: np.random.Generator, drive: Trajectory, slowed: float, seconds: float) -> Part:
-    """Of three parts of a drive the one that turns most: most of any drive goes straight on."""
+    """Draw three parts of a drive and return the one that turns most, because most of a drive is straight."""
     parts = [Part(drive, float(start_s), slowed, seconds) for start_s in rng.uniform(0, DRIVE_S, 3)]
     t_s = np.linspace(0, seconds, 100)
     return max(parts, key=lambda part: float(np.abs(part.twist(t_s)[:, 4]).mean()))
@@ -269,7 +269,7 @@ def _choice(rng: np.random.Generator, shares: dict[str, float]) -> str:
 
 
 def log_uniform(rng: np.random.Generator, span: Span) -> float:
-    """A number between these two, drawn so that its logarithm is uniform."""
+    """Draw a number from a span, with a uniform logarithm."""
     return math.exp(rng.uniform(math.log(span[0]), math.log(span[1])))
 
 

@@ -1,4 +1,7 @@
-"""The loop: segments of many streams, truncated backpropagation through time, Adam (research/velocity.md, recipe L)."""
+"""The training loop: batches of segments, truncated backpropagation through time, Adam.
+
+Source: research/velocity.md, recipe L.
+"""
 
 import json
 import math
@@ -14,38 +17,39 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from neurove_core import bundle, golden
-from neurove_core.about import About, MadeBy
-from neurove_core.bundle import Bundle
-from neurove_core.carried import detached
-from neurove_core.encoding import to_spikes
+from neurove_core import self_test
 from neurove_core.estimator import Estimator
-from neurove_core.files import write_whole
-from neurove_core.loss import group_loss, scaled_sum
+from neurove_core.files import write_atomically
+from neurove_core.models import bundle, golden
+from neurove_core.models.bundle import Bundle
+from neurove_core.models.metadata import MadeBy, Metadata
+from neurove_core.networks.encoding import to_spikes
+from neurove_core.networks.state import detached
 from neurove_core.training.batches import Segment, draw
 from neurove_core.training.config import RecipeConfig, TrainingConfig
 from neurove_core.training.curve import Scalars, draw_curve
 from neurove_core.training.data import Cache, Sequences
-from neurove_core.training.ranks import Ranks, together
-from neurove_core.training.recorded import Recorded
-from neurove_core.training.run import Run
+from neurove_core.training.loss import group_loss, scaled_sum
+from neurove_core.training.ranks import Ranks, process_group
+from neurove_core.training.recorded import RecordedSequences
+from neurove_core.training.run import TrainingRun
 
 CHECKPOINT: Final = "checkpoint.safetensors"
 RUN_JSON: Final = "run.json"
 
-_CURVE_STEPS: Final = 100  # the curve has the mean of so many updates, of a short run of a hundredth of all
+_CURVE_STEPS: Final = 100  # updates per point of the curve; in a short run, one hundredth of all updates
 _PROVENANCE_CHARS: Final = 1000
 _GOLDEN_SEQUENCES: Final = 8
 _GOLDEN_BYTES: Final = 200_000
-_NAMES_CHARS: Final = 400  # of the recordings in it
+_NAMES_CHARS: Final = 400  # of the names of recordings in the provenance
 
 
 class Progress(NamedTuple):
-    """How far a run is."""
+    """Progress of a run."""
 
     step: int
     steps: int
-    linear_m_s: float  # mean length of the linear error since the last report
+    linear_m_s: float  # mean length of the linear error since the last point of the curve
     angular_rad_s: float
 
 
@@ -55,10 +59,10 @@ class _Losses(NamedTuple):
 
 
 def learning_rate(step: int, recipe: RecipeConfig) -> float:
-    """Of update `step`, counted from 0: rises in a line to the recipe's, then falls as half a cosine to 0.
+    """Compute the learning rate of update `step`, counted from 0: a linear warm-up, then half a cosine to 0.
 
-    Each further cycle does so again, to half the peak of the one before (warm restarts, Loshchilov 2017). A run of more
-    cycles begins as one of fewer does, so a finished run can go on.
+    Each further cycle repeats this with half the peak of the previous cycle (warm restarts, Loshchilov 2017). The first
+    cycles do not depend on the number of cycles, so a finished run can continue with more.
 
     >>> recipe = RecipeConfig(steps=300, warm_up_steps=100, cycles=2)
     >>> [round(learning_rate(step, recipe), 6) for step in (0, 99, 200, 299, 399, 500, 600)]
@@ -84,81 +88,82 @@ def train(
     device: str = "cpu",
     on_progress: Callable[[Progress], None] = lambda _: None,
 ) -> Path:
-    """Train a model to the end of its recipe.
+    """Train a network on existing sequences, and write its bundle without an uncertainty; see `pipeline.train`.
 
     Args:
         config: of the run.
         out: folder for the checkpoint, run.json, the curve and the bundle.
-        data: folder of the sequences, filled by `Cache.fill` and `Recorded.fill`.
+        data: folder of the sequences, filled by `Cache.fill` and `RecordedSequences.fill`.
         more: files of further sequences, as `data.save` writes them.
-        resume: go on from the checkpoint in `out`, where there is one.
-        start: a model to begin from; a checkpoint that is gone on from knows its own.
-        devices: processes that share each batch, each with its own device.
+        resume: continue from the checkpoint in `out`, if it exists.
+        start: model whose weights the run begins from; ignored if the run continues from a checkpoint.
+        devices: number of processes that share each batch, each with its own device.
         device: `cpu`, `cuda` or `auto`; see `ranks.device_of`.
-        on_progress: told after each segment.
+        on_progress: called after each segment.
 
     Returns:
-        the bundle's path.
+        the path of the bundle.
 
     Raises:
-        BrokenRecording: a sequence is missing or broken. BadModel: the checkpoint can not be gone on from, or the
-            start is of another network.
-        InvalidField: the batch does not split over the devices, or there are not so many. LostRank: one of them ended.
+        BrokenRecording: a sequence is missing or broken.
+        BadModel: the checkpoint does not fit the configuration, or `start` has another network.
+        InvalidField: the batch does not split over the devices, or a device is missing.
+        LostRank: one of the processes ended early.
     """
     out.mkdir(parents=True, exist_ok=True)
     resume = resume and (out / CHECKPOINT).exists()
-    sequences = Sequences([*Cache(data, config).paths(), *Recorded(data, config).paths(), *more])
-    how = Beginning(resume, start)
-    begin(config, out, sequences, how, Ranks(count=devices))  # so that what is wrong is told by one
-    with together(devices, device, follow, (config, out, sequences.paths, how)) as ranks:
-        run = begin(config, out, sequences, how, ranks)
+    sequences = Sequences([*Cache(data, config).paths(), *RecordedSequences(data, config).paths(), *more])
+    how = Start(resume, start)
+    begin_run(config, out, sequences, how, Ranks(count=devices))  # one process raises the errors of the arguments
+    with process_group(devices, device, train_rank, (config, out, sequences.paths, how)) as ranks:
+        run = begin_run(config, out, sequences, how, ranks)
         with Scalars(out, run.step) as scalars:
-            descend(run, sequences, out, on_progress, scalars.add)
+            train_to_end(run, sequences, out, on_progress, scalars.add)
     draw_curve(run.curve, out, f"{config.name}: {run.step} updates")
     path = out / f"{config.name}{bundle.SUFFIX}"
-    made = run.bundle(provenance(run, len(more)), about(run))
-    test = golden.record(Estimator(made), golden_windows(sequences))
+    made = run.bundle(provenance(run, len(more)), metadata_of(run))
+    test = self_test.record(Estimator(made), golden_windows(sequences))
     bundle.save(replace(made, golden=test), path)
     return path
 
 
-class Beginning(NamedTuple):
-    """Where a run's first weights come from: a checkpoint, a model, or the recipe's seed."""
+class Start(NamedTuple):
+    """Origin of the first weights of a run: a checkpoint, a model, or the seed of the recipe."""
 
     resume: bool
     start: Bundle | None
 
 
-def begin(config: TrainingConfig, out: Path, sequences: Sequences, how: Beginning, ranks: Ranks) -> Run:
-    """A rank's run at its first update, or at that of the checkpoint."""
+def begin_run(config: TrainingConfig, out: Path, sequences: Sequences, how: Start, ranks: Ranks) -> TrainingRun:
+    """The run of a rank, at its first update or at the update of the checkpoint."""
     if how.resume:
-        return Run.restore(out / CHECKPOINT, config, ranks)
-    return Run.begin(config, sequences, ranks, how.start)
+        return TrainingRun.restore(out / CHECKPOINT, config, ranks)
+    return TrainingRun.begin(config, sequences, ranks, how.start)
 
 
-def follow(config: TrainingConfig, out: Path, paths: list[Path], how: Beginning, ranks: Ranks) -> None:
-    """What every rank but the first does: learn, and write nothing."""
+def train_rank(config: TrainingConfig, out: Path, paths: list[Path], how: Start, ranks: Ranks) -> None:
+    """Main function of every rank except the first: train, and write nothing."""
     sequences = Sequences(paths)
-    descend(begin(config, out, sequences, how, ranks), sequences, out)
+    train_to_end(begin_run(config, out, sequences, how, ranks), sequences, out)
 
 
-def descend(
-    run: Run,
+def train_to_end(
+    run: TrainingRun,
     sequences: Sequences,
     out: Path,
     on_progress: Callable[[Progress], None] = lambda _: None,
     on_point: Callable[[dict[str, float]], None] = lambda _: None,
 ) -> None:
-    """Learn to the end of the recipe; the first rank leaves checkpoints and run.json in `out`."""
-    recipe, share = run.config.recipe, run.share
+    """Train to the end of the recipe; the first rank writes checkpoints and run.json to `out`."""
+    recipe, share = run.config.recipe, run.rank_recipe
     spent_s, saved_s, began_s, recent = run.cpu_s, time.monotonic(), time.process_time(), list[_Losses]()
     while run.step < recipe.updates:
-        recent += learn(run, draw(run.rng, sequences, share))
+        recent += train_segment(run, draw(run.rng, sequences, share))
         mean = _mean(recent)
         on_progress(Progress(run.step, recipe.updates, 2 * mean.linear, 2 * mean.angular))
         if len(recent) < min(_CURVE_STEPS, recipe.steps / 100) and run.step < recipe.updates:
             continue
-        ranks = run.ranks.gathered((run.order, time.process_time() - began_s))
+        ranks = run.ranks.gather((run.rng_state, time.process_time() - began_s))
         run.cpu_s = spent_s + sum(cpu_s for _, cpu_s in ranks)
         run.curve.append(_point(run, mean))
         on_point(run.curve[-1])
@@ -170,18 +175,18 @@ def descend(
             saved_s = time.monotonic()
 
 
-def learn(run: Run, segment: Segment) -> list[_Losses]:
-    """Follow a segment's streams from rest, chunk by chunk, with an update of the weights after each."""
+def train_segment(run: TrainingRun, segment: Segment) -> list[_Losses]:
+    """Run the streams of a segment from the zero state, with an update of the weights after each chunk."""
     recipe, ranks = run.config.recipe, run.ranks
     segment = Segment(*(tensor.to(ranks.device) for tensor in segment))
-    state, losses = run.network.initial_state(segment.counts.shape[1]), []
+    state, steps = run.network.initial_state(segment.counts.shape[1]), []
     for first in range(0, recipe.segment_windows, recipe.chunk_windows):
         chunk = slice(first, first + recipe.chunk_windows)
         for group in run.optimiser.param_groups:
             group["lr"] = learning_rate(run.step, recipe)
         spikes = to_spikes(segment.counts[chunk], run.config.model.network.encoding)
-        answers, state = run.network(spikes, state)
-        linear, angular = (ranks.mean(loss) for loss in errors(run, answers, segment, chunk))
+        outputs, state = run.network(spikes, state)
+        linear, angular = (ranks.mean(loss) for loss in losses(run, outputs, segment, chunk))
         loss, run.balance = scaled_sum(linear, angular, run.balance, recipe.balance_decay)
         run.optimiser.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]  # torch's own
@@ -190,23 +195,28 @@ def learn(run: Run, segment: Segment) -> list[_Losses]:
         run.optimiser.step()
         run.step += 1
         state = detached(state)
-        losses.append(_Losses(float(linear.detach()), float(angular.detach())))
-    return losses
+        steps.append(_Losses(float(linear.detach()), float(angular.detach())))
+    return steps
 
 
-def errors(run: Run, answers: Tensor, segment: Segment, chunk: slice) -> tuple[Tensor, Tensor]:
-    """L_l in m/s and L_a in rad/s of a chunk's answers (T, B, n, 6).
+def losses(run: TrainingRun, outputs: Tensor, segment: Segment, chunk: slice) -> tuple[Tensor, Tensor]:
+    """Compute L_l [m/s] and L_a [rad/s] of the outputs (T, B, n, 6) of the network for a chunk.
 
-    The linear part is learned per metre of camera height, but its error counts in m/s: else streams near the ground,
-    whose numbers are large, would be all that is learned. What the truth does not know is no error.
+    The linear part is trained per metre of camera height, but its error counts in m/s. Otherwise streams near the
+    ground, whose values are large, would dominate the loss. An unknown truth (nan) counts as no error.
     """
     truth = segment.twists[chunk]
-    error = torch.where(truth.isnan(), 0, answers * run.scale + run.offset - truth)
+    error = torch.where(truth.isnan(), 0, outputs * run.scale + run.offset - truth)
     return group_loss(error[..., :3] * segment.height_m[:, None, None]), group_loss(error[..., 3:])
 
 
-def provenance(run: Run, more: int = 0) -> str:
-    """One line: how this model was made; `more` sequences were learned from beside the configuration's."""
+def provenance(run: TrainingRun, more: int = 0) -> str:
+    """Describe in one line how the model was made.
+
+    Args:
+        run: at its end.
+        more: number of sequences in addition to those of the configuration.
+    """
     recipe, data = run.config.recipe, run.config.data
     names = ", ".join(Path(one.source).name for one in data.recordings)
     also = f" and {more} more" if more else ""
@@ -220,8 +230,8 @@ def provenance(run: Run, more: int = 0) -> str:
     return text[:_PROVENANCE_CHARS]
 
 
-def about(run: Run) -> About:
-    """How this model was made, as fields, and how far off it was at its last updates."""
+def metadata_of(run: TrainingRun) -> Metadata:
+    """Describe how the model was made, as fields, with its errors in the last updates."""
     config = run.config
     made_by = MadeBy(
         program=_program(run),
@@ -235,18 +245,18 @@ def about(run: Run) -> About:
     )
     last = run.curve[-1] if run.curve else {}
     errors = ("linear_error_m_s", "angular_error_rad_s")
-    return About(made_by=made_by, figures={f"training_{name}": last[name] for name in errors if name in last})
+    return Metadata(made_by=made_by, figures={f"training_{name}": last[name] for name in errors if name in last})
 
 
-def _program(run: Run) -> str:
+def _program(run: TrainingRun) -> str:
     begun = f", begun from {run.start[:12]}" if run.start else ""
     return f"neurove train {run.config.name}{begun}"
 
 
 def golden_windows(sequences: Sequences) -> NDArray[np.uint8]:
-    """Windows (T, 2n, H, W) for the golden test: the busiest ends of the first sequences that fit into a bundle.
+    """Select windows (T, 2n, H, W) for the golden test: the busiest end of the first sequences.
 
-    They are fewer than `golden.WINDOWS` where the grid is large.
+    A large grid gives fewer windows than `golden.WINDOWS`, so that they fit into the bundle.
     """
     ends = []
     for index in range(min(len(sequences), _GOLDEN_SEQUENCES)):
@@ -259,7 +269,7 @@ def golden_windows(sequences: Sequences) -> NDArray[np.uint8]:
 
 
 def commit() -> str | None:
-    """The commit of the source that runs, or None where it is no work tree."""
+    """Return the commit of the running source, or None if it is not in a work tree."""
     command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--exclude=*"]
     try:
         return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip() or None
@@ -271,7 +281,7 @@ def _mean(losses: list[_Losses]) -> _Losses:
     return _Losses(*(sum(values) / len(values) for values in zip(*losses, strict=True)))
 
 
-def _point(run: Run, mean: _Losses) -> dict[str, float]:
+def _point(run: TrainingRun, mean: _Losses) -> dict[str, float]:
     return {
         "step": run.step,
         "linear_error_m_s": 2 * mean.linear,
@@ -281,8 +291,8 @@ def _point(run: Run, mean: _Losses) -> dict[str, float]:
     }
 
 
-def _write_run(run: Run, out: Path) -> None:
-    about: dict[str, Any] = {
+def _write_run(run: TrainingRun, out: Path) -> None:
+    summary: dict[str, Any] = {
         "config": run.config.model_dump(mode="json"),
         "seed": run.config.recipe.seed,
         "commit": commit(),
@@ -294,4 +304,4 @@ def _write_run(run: Run, out: Path) -> None:
         "cpu_s": round(run.cpu_s, 1),
         "curve": run.curve,
     }
-    write_whole(out / RUN_JSON, json.dumps(about, indent=1).encode())
+    write_atomically(out / RUN_JSON, json.dumps(summary, indent=1).encode())

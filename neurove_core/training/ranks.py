@@ -1,7 +1,8 @@
-"""Processes that learn one model together: each takes its share of a batch, and all end with the same weights.
+"""Data-parallel training: several processes share each batch, and all of them end with the same weights.
 
-Every rank computes on its own device; what depends on the whole batch (the norms' statistics, the losses that balance
-each other, the gradient) is averaged over all of them: N devices take the step that one would take on the same batch.
+Every rank computes on its own device. Everything that depends on the whole batch is averaged over all ranks: the
+statistics of the norms, the losses of the dynamic scaling, and the gradient. N devices therefore take the step that one
+device would take on the same batch.
 """
 
 import contextlib
@@ -21,24 +22,24 @@ import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
-from protocol.errors import InvalidField, NeuroVEError
+from neurove_protocol.errors import InvalidField, NeuroVEError
 
-_TIMEOUT: Final = timedelta(minutes=10)  # of one exchange; a rank that died is noticed at once
+_TIMEOUT: Final = timedelta(minutes=10)  # of one exchange; the end of a rank is detected at once
 
 
 class LostRank(NeuroVEError):
-    """A process that learns with others ended before them."""
+    """A process of a distributed run ended early."""
 
     code = "lost_rank"
 
     def __init__(self, rank: int, exit_code: int | None) -> None:
-        why = f"process {rank} of the run ended with code {exit_code}: go on with --resume"
+        why = f"process {rank} of the run ended with code {exit_code}: continue with --resume"
         super().__init__(why, rank=rank, exit_code=exit_code)
 
 
 @dataclass(frozen=True)
 class Ranks:
-    """One of the processes of a run, and what it exchanges with the others."""
+    """One of the processes of a run, and its exchanges with the others."""
 
     rank: int = 0
     count: int = 1
@@ -46,11 +47,11 @@ class Ranks:
 
     @property
     def first(self) -> bool:
-        """Whether this is the one that writes files."""
+        """Whether this rank writes the files."""
         return self.rank == 0
 
     def mean(self, value: Tensor) -> Tensor:
-        """The mean of a tensor over all ranks, the same bits on each; gradients flow into every rank's own."""
+        """Mean of a tensor over all ranks, with the same bits on each; gradients flow into the tensor of every rank."""
         if self.count == 1:
             return value
         mean: Tensor = _Mean.apply(value, self.count)  # type: ignore[no-untyped-call]  # torch's own
@@ -65,8 +66,8 @@ class Ranks:
         for gradient, mean in zip(gradients, torch.split(means, [one.numel() for one in gradients]), strict=True):
             gradient.copy_(mean.view_as(gradient))
 
-    def gathered(self, value: Any) -> list[Any]:
-        """What each rank has, in their order."""
+    def gather(self, value: Any) -> list[Any]:
+        """The value of each rank, in the order of the ranks."""
         if self.count == 1:
             return [value]
         values: list[Any] = [None] * self.count
@@ -75,11 +76,11 @@ class Ranks:
 
 
 ALONE: Final = Ranks()
-"""A run of one process, on the CPU."""
+"""A run of one process on the CPU."""
 
 
 class _Mean(torch.autograd.Function):
-    """The mean over all ranks; backwards the same, for each rank's loss depends on what every rank gave."""
+    """Mean over all ranks; backward it averages too, because the loss of each rank depends on the values of all."""
 
     @staticmethod
     def forward(ctx: Any, value: Tensor, count: int) -> Tensor:
@@ -98,13 +99,13 @@ def _averaged(value: Tensor, count: int) -> Tensor:
 
 
 class SharedNorm(nn.Module):
-    """A batch norm whose statistics are of all ranks' batches together; its state is that of torch's own.
+    """A batch norm with statistics over the batches of all ranks; its state is that of the norm of torch.
 
-    torch's SyncBatchNorm has no CPU form. Each rank must hold as many rows as every other.
+    It exists because SyncBatchNorm of torch does not run on the CPU. All ranks must hold the same number of rows.
 
     Args:
-        norm: BatchNorm1d or BatchNorm2d with affine parameters and running statistics, whose tensors it takes over.
-        ranks: that it shares with.
+        norm: BatchNorm1d or BatchNorm2d with affine parameters and running statistics; its tensors are used.
+        ranks: this rank, and its exchange with the others.
     """
 
     running_mean: Tensor
@@ -119,7 +120,7 @@ class SharedNorm(nn.Module):
         self.eps, self.momentum, self.ranks = norm.eps, norm.momentum or 0.0, ranks
 
     def forward(self, x: Tensor) -> Tensor:
-        """(rows, C) or (rows, C, H, W), normalised by the mean and variance over all but C, of all ranks."""
+        """Normalise (rows, C) or (rows, C, H, W) by the mean and variance over all axes but C and over all ranks."""
         over = [axis for axis in range(x.dim()) if axis != 1]
         along = (slice(None), *(None,) * (x.dim() - 2))
         mean = self.ranks.mean(x.mean(over))
@@ -134,7 +135,7 @@ class SharedNorm(nn.Module):
 
 
 def share_norms(module: nn.Module, ranks: Ranks) -> None:
-    """Put a SharedNorm in the place of every batch norm; names and values in the module's state stay."""
+    """Replace every batch norm by a SharedNorm; names and values in the state of the module stay the same."""
     for name, child in list(module.named_children()):
         if isinstance(child, nn.BatchNorm1d | nn.BatchNorm2d):
             setattr(module, name, SharedNorm(child, ranks))
@@ -143,56 +144,56 @@ def share_norms(module: nn.Module, ranks: Ranks) -> None:
 
 
 def device_of(wanted: str, rank: int = 0, devices: int = 1) -> torch.device:
-    """The device of a rank.
+    """Select the device of a rank.
 
     Args:
-        wanted: `cpu`, `cuda` (one GPU for each rank), or `auto`: GPUs where there are enough, else the CPU.
-        rank: whose.
-        devices: how many ranks there are.
+        wanted: `cpu`, `cuda` (one GPU for each rank), or `auto` (GPUs if there are enough, else the CPU).
+        rank: number of the rank.
+        devices: number of ranks.
 
     Raises:
-        InvalidField: another name, or fewer GPUs than ranks.
+        InvalidField: the name is unknown, or there are fewer GPUs than ranks.
     """
     if wanted not in ("auto", "cpu", "cuda"):
         raise InvalidField("training", "device", wanted, "auto, cpu or cuda is expected")
-    there = torch.cuda.device_count() if torch.cuda.is_available() else 0
-    if wanted == "cuda" and there < devices:
-        raise InvalidField("training", "device", wanted, f"{devices} GPUs are needed, torch sees {there}")
-    return torch.device("cpu" if wanted == "cpu" or there < devices else f"cuda:{rank}")
+    available = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if wanted == "cuda" and available < devices:
+        raise InvalidField("training", "device", wanted, f"{devices} GPUs are needed, torch sees {available}")
+    return torch.device("cpu" if wanted == "cpu" or available < devices else f"cuda:{rank}")
 
 
 @contextlib.contextmanager
-def together(devices: int, device: str, work: Callable[..., Any], arguments: tuple[Any, ...]) -> Iterator[Ranks]:
-    """Inside this, `devices` processes of this machine learn together, and this one is the first of them.
+def process_group(devices: int, device: str, work: Callable[..., Any], arguments: tuple[Any, ...]) -> Iterator[Ranks]:
+    """Run `devices` processes on this machine as one group; the caller is the first rank.
 
     Args:
-        devices: how many, at least 1; with 1 no process is started.
+        devices: number of processes, at least 1; with 1 no process is started.
         device: see `device_of`.
-        work: what the others do, a function of a module; it gets these arguments and then its Ranks.
-        arguments: they must pickle.
+        work: function of a module that every other rank calls with `arguments` and its Ranks.
+        arguments: must be picklable.
 
     Raises:
-        InvalidField: of `device_of`. LostRank: another process ended before this one.
+        InvalidField: as `device_of`. LostRank: another process ended before this one.
     """
     if devices == 1:
         yield Ranks(device=device_of(device))
         return
     first = Ranks(0, devices, device_of(device, 0, devices))
-    context = multiprocessing.get_context("spawn")  # neither torch's threads nor CUDA survive a fork
+    context = multiprocessing.get_context("spawn")  # the threads of torch and CUDA do not survive a fork
     others: list[_Other] = []
     with tempfile.TemporaryDirectory() as meeting, contextlib.ExitStack() as ends:
         store, threads = str(Path(meeting) / "ranks"), torch.get_num_threads()
         for rank in range(1, devices):
-            ready, told = context.Pipe(duplex=False)
+            ready, started = context.Pipe(duplex=False)
             own = Ranks(rank, devices, device_of(device, rank, devices))
-            other = context.Process(target=_learn, args=(own, store, threads, told, work, arguments), daemon=True)
+            other = context.Process(target=_run_rank, args=(own, store, threads, started, work, arguments), daemon=True)
             other.start()
-            told.close()
+            started.close()
             others.append(_Other(rank, other, ready))
             ends.callback(others[-1].end)
         for each in others:
             each.wait()
-        with _joined(first, store):
+        with _group(first, store):
             try:
                 yield first
             except BaseException as error:
@@ -200,29 +201,29 @@ def together(devices: int, device: str, work: Callable[..., Any], arguments: tup
                     next((each for each in others if each.ended()), None) if isinstance(error, RuntimeError) else None
                 )
                 for each in others:
-                    each.process.kill()  # before the group ends, else each would tell that the first one is gone
+                    each.process.kill()  # before the group ends; otherwise each logs that the first rank is gone
                 if lost is None:
                     raise
-                raise lost.error() from error  # torch tells no more than that a connection was closed
+                raise lost.error() from error  # torch reports only that a connection was closed
 
 
 class _Other(NamedTuple):
-    """A process of the run, as the first one sees it."""
+    """Another process of the run, as the first rank handles it."""
 
     rank: int
     process: Any
-    ready: Any  # a pipe that tells when it is up
+    ready: Any  # a pipe that reports when the process has started
 
     def wait(self) -> None:
-        """Until it is up: joining a group that one of them never joins would take the whole timeout."""
+        """Wait until the process has started; joining a group with a missing member would take the whole timeout."""
         try:
             self.ready.recv()
-        except EOFError:  # it ended before it was up
+        except EOFError:  # it ended during its start
             self.process.join()
             raise self.error() from None
 
     def ended(self) -> bool:
-        self.process.join(1.0)  # its connections are closed a moment before it is gone
+        self.process.join(1.0)  # its connections close shortly before it ends
         return self.process.exitcode is not None
 
     def error(self) -> LostRank:
@@ -231,28 +232,28 @@ class _Other(NamedTuple):
     def end(self) -> None:
         self.ready.close()
         if sys.exc_info()[0] is None:
-            self.process.join(60)  # it has had the last exchange, and ends by itself
+            self.process.join(60)  # it has done the last exchange and ends by itself
         self.process.kill()
         self.process.join()
 
 
-def _learn(ranks: Ranks, store: str, threads: int, up: Any, work: Callable[..., Any], arguments: Any) -> None:
-    """One of the other processes, from its beginning to its end."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all; the first one ends the others
+def _run_rank(ranks: Ranks, store: str, threads: int, started: Any, work: Callable[..., Any], arguments: Any) -> None:
+    """Main function of the other processes."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the first rank ends the others
     torch.set_num_threads(threads)
-    up.send(True)
-    with _joined(ranks, store):
+    started.send(True)
+    with _group(ranks, store):
         work(*arguments, ranks)
 
 
 @contextlib.contextmanager
-def _joined(ranks: Ranks, store: str) -> Iterator[None]:
-    """Inside this the group of all ranks exists."""
+def _group(ranks: Ranks, store: str) -> Iterator[None]:
+    """Create the group of all ranks, and destroy it at the end."""
     if ranks.device.type == "cuda":
         torch.cuda.set_device(ranks.device)
     else:
         loopback = next((name for _, name in socket.if_nameindex() if name.startswith("lo")), None)
-        if loopback:  # else the port would be open to the network
+        if loopback:  # otherwise the port would be open to the network
             os.environ.setdefault("GLOO_SOCKET_IFNAME", loopback)
     dist.init_process_group(
         "nccl" if ranks.device.type == "cuda" else "gloo",

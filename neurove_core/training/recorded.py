@@ -1,7 +1,7 @@
-"""Recordings with truth as sequences to learn from: cut as the service cuts them, kept beside the simulated ones.
+"""Training sequences from recordings with ground truth, split into windows as the service does.
 
-A recording is read once; what was made of it stays valid as long as its events, its truth, its lens and what the
-configuration says of it stay the same.
+A recording is read once. Its sequences stay valid while its events, its truth, its lens and its entry in the
+configuration stay the same.
 """
 
 import functools
@@ -14,86 +14,91 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core import windows
-from neurove_core.files import write_whole
-from neurove_core.geometry import Twists, lookup_table, twists
-from neurove_core.io import Recording, UnknownSource, open_source, read_poses
-from neurove_core.io.recording import SUPPORTED
+from neurove_core.files import write_atomically
+from neurove_core.geometry.camera import lookup_table
+from neurove_core.geometry.motion import Twists, twists
+from neurove_core.ingest import windows
+from neurove_core.ingest.windows import Window, WindowsState
+from neurove_core.io import Recording, UnknownSource
+from neurove_core.io.formats.pose_files import read_poses
+from neurove_core.sources import open_source
 from neurove_core.training.config import RecordedConfig, TrainingConfig
 from neurove_core.training.data import FORMAT, Sequence, save
-from neurove_core.windows import Window, WindowsState
-from protocol.errors import InvalidField
+from neurove_protocol.errors import InvalidField
 
 INDEX: Final = "index.json"
-"""Written last: how many windows each sequence of a recording has."""
+"""File with the number of windows of each sequence of a recording; it is written last."""
 
-_SAMPLES: Final = 4  # of the truth in each bin, whose mean is the bin's
+_SAMPLES: Final = 4  # samples of the truth per bin; the bin has their mean
 _STREAM: Final = "train"
-_IS_RECORDING: Final = ("events.txt", "metadata.yaml")  # what makes a folder one recording, not some
+_IS_RECORDING: Final = ("events.txt", "metadata.yaml")  # a folder with one of these files is one recording
 
 
-class Recorded:
-    """The sequences of a configuration's recordings, in a folder; what is missing is cut, what is there is read.
+class RecordedSequences:
+    """Sequences of the recordings of a configuration, in a folder; only missing ones are made.
 
     Args:
-        folder: of all configurations, as of `data.Cache`; each recording has its own folder within.
-        config: whose recordings these are.
+        folder: shared by all configurations, as in `data.Cache`; each recording has its own folder inside.
+        config: of the run.
 
     Raises:
-        UnknownSource: there is no such recording, or a folder holds none.
-        InvalidField: it has no truth, never ends, or knows linear velocity but no camera height; names the field.
+        UnknownSource: a recording does not exist, or a folder contains none.
+        InvalidField: a recording has no truth, never ends, or has linear velocities but no camera height. The error
+            names the field.
         BrokenRecording, MissingGeometry, MissingExtra: as `io.open_source`.
     """
 
     def __init__(self, folder: Path, config: TrainingConfig) -> None:
         self._config, self._folder = config, folder
         self._found = [
-            _opened(f"data.recordings.{i}", source, one)
+            _open(f"data.recordings.{i}", source, one)
             for i, one in enumerate(config.data.recordings)
             for source in _sources(one)
         ]
 
     def fill(self) -> Iterator[str]:
-        """Cut what is missing; yields the name of each recording that was cut.
+        """Split the missing recordings into sequences, and yield the name of each one when it is done.
 
         Raises:
-            BrokenRecording: it can not be read to its end; nothing is kept of it.
-            InvalidField: its truth and its events have too little time in common for a segment.
+            BrokenRecording: a recording cannot be read to its end; its sequences are not used.
+            InvalidField: truth and events of a recording do not overlap long enough for a segment.
         """
         for found in self._found:
             folder = self._folder_of(found)
             if not (folder / INDEX).exists():
                 folder.mkdir(parents=True, exist_ok=True)
                 lengths: list[int] = []
-                for sequence in pieces(found.recording, found.truth, found.height_m, self._config):
+                for sequence in split_recording(found.recording, found.truth, found.height_m, self._config):
                     save(sequence, folder / f"{len(lengths):06d}.safetensors")
                     lengths.append(len(sequence.twists))
-                write_whole(folder / INDEX, json.dumps({"source": found.source, "windows": lengths}).encode())
+                write_atomically(folder / INDEX, json.dumps({"source": found.source, "windows": lengths}).encode())
                 yield found.recording.name
             self._paths_of(found)
 
     def missing(self) -> int:
-        """How many recordings are not cut yet."""
+        """Number of recordings that are not split yet."""
         return sum(not (self._folder_of(found) / INDEX).exists() for found in self._found)
 
     def paths(self) -> list[Path]:
-        """The files of all sequences that are long enough for a segment.
+        """Files of all sequences that are long enough for a segment.
 
         Raises:
-            InvalidField: a recording has none.
+            InvalidField: a recording has no such sequence.
         """
         return [path for found in self._found for path in self._paths_of(found)]
 
-    def _paths_of(self, found: "_Found") -> list[Path]:
-        folder, takes = self._folder_of(found), self._config.recipe.most_windows
+    def _paths_of(self, found: "_OpenRecording") -> list[Path]:
+        folder, needed = self._folder_of(found), self._config.recipe.most_windows
         lengths = json.loads((folder / INDEX).read_bytes())["windows"]
-        paths = [folder / f"{i:06d}.safetensors" for i, length in enumerate(lengths) if length >= takes]
+        paths = [folder / f"{i:06d}.safetensors" for i, length in enumerate(lengths) if length >= needed]
         if not paths:
-            most = f"at most {max(lengths, default=0)} windows in a row have events and truth, a segment takes {takes}"
+            most = (
+                f"at most {max(lengths, default=0)} consecutive windows have events and truth, a segment needs {needed}"
+            )
             raise InvalidField("training", f"{found.field}.source", found.source, most)
         return paths
 
-    def _folder_of(self, found: "_Found") -> Path:
+    def _folder_of(self, found: "_OpenRecording") -> Path:
         model = self._config.model
         kind = [FORMAT, model.window.model_dump(), model.canonical.model_dump(), self._config.sequence_windows]
         kind += [found.height_m, found.digest]
@@ -101,15 +106,15 @@ class Recorded:
         return self._folder / f"recorded-{name}"
 
 
-def pieces(recording: Recording, truth: Twists, height_m: float, config: TrainingConfig) -> Iterator[Sequence]:
-    """The windows of a recording as the service cuts them, in sequences of at most `config.sequence_windows`.
+def split_recording(recording: Recording, truth: Twists, height_m: float, config: TrainingConfig) -> Iterator[Sequence]:
+    """Split a recording into windows as the service does, in sequences of at most `config.sequence_windows`.
 
-    A sequence ends where the service would skip windows, and where a window has bins of which nothing is known.
+    A sequence ends where the service would skip windows, and before a window with a bin whose truth is unknown.
 
     Args:
-        recording: that ends.
-        truth: of its camera; what it does not know (nan) stays unknown.
-        height_m: of its camera above the ground.
+        recording: must end.
+        truth: of its camera; unknown values (nan) stay unknown.
+        height_m: height of its camera above the ground.
         config: of the run.
     """
     window_config, most = config.model.window, config.sequence_windows
@@ -138,7 +143,7 @@ def _windows(recording: Recording, config: TrainingConfig) -> Iterator[Window]:
 
 
 def _truth_of(window: Window, truth: Twists, bins: int, bin_us: int) -> NDArray[np.float64]:
-    """Mean truth (n, 6) of each bin; nan where it is not known over all of it."""
+    """Mean truth (n, 6) of each bin; nan if the truth does not cover the whole bin."""
     t_us = window.start_us + (np.arange(bins * _SAMPLES) + 0.5) * (bin_us / _SAMPLES)
     mean: NDArray[np.float64] = truth.at(t_us.astype(np.int64)).reshape(bins, _SAMPLES, 6).mean(axis=1)
     return mean
@@ -152,27 +157,29 @@ def _sequence(run: list[tuple[Window, NDArray[np.float64]]], height_m: float, na
     return Sequence(counts, twist.astype(np.float32), height_m, f"{name} from {start_s:.1f} s, h={height_m:.2f} m")
 
 
-class _Found(NamedTuple):
-    """A recording that is learned from."""
+class _OpenRecording(NamedTuple):
+    """An open recording of the configuration."""
 
     field: str  # of the configuration
     source: str
     recording: Recording
     truth: Twists
     height_m: float
-    digest: str  # of all that its sequences are made of
+    digest: str  # of everything that its sequences depend on
 
 
 def _sources(one: RecordedConfig) -> list[str]:
-    """The recording, or those in the folder."""
+    """The source itself, or the recordings in its folder."""
     path = Path(one.source)
     if "://" in one.source or not path.is_dir() or _is_recording(path):
         return [one.source]
     inside = [child for child in sorted(path.iterdir()) if _may_be_recording(child) and _opens(child, one.topic)]
     if not inside:
-        raise UnknownSource(path, SUPPORTED, "neither a recording nor a folder that holds some")
+        raise UnknownSource(path, "neither a recording nor a folder with recordings")
     if one.truth is not None and len(inside) > 1:
-        raise InvalidField("training", "truth", one.truth, f"{one.source} holds {len(inside)} recordings; name each")
+        raise InvalidField(
+            "training", "truth", one.truth, f"{one.source} contains {len(inside)} recordings; list each with its truth"
+        )
     return [str(child) for child in inside]
 
 
@@ -183,7 +190,7 @@ def _is_recording(folder: Path) -> bool:
 def _may_be_recording(child: Path) -> bool:
     if child.is_dir():
         return _is_recording(child)
-    return not child.name.startswith(".") and child.suffix.lower() != ".txt"  # the text of a truth, of a calibration
+    return not child.name.startswith(".") and child.suffix.lower() != ".txt"  # text files hold truth or calibration
 
 
 def _opens(path: Path, topic: str | None) -> bool:
@@ -194,23 +201,23 @@ def _opens(path: Path, topic: str | None) -> bool:
     return True
 
 
-def _opened(field: str, source: str, one: RecordedConfig) -> _Found:
+def _open(field: str, source: str, one: RecordedConfig) -> _OpenRecording:
     recording = open_source(source, topic=one.topic)
     if recording.endless:
-        raise InvalidField("training", f"{field}.source", source, "it never ends: say how many seconds")
+        raise InvalidField("training", f"{field}.source", source, "it never ends: add ?seconds=S")
     truth = twists(read_poses(Path(one.truth))) if one.truth else recording.twists()
     if truth is None:
-        raise InvalidField("training", f"{field}.truth", None, f"{source} holds no truth: name a file of poses")
+        raise InvalidField("training", f"{field}.truth", None, f"{source} has no truth: give a file of poses")
     camera = recording.camera(_STREAM)
     height_m = one.height_m or (camera.height_m if camera else None)
     if height_m is None and np.isfinite(truth.twist[:, :3]).any():
-        why = f"{source} does not say how high its camera is, and linear velocity is learned per metre of height"
+        why = f"{source} does not give the height of its camera, and linear velocity is trained per metre of height"
         raise InvalidField("training", f"{field}.height_m", None, why)
-    about: list[Any] = [camera.model_dump() if camera else None, str(recording.sensor), one.topic]
-    about += [hashlib.sha256(column.tobytes()).hexdigest() for column in truth]
-    about += [source] if "://" in source else [_digest(file, *_version(file)) for file in _files(Path(source))]
-    digest = hashlib.sha256(json.dumps(about, sort_keys=True).encode()).hexdigest()
-    return _Found(field, source, recording, truth, height_m or 1.0, digest)
+    parts: list[Any] = [camera.model_dump() if camera else None, str(recording.sensor), one.topic]
+    parts += [hashlib.sha256(column.tobytes()).hexdigest() for column in truth]
+    parts += [source] if "://" in source else [_digest(file, *_version(file)) for file in _files(Path(source))]
+    digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
+    return _OpenRecording(field, source, recording, truth, height_m or 1.0, digest)
 
 
 def _files(path: Path) -> list[Path]:
@@ -218,12 +225,12 @@ def _files(path: Path) -> list[Path]:
 
 
 def _version(file: Path) -> tuple[int, int]:
-    about = file.stat()
-    return about.st_size, about.st_mtime_ns
+    stat = file.stat()
+    return stat.st_size, stat.st_mtime_ns
 
 
 @functools.lru_cache(maxsize=4096)
 def _digest(file: Path, size: int, changed_ns: int) -> str:
-    """Of a file's content; within one process it is read again only where it has changed."""
+    """SHA-256 of the content of a file; a process reads a file again only after a change."""
     with file.open("rb") as content:
         return hashlib.file_digest(content, "sha256").hexdigest()

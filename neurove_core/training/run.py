@@ -1,8 +1,8 @@
-"""A training run: network, optimiser and all else that the next update depends on; checkpoints; the bundle at the end.
+"""The state of a training run: network, optimiser, random generator; its checkpoints, and its bundle at the end.
 
 A checkpoint is a safetensors file, so nothing is unpickled. It is written between segments, when no stream carries
-state, and holds everything: a run that goes on from one continues bit for bit, on one machine and torch version. Where
-several processes learn, all go on from the one file.
+state, and it is complete: on the same machine and torch version, a resumed run continues bit for bit. All processes of
+a distributed run resume from the same file.
 """
 
 import json
@@ -17,26 +17,26 @@ import torch
 from pydantic import ValidationError
 from torch import Tensor, nn
 
-from neurove_core import networks
-from neurove_core.about import About
-from neurove_core.bundle import PER_HEIGHT, Bundle
 from neurove_core.config import ModelConfig
-from neurove_core.files import write_whole
-from neurove_core.loss import Balance
-from neurove_core.networks import Network
+from neurove_core.files import write_atomically
+from neurove_core.models.bundle import PER_HEIGHT, Bundle
+from neurove_core.models.metadata import Metadata
+from neurove_core.networks import kinds
+from neurove_core.networks.kinds import Network
 from neurove_core.training.config import RecipeConfig, TrainingConfig
 from neurove_core.training.data import Sequences
+from neurove_core.training.loss import Balance
 from neurove_core.training.ranks import ALONE, Ranks, share_norms
-from protocol.errors import BadModel, InvalidField
-from protocol.fields import WrongField
+from neurove_protocol.errors import BadModel, InvalidField
+from neurove_protocol.fields import WrongField
 
 _KEY = "neurove_run"
-_SYMMETRIC = [0, 4, 5]  # vx wy wz: as often to one side as to the other, for half of what is seen is mirrored
+_SYMMETRIC = [0, 4, 5]  # vx wy wz: their mean is 0, because half of the segments are mirrored
 
 
 @dataclass
-class Run:
-    """All that a run carries from one segment to the next."""
+class TrainingRun:
+    """Everything that a run carries from one segment to the next."""
 
     config: TrainingConfig
     network: Network
@@ -49,23 +49,23 @@ class Run:
     step: int = 0
     cpu_s: float = 0.0
     curve: list[dict[str, float]] = field(default_factory=list)
-    start: str = ""  # digest of the bundle that it began from, hex; empty where weights were drawn
+    start: str = ""  # digest of the bundle that it began from, hex; empty if the seed initialised the weights
 
     @classmethod
     def begin(
         cls, config: TrainingConfig, sequences: Sequences, ranks: Ranks = ALONE, start: Bundle | None = None
     ) -> Self:
-        """A run at its first step; weights and order are drawn from the recipe's seed, the order anew for each rank.
+        """Create a run at its first update; the seed gives the weights and, for each rank, its own order of segments.
 
         Args:
             config: of the run.
-            sequences: that it learns from.
-            ranks: the process that it runs in.
-            start: a model whose weights, norms and scaling it begins from, instead of drawn ones.
+            sequences: training sequences.
+            ranks: this process and its group.
+            start: model whose weights, norms and output scaling the run begins from, instead of the seed's weights.
 
         Raises:
-            InvalidField: the batch can not be shared evenly, or no sequence knows one of the two velocities.
-            BadModel: the start is of another network than the configuration's, see `check_start`.
+            InvalidField: the batch does not split evenly, or no sequence has a truth of one of the two velocities.
+            BadModel: the network of `start` differs from that of the configuration; see `check_start`.
         """
         if start is not None:
             check_start(start, config)
@@ -73,20 +73,20 @@ class Run:
         offset, scale = (one.to(ranks.device, copy=True) for one in scaling)
         network, optimiser = _network(config, ranks)
         if start is not None:
-            _take_over(network, start)
+            _copy_weights(network, start)
         run = cls(config, network, optimiser, offset, scale, _order(config, ranks), _balance(ranks), ranks)
         run.start = "" if start is None else start.digest
         return run
 
     @property
-    def share(self) -> RecipeConfig:
-        """The recipe with this rank's part of the batch."""
+    def rank_recipe(self) -> RecipeConfig:
+        """The recipe with the part of the batch of this rank."""
         batch = self.config.recipe.batch // self.ranks.count
         return self.config.recipe.model_copy(update={"batch": batch})
 
-    def bundle(self, provenance: str, about: About | None = None) -> Bundle:
-        """The model as it is now."""
-        network = networks.make(self.config.model)
+    def bundle(self, provenance: str, metadata: Metadata | None = None) -> Bundle:
+        """Return the current model as a bundle."""
+        network = kinds.make(self.config.model)
         network.load_state_dict(self.network.state_dict())
         return Bundle(
             name=self.config.name,
@@ -97,48 +97,53 @@ class Run:
             offset=self.offset.cpu(),
             scale=self.scale.cpu(),
             linear_unit=PER_HEIGHT,
-            about=about or About(),
+            metadata=metadata or Metadata(),
         ).with_digest()
 
     def save(self, path: Path, orders: list[Any]) -> None:
-        """Write a checkpoint; it is whole or it is not there, and the one before stays until it is.
+        """Write a checkpoint atomically; the previous one stays until then.
 
         Args:
             path: of the file.
-            orders: each rank's `order`.
+            orders: `rng_state` of each rank.
         """
         tensors = {f"network.{name}": tensor.contiguous() for name, tensor in self.network.state_dict().items()}
         for index, parameter in enumerate(self.network.parameters()):
             for name, value in self.optimiser.state.get(parameter, {}).items():
                 tensors[f"adam.{index}.{name}"] = value
         tensors |= {"offset": self.offset, "scale": self.scale, "balance": torch.stack(list(self.balance))}
-        about = {"config": self.config.model_dump(mode="json"), "step": self.step, "cpu_s": self.cpu_s}
-        about |= {"orders": orders, "curve": self.curve, "start": self.start}
+        metadata = {"config": self.config.model_dump(mode="json"), "step": self.step, "cpu_s": self.cpu_s}
+        metadata |= {"orders": orders, "curve": self.curve, "start": self.start}
         stored = {name: tensor.cpu() for name, tensor in tensors.items()}
-        write_whole(path, safetensors.torch.save(stored, {_KEY: json.dumps(about)}))
+        write_atomically(path, safetensors.torch.save(stored, {_KEY: json.dumps(metadata)}))
 
     @property
-    def order(self) -> Any:
-        """What decides which segments this rank draws from here on."""
+    def rng_state(self) -> Any:
+        """State of the generator that draws the segments of this rank."""
         return self.rng.bit_generator.state
 
     @classmethod
     def restore(cls, path: Path, config: TrainingConfig, ranks: Ranks = ALONE) -> Self:
-        """The run that a checkpoint holds, as one rank goes on with it.
+        """Restore the run of a rank from a checkpoint.
 
         Raises:
-            BadModel: it is missing, broken, of another configuration, or of another number of devices.
+            BadModel: the checkpoint is missing or broken, or it has another configuration or number of devices.
         """
         try:
             with safetensors.safe_open(path, "pt") as file:
-                about = json.loads(file.metadata()[_KEY])
+                metadata = json.loads(file.metadata()[_KEY])
                 tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (no mapping)
         except (OSError, KeyError, TypeError, ValueError, safetensors.SafetensorError) as error:
-            raise BadModel(path.name, f"no checkpoint to go on from: {error}") from None
-        _same_config(path, about["config"], config)
-        orders = about["orders"] if "orders" in about else [about.get("rng")]  # before `--devices` there was one
+            raise BadModel(path.name, f"not a usable checkpoint: {error}") from None
+        _same_config(path, metadata["config"], config)
+        orders = (
+            metadata["orders"] if "orders" in metadata else [metadata.get("rng")]
+        )  # checkpoints from before `--devices` have one
         if len(orders) != ranks.count:
-            raise BadModel(path.name, f"it began with devices={len(orders)}, to go on takes as many, not {ranks.count}")
+            raise BadModel(
+                path.name,
+                f"it began with devices={len(orders)} and needs the same number to continue, not {ranks.count}",
+            )
         network, optimiser = _network(config, ranks)
         try:
             network.load_state_dict({n[8:]: tensor for n, tensor in tensors.items() if n.startswith("network.")})
@@ -146,25 +151,27 @@ class Run:
             offset, scale, balance = (tensors[name].to(ranks.device) for name in ("offset", "scale", "balance"))
             run = cls(config, network, optimiser, offset, scale, np.random.default_rng())
             run.balance, run.ranks = Balance(*balance.unbind()), ranks
-            run.step, run.cpu_s, run.curve = int(about["step"]), float(about["cpu_s"]), list(about["curve"])
-            run.start = str(about.get("start", ""))  # checkpoints of before were all begun from drawn weights
+            run.step, run.cpu_s, run.curve = int(metadata["step"]), float(metadata["cpu_s"]), list(metadata["curve"])
+            run.start = str(metadata.get("start", ""))  # older checkpoints began from weights of the seed
             run.rng.bit_generator.state = orders[ranks.rank]
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise BadModel(path.name, f"a checkpoint that does not hold this run: {error}") from None
+            raise BadModel(path.name, f"the checkpoint does not contain this run: {error}") from None
         return run
 
 
 def output_scaling(sequences: Sequences) -> tuple[Tensor, Tensor]:
-    """Offset and scale (6) of a network's outputs: mean of the truth, one spread for each group of three.
+    """Compute offset and scale (6) of a network's outputs: the mean of the truth, and one spread per group of three.
 
     Raises:
-        InvalidField: no sequence has a truth of the linear, or of the angular velocity.
+        InvalidField: no sequence has a truth of the linear velocity, or none has one of the angular velocity.
     """
     twists = np.concatenate([twist.reshape(-1, 6) for twist in sequences.twists]).astype(np.float64)
     known = np.isfinite(twists)
     for group, start in (("linear", 0), ("angular", 3)):
         if not known[:, start : start + 3].any():
-            why = f"none of them has a truth of the {group} velocity; learn from others as well"
+            why = (
+                f"none of them has a truth of the {group} velocity; add recordings or simulated sequences that have it"
+            )
             raise InvalidField("training", "data.recordings", len(sequences), why)
     offset = np.where(known, twists, 0).sum(0) / np.maximum(known.sum(0), 1)
     offset[_SYMMETRIC] = 0
@@ -174,7 +181,7 @@ def output_scaling(sequences: Sequences) -> tuple[Tensor, Tensor]:
 
 
 def _order(config: TrainingConfig, ranks: Ranks) -> np.random.Generator:
-    """What a rank draws its segments by: its own, so that no two learn from the same ones."""
+    """The generator of the segments of a rank; each rank has its own, so that their segments differ."""
     return np.random.default_rng((config.recipe.seed, 202, ranks.rank) if ranks.rank else (config.recipe.seed, 202))
 
 
@@ -184,56 +191,55 @@ def _balance(ranks: Ranks) -> Balance:
 
 def _network(config: TrainingConfig, ranks: Ranks) -> tuple[Network, torch.optim.Adam]:
     if ranks.count < 1 or config.recipe.batch % ranks.count:
-        bound = f"recipe.batch={config.recipe.batch} does not split into so many equal parts"
+        bound = f"recipe.batch={config.recipe.batch} does not split into this many equal parts"
         raise InvalidField("training", "devices", ranks.count, bound)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.recipe.seed)
-        network = networks.make(config.model)
+        network = kinds.make(config.model)
     for norm in network.modules():
         if isinstance(norm, nn.BatchNorm1d | nn.BatchNorm2d):
             norm.momentum = config.recipe.norm_momentum
     if ranks.count > 1:
         share_norms(network, ranks)
     network = network.to(ranks.device).train()
-    fused = (
-        torch.device(ranks.device).type == "cpu"
-    )  # one pass over the weights: a quarter of the time; steps count there
+    # on the CPU the fused form takes a quarter of the time, because it passes over the weights once
+    fused = torch.device(ranks.device).type == "cpu"
     return network, torch.optim.Adam(network.parameters(), lr=config.recipe.learning_rate, fused=fused)
 
 
 def check_start(start: Bundle, config: TrainingConfig) -> None:
-    """Refuse to begin from a model whose weights would mean something else in the configuration's network.
+    """Refuse a start model whose weights do not fit the network of the configuration.
 
-    What shapes no tensor may differ: how gradients pass a spike, and the precision of the weights.
+    The surrogate gradient and the precision of the weights may differ, because they do not change the weights' meaning.
 
     Raises:
-        BadModel: a field that differs is named with both values.
+        BadModel: a field differs; the error has both values.
     """
     if start.linear_unit != PER_HEIGHT:
-        raise BadModel(start.name, f"linear_unit={start.linear_unit!r}: training goes on from {PER_HEIGHT!r} alone")
+        raise BadModel(start.name, f"linear_unit={start.linear_unit!r}: training can start only from {PER_HEIGHT!r}")
     check_same_network(start, config.model)
 
 
 def check_same_network(model: Bundle, config: ModelConfig) -> None:
-    """Refuse a model whose weights would mean something else in a network of this configuration.
+    """Refuse a model whose weights do not fit a network of this configuration.
 
     Raises:
-        BadModel: a field that differs is named with both values.
+        BadModel: a field differs; the error has both values.
     """
     had, wanted = _shape(model.config), _shape(config)
     for name, value in wanted.items():
         if had[name] != value:
-            raise BadModel(model.name, f"it has {name}={had[name]}, the configuration says {value}")
+            raise BadModel(model.name, f"it has {name}={had[name]}, the configuration has {value}")
 
 
-def _take_over(network: Network, start: Bundle) -> None:
-    """Give a network the weights and norms of a model, but not its measure of its errors: that is fitted anew."""
+def _copy_weights(network: Network, start: Bundle) -> None:
+    """Copy the weights and norms of a model into a network, without its uncertainty, which is fitted again later."""
     weights = {name: one for name, one in start.network.state_dict().items() if not name.startswith("spread.")}
     network.load_state_dict(weights)
 
 
 def _shape(config: ModelConfig) -> dict[str, Any]:
-    """What must be the same for one model's weights to mean the same in another."""
+    """Fields of a configuration that must be equal for the weights of two models to be comparable."""
     free = {"surrogate", "surrogate_width", "precision"}
     parts = {"window": config.window, "canonical": config.canonical, "network": config.network}
     found = {f"{part}.{name}": value for part, model in parts.items() for name, value in model if name not in free}
@@ -244,24 +250,24 @@ def _restore_optimiser(optimiser: torch.optim.Adam, parameters: list[Any], tenso
     for index, parameter in enumerate(parameters):
         prefix = f"adam.{index}."
         state = {name[len(prefix) :]: tensor for name, tensor in tensors.items() if name.startswith(prefix)}
-        if state:  # Adam counts its steps on the CPU
+        if state:  # Adam keeps its step count on the CPU
             optimiser.state[parameter] = {n: one if n == "step" else one.to(parameter) for n, one in state.items()}
 
 
 def _same_config(path: Path, began: dict[str, Any], config: TrainingConfig) -> None:
-    """Refuse to go on with another recipe than the run began with: its curve would belong to neither.
+    """Refuse to continue a run with another configuration than it began with.
 
-    A setting that did not exist when the run began had its default. More cycles are the same run, longer.
+    A setting that did not exist when the run began counts as its default. More cycles are allowed: the run gets longer.
     """
     try:
         found = TrainingConfig.model_validate(began).model_dump(mode="json")
     except ValidationError as error:
-        why = f"it began with a configuration that is none: {WrongField.of(error).sentence}"
+        why = f"it began with an invalid configuration: {WrongField.of(error).sentence}"
         raise BadModel(path.name, why) from None
     for part, fields in config.model_dump(mode="json").items():
         for name, value in fields.items() if isinstance(fields, dict) else ((part, fields),):
             was = found[part][name] if isinstance(fields, dict) else found[part]
             longer = (part, name) == ("recipe", "cycles") and value > was
             if was != value and not longer:
-                why = f"it began with {part}.{name}={was}, the configuration says {value}"
+                why = f"it began with {part}.{name}={was}, the configuration has {value}"
                 raise BadModel(path.name, why)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from service.transport import open_transport
+from neurove_service.transport import open_transport
 from tests.live.conftest import START_S, free_endpoint
 
 TLS = Path(__file__).resolve().parents[2] / "deploy" / "tls"

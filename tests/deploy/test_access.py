@@ -1,4 +1,4 @@
-"""Who may: certificates and the access list as shipped, against those who may not. What THREATS.md refers to."""
+"""Access control: the shipped certificates and access list refuse clients without a right (see THREATS.md)."""
 
 import contextlib
 import re
@@ -6,12 +6,12 @@ import re
 import pytest
 import zenoh
 
-from protocol import CameraInfo, Flag
-from protocol.control import ActivateRequest, HealthReply, HealthRequest, PeerError
-from protocol.events import encode_packet
-from protocol.keys import Keys
-from service import ask
-from service.config import ClientConfig
+from neurove_protocol import CameraInfo, Flag
+from neurove_protocol.control import ActivateRequest, HealthReply, HealthRequest, PeerError
+from neurove_protocol.events import encode_packet
+from neurove_protocol.keys import Keys
+from neurove_service.clients import ask
+from neurove_service.config import ClientConfig
 from tests.builders import make_packets
 from tests.deploy.secured import access_list, asked, bare, deployment, free_tls, joined
 from tests.live.conftest import START_S, Heard, Source, neurove, running, wait_until
@@ -110,11 +110,11 @@ class TestWhoMay:
                 reply = ask.activate(operator, config, model, "edge1")
                 assert (reply.node, reply.active.name) == ("edge1", model)
 
-    def test_the_operator_is_told_why_a_node_refused(self, anywhere):
+    def test_the_operator_receives_the_reason_of_a_refusal(self, anywhere):
         with anywhere.join("operator-alice") as operator, pytest.raises(PeerError, match="not on this node"):
             ask.activate(operator, anywhere.config("operator-alice"), "nowhere", "edge1")
 
-    def test_a_driver_feeds_its_stream_and_a_consumer_hears_of_it(self, anywhere):
+    def test_a_driver_publishes_its_stream_and_a_consumer_receives_estimates(self, anywhere):
         config = anywhere.config("consumer-planner")
         lens = CameraInfo(stream="cam0", width=64, height=48, lens="pinhole", fx=40, fy=40, cx=32, cy=24)
         with anywhere.join("driver-cam0") as driver, anywhere.join("consumer-planner") as consumer:
@@ -128,12 +128,12 @@ class TestWhoMay:
             assert KEYS.serves("edge1", "cam0") in consumer.tokens(KEYS.serves(), 1.0)
 
     @pytest.mark.parametrize("name", ["consumer-planner", "recorder-desk", "operator-alice"])
-    def test_who_reads_may_ask_for_health_and_models(self, anywhere, name):
+    def test_readers_may_query_health_and_models(self, anywhere, name):
         with anywhere.join(name) as transport:
             assert [reply.node for reply in ask.health(transport, anywhere.config(name))] == ["edge1"]
             assert [reply.node for reply in ask.models(transport, anywhere.config(name))] == ["edge1"]
 
-    def test_a_recorder_hears_the_events_and_asks_the_cameras(self, place):
+    def test_a_recorder_receives_events_and_queries_cameras(self, place):
         heard = []
         with place.join("driver-cam0") as driver, place.join("recorder-desk") as recorder:
             driver.answer(KEYS.camera("cam0"), lambda _: b"lens")
@@ -143,7 +143,7 @@ class TestWhoMay:
             wait_until(lambda: publisher.put(b"x") or heard)
             assert set(heard) == {(KEYS.events("cam0"), b"x")}
 
-    def test_the_operator_hands_a_node_the_chunks_of_a_model(self, place):
+    def test_the_operator_sends_the_chunks_of_a_model_to_a_node(self, place):
         with place.join("operator-alice") as operator, place.bare("node-edge1") as node:
             operator.answer(f"{KEYS.prefix}/@push/{DIGEST}", lambda request: b"chunk " + request)
             wait_until(lambda: asked(node, f"{KEYS.prefix}/@push/{DIGEST}", b"7") == [b"chunk 7"])
@@ -159,14 +159,14 @@ class TestWhoMayNot:
                 assert asked(intruder, key, request, timeout_s=1.0) == []
         assert anywhere.epoch() == before
 
-    def test_the_command_says_that_it_may_be_for_want_of_permission(self, place):
-        told = neurove("activate", "untrained", *place.flags("consumer-planner"))
-        assert (told.returncode, told.stdout) == (1, "")
-        assert "does its access list let you ask?" in told.stderr
-        assert told.stderr.count("\n") == 1
+    def test_the_command_names_missing_permission_as_a_possible_reason(self, place):
+        result = neurove("activate", "untrained", *place.flags("consumer-planner"))
+        assert (result.returncode, result.stdout) == (1, "")
+        assert "does its access list admit you?" in result.stderr
+        assert result.stderr.count("\n") == 1
 
     @pytest.mark.parametrize("name", [*NOT_OPERATORS, "operator-alice"])
-    def test_nobody_puts_what_is_not_theirs_with_or_without_wildcards(self, place, name):
+    def test_no_client_publishes_on_a_key_of_another_with_or_without_wildcards(self, place, name):
         through = []
         listeners = [
             place.router.declare_subscriber(key, lambda sample: through.append(str(sample.key_expr)))
@@ -233,7 +233,7 @@ class TestWhoMayNot:
             assert asked(operator, f"{KEYS.prefix}/@push/{DIGEST}", timeout_s=1.0) == []
         assert reached == []
 
-    def test_a_driver_can_not_speak_for_the_camera_of_another(self, place):
+    def test_a_driver_cannot_answer_for_the_camera_of_another(self, place):
         with place.join("driver-cam0") as driver, place.join("recorder-desk") as recorder:
             driver.answer(KEYS.camera("cam0"), lambda _: b"own")
             driver.answer(KEYS.camera("cam1"), lambda _: b"forged")
@@ -242,7 +242,7 @@ class TestWhoMayNot:
             assert recorder.ask(KEYS.camera("cam1"), b"", 1.0) == []
 
     @pytest.mark.parametrize("name", NOT_OPERATORS)
-    def test_nobody_is_alive_under_the_name_of_another(self, anywhere, name):
+    def test_no_client_declares_the_liveliness_token_of_another(self, anywhere, name):
         with anywhere.join(name) as intruder, anywhere.join("operator-alice") as operator:
             intruder.token(KEYS.alive("edge9"))
             intruder.token(KEYS.serves("edge1", "cam9"))
@@ -253,7 +253,7 @@ class TestWhoMayNot:
             assert KEYS.serves("edge1", "cam9") not in operator.tokens(KEYS.serves(), 1.0)
 
     @pytest.mark.parametrize("name", ["driver-cam0", "consumer-planner", "operator-alice"])
-    def test_events_are_for_the_node_and_a_recorder_alone(self, place, name):
+    def test_only_the_node_and_a_recorder_receive_events(self, place, name):
         heard, recorded = [], []
         with place.bare(name) as curious, place.join("recorder-desk") as recorder, place.join("driver-cam0") as driver:
             for key in (KEYS.events(), f"{KEYS.prefix}/**", "**"):
@@ -270,17 +270,17 @@ def told_by_the_node():
 
 
 class TestWhoDoesNotGetIn:
-    def test_without_a_certificate(self, anywhere):
+    def test_refuses_a_client_without_a_certificate(self, anywhere):
         with pytest.raises(zenoh.ZError, match="Unable to connect"):
             bare(anywhere.endpoint)
 
-    def test_without_a_certificate_of_ones_own(self, anywhere):
+    def test_refuses_a_client_without_its_own_certificate(self, anywhere):
         """Knows the authority, as everybody may, but has nothing to show."""
         certificate = (anywhere.folder / "ca.crt").as_posix()
         with pytest.raises(zenoh.ZError, match="Unable to connect"):
             bare(anywhere.endpoint, **{"transport/link/tls/root_ca_certificate": certificate})
 
-    def test_with_a_certificate_of_another_authority(self, anywhere, foreign, tmp_path):
+    def test_refuses_a_certificate_of_another_authority(self, anywhere, foreign, tmp_path):
         own = (foreign / "operator-alice.json5").read_text()
         trusting = re.sub(r"root_ca_certificate_base64: .*", trusted(anywhere.folder / "operator-alice.json5"), own)
         (tmp_path / "trusting.json5").write_text(trusting)
@@ -288,15 +288,15 @@ class TestWhoDoesNotGetIn:
             with pytest.raises(zenoh.ZError, match="Unable to connect"):
                 bare(anywhere.endpoint, config)
 
-    def test_without_encryption(self, anywhere):
+    def test_refuses_a_client_without_encryption(self, anywhere):
         with pytest.raises(zenoh.ZError, match="Unable to connect"):
             bare(anywhere.endpoint.replace("tls/", "tcp/"))
 
-    def test_the_command_says_that_certificates_may_be_the_reason(self, place, foreign):
-        told = neurove("health", "--connect", place.endpoint, "--zenoh-config", str(foreign / "operator-alice.json5"))
-        assert told.returncode == 1
-        assert "or one side refuses the other's certificate (zenoh_config)" in told.stderr
-        assert told.stderr.count("\n") == 1
+    def test_the_command_names_certificates_as_a_possible_reason(self, place, foreign):
+        result = neurove("health", "--connect", place.endpoint, "--zenoh-config", str(foreign / "operator-alice.json5"))
+        assert result.returncode == 1
+        assert "or one side refuses the other's certificate (zenoh_config)" in result.stderr
+        assert result.stderr.count("\n") == 1
 
     def test_a_stolen_client_certificate_does_not_make_a_router(self, place, tmp_path):
         """Nobody speaks to a listener whose certificate was not made for listening."""
@@ -318,7 +318,7 @@ def trusted(config):
     return re.search(r"root_ca_certificate_base64: .*", config.read_text())[0]
 
 
-def test_a_certificate_whose_name_was_taken_off_the_list_may_nothing(tmp_path):
+def test_a_certificate_that_is_removed_from_the_list_has_no_rights(tmp_path):
     endpoint = free_tls()
     names = ("router-box=127.0.0.1", "operator-alice", "operator-bob")
     folder = deployment(tmp_path / "pki", endpoint, *names)

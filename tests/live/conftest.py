@@ -1,4 +1,4 @@
-"""Real processes and real Zenoh sessions on loopback: multicast off, free ports, everything ended by its own id."""
+"""Real processes and real Zenoh sessions on loopback: multicast off, free ports, each process ended by its own id."""
 
 import contextlib
 import os
@@ -11,9 +11,9 @@ import time
 
 import pytest
 
-from service import ask
-from service.config import ClientConfig
-from service.transport import open_transport
+from neurove_service.clients import ask
+from neurove_service.config import ClientConfig
+from neurove_service.transport import open_transport
 
 START_S = 180
 
@@ -34,9 +34,9 @@ def wait_until(condition, timeout_s=30.0):
 
 
 class Process:
-    """One of our commands as a child process."""
+    """A command as a child process."""
 
-    def __init__(self, *arguments, module="service.cli", **environment):
+    def __init__(self, *arguments, module="neurove_service.cli", **environment):
         self.child = subprocess.Popen(
             [sys.executable, "-m", module, *arguments],
             stdout=subprocess.PIPE,
@@ -46,7 +46,7 @@ class Process:
         )
 
     def end(self, number=signal.SIGTERM, timeout_s=20.0):
-        """Signal it, and give its exit code, output and errors."""
+        """Send a signal; return exit code, output and errors."""
         if self.child.poll() is None:
             self.child.send_signal(number)
         out, err = self.child.communicate(timeout=timeout_s)
@@ -60,7 +60,7 @@ def running(*arguments, **environment):
         yield process
     finally:
         try:
-            process.end()  # in order, as an operator would: what it did is counted by coverage then
+            process.end()  # in order, as an operator would, so that coverage counts it
         except subprocess.TimeoutExpired:
             process.child.kill()
             process.child.communicate()
@@ -68,9 +68,9 @@ def running(*arguments, **environment):
 
 
 def neurove(*arguments, timeout_s=60.0):
-    """Run one command to its end."""
+    """Run a command to its end."""
     return subprocess.run(
-        [sys.executable, "-m", "service.cli", *arguments],
+        [sys.executable, "-m", "neurove_service.cli", *arguments],
         capture_output=True,
         text=True,
         timeout=timeout_s,
@@ -106,7 +106,7 @@ def _connects(endpoint):
 
 
 class Heard:
-    """Estimates that a consumer has heard, by stream."""
+    """Estimates and statuses that a consumer received, by stream."""
 
     def __init__(self, transport, config):
         self.estimates = []
@@ -131,7 +131,7 @@ class Source:
         self._publisher.put(payload)
 
     def play(self, payloads, pause_s=0.002):
-        """Publish one after the other, as a camera does: what bursts may be dropped on the way, by contract."""
+        """Publish one after the other, as a camera does: by contract, a link may drop packets of a burst."""
         for payload in payloads:
             self.put(payload)
             threading.Event().wait(pause_s)

@@ -1,17 +1,17 @@
-"""kill -9 of a service in the middle of a push or an activation, and what it serves after its restart."""
+"""kill -9 of a service during a push or an activation, and the model that it serves after its restart."""
 
 import contextlib
 import signal
 import threading
 import time
 
-from neurove_core import bundle
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
-from protocol.control import CHUNK_SCHEMA
-from protocol.errors import NeuroVEError
-from service import ask
-from service.config import ClientConfig
-from service.push_source import PushSource
+from neurove_core.models import bundle
+from neurove_protocol.control import CHUNK_SCHEMA
+from neurove_protocol.errors import NeuroVEError
+from neurove_service.clients import ask
+from neurove_service.clients.push_source import PushSource
+from neurove_service.config import ClientConfig
 from tests.live.conftest import START_S, free_endpoint, service
 
 CONFIG = ModelConfig(
@@ -20,14 +20,14 @@ CONFIG = ModelConfig(
     settle_windows=4,
     low_activity_events=10,
 )
-"""Small to run, and some chunks to move."""
+"""Fast to run, with several chunks to transfer."""
 
 CHUNK_S = 0.015
-"""What each chunk is made to take, so that a kill can come in between."""
+"""Added time of each chunk, so that a kill can come between chunks [s]."""
 
 
 class Node:
-    """A service that is killed and started again, over one folder and one endpoint."""
+    """A service that is killed and restarted, with one folder and one endpoint."""
 
     def __init__(self, folder):
         self.folder = folder
@@ -39,40 +39,40 @@ class Node:
 
     @contextlib.contextmanager
     def started(self, *more):
-        """The running service, with `more` arguments, and what it says of its models once it is ready.
+        """The running service, with `more` arguments, and its models when it is ready.
 
-        It must serve a model that the last kill allows, and everything that it has must be whole.
+        It must serve a model that the last kill allows, and all its models must be complete.
         """
         began = time.monotonic()
         models_dir = str(self.folder / "models")
         with service(self.endpoint, "--models-dir", models_dir, *more) as (process, transport, _):
             self.ready_s = time.monotonic() - began
             (models,) = ask.models(transport, self.config)
-            assert more or not self.may_serve or models.active.digest in self.may_serve, "another model serves"
+            assert more or not self.may_serve or models.active.digest in self.may_serve, "a wrong model serves"
             assert models.unreadable == {}, models.unreadable
             assert ask.health(transport, self.config)[0].ok
             yield process, transport, models
 
     def kill_in_a_change(self, seed, *, at_step=None, after_s=None):
-        """Start it, push and activate a new model, and kill it -9 at a step or after a time.
+        """Start the service, push and activate a new model, and kill -9 it at a step or after a time.
 
         Returns:
-            digest of the new model, the last step that was heard, and the model that served before.
+            digest of the new model, the last reported step, and digest of the model that served before.
         """
         path = self.folder / f"model{seed}.safetensors"
         bundle.save(bundle.untrained(seed, CONFIG, f"model{seed}"), path)
-        heard, reached = ["nothing"], threading.Event()
+        reported, reached = ["nothing"], threading.Event()
 
-        def on_progress(said):
-            heard.append(said.step)
-            if said.step == at_step:
+        def on_progress(progress):
+            reported.append(progress.step)
+            if progress.step == at_step:
                 reached.set()
 
         def change(transport, source):
-            with contextlib.suppress(NeuroVEError):  # the node is killed in the middle of it
+            with contextlib.suppress(NeuroVEError):  # the node is killed during the change
                 ask.push(transport, self.config, source.request, "n1", on_progress)
                 ask.activate(transport, self.config, source.digest, "n1", on_progress=on_progress)
-                heard.append("acknowledged")
+                reported.append("acknowledged")
                 self.may_serve = {source.digest}
                 reached.set()
 
@@ -85,10 +85,10 @@ class Node:
             process.end(signal.SIGKILL)
             thread.join(START_S)
             assert not thread.is_alive(), "the client waits for a node that was killed"
-        return source.digest, heard[-1], before.active.digest
+        return source.digest, reported[-1], before.active.digest
 
     def restarted(self):
-        """What a new start says of its models."""
+        """The models after a new start."""
         with self.started() as (_, _, models):
             return models
 

@@ -1,9 +1,9 @@
-"""A Zenoh router for tests: `python tests/live/router.py ENDPOINT`. There is no zenohd in the registries we use."""
+"""A Zenoh router for tests: `python tests/live/router.py ENDPOINT`. With it the tests need no zenohd."""
 
 import sys
 import threading
 
-from service.transport import open_transport
+from neurove_service.transport import open_transport
 
 
 def main() -> None:

@@ -1,11 +1,11 @@
-"""What the commands that change a node make of several nodes, of refusals and of faults, over real sessions."""
+"""Commands that change a node, with several nodes, refusals and internal errors, over real sessions."""
 
 import contextlib
 import json
 
 import pytest
 
-from protocol.control import (
+from neurove_protocol.control import (
     ActivateReply,
     ActivateRequest,
     ModelInfo,
@@ -15,11 +15,11 @@ from protocol.control import (
     PushRequest,
     StreamStatus,
 )
-from protocol.errors import Conflict, NoStore, UnknownModel
-from protocol.keys import Keys
-from service import ask
-from service.config import ClientConfig
-from service.transport import open_transport
+from neurove_protocol.errors import Conflict, NoStore, UnknownModel
+from neurove_protocol.keys import Keys
+from neurove_service.clients import ask
+from neurove_service.config import ClientConfig
+from neurove_service.transport import open_transport
 from tests.live.conftest import client, free_endpoint, is_alive, wait_until
 from tests.protocol.messages import STATUS
 
@@ -32,20 +32,20 @@ OLD, NEW = (
 
 
 class Node:
-    """Answers pushes and activations as a node does, with what the test wants it to say."""
+    """Answers pushes and activations as a node does, with an answer that the test sets."""
 
     def __init__(self, name, answer):
         self.name, self.answer, self.asked = name, answer, []
 
-    def activate(self, data, tell):
-        return self._told(ActivateRequest.decode(data).model, tell)
+    def activate(self, data, report):
+        return self._answer(ActivateRequest.decode(data).model, report)
 
-    def push(self, data, tell):
-        return self._told(PushRequest.decode(data).name, tell)
+    def push(self, data, report):
+        return self._answer(PushRequest.decode(data).name, report)
 
-    def _told(self, wanted, tell):
+    def _answer(self, wanted, report):
         self.asked.append(wanted)
-        tell(ProgressReply(node=self.name, step="verified", text="it runs here").encode())
+        report(ProgressReply(node=self.name, step="verified", text="it runs here").encode())
         return self.answer(self.name).encode()
 
 
@@ -66,7 +66,7 @@ def refuses(error):
 
 @pytest.fixture
 def network():
-    """An endpoint of a router, and a way to put nodes behind it."""
+    """An endpoint of a router, and a function that connects nodes to it."""
     endpoint, keys = free_endpoint(), Keys()
     with contextlib.ExitStack() as stack:
         stack.enter_context(open_transport("router", listen=(endpoint,)))
@@ -90,45 +90,45 @@ def test_one_of_several_nodes_must_be_named_before_anything_changes(network, run
     nodes = put(n1=done, n2=done)
     code, out, err = run("activate", "new", "--connect", endpoint)
     assert (code, out) == (2, "")
-    assert "several nodes are alive: n1, n2; name one with --node, or say --all" in err
+    assert "several nodes are alive: n1, n2; give --node NAME or --all" in err
     assert [node.asked for node in nodes.values()] == [[], []]
     code, out, _ = run("activate", "new", "--connect", endpoint, "--node", "n2")
     assert (code, out.splitlines()) == (
         0,
-        ["n2: verified: it runs here", f"n2: new ({'b' * 12}) now serves, was old ({'a' * 12})"],
+        ["n2: verified: it runs here", f"n2: new ({'b' * 12}) is active and replaces old ({'a' * 12})"],
     )
     assert [node.asked for node in nodes.values()] == [[], ["new"]]
 
 
-def test_what_one_node_refuses_is_not_tried_on_the_next_and_both_are_told(network, run):
+def test_after_a_refusal_the_remaining_nodes_are_not_asked_and_are_listed(network, run):
     endpoint, put = network
     nodes = put(n1=done, n2=refuses(UnknownModel("new", ("old",))), n3=done)
     code, out, err = run("activate", "new", "--connect", endpoint, "--all", "--json")
     assert code == 1
     assert [json.loads(line)["node"] for line in out.splitlines()] == ["n1", "n1", "n2"]
-    assert err == "neurove: n2: model='new': not on this node; available: old; not asked then: n3\n"
+    assert err == "neurove: n2: model='new': not on this node; available: old; not changed: n3\n"
     assert [node.asked for node in nodes.values()] == [["new"], ["new"], []]
 
 
-def test_a_push_to_all_tells_people_where_the_bundle_is_and_where_it_is_refused(network, run, tmp_path):
+def test_a_push_to_all_reports_the_nodes_that_store_the_bundle_and_the_one_that_refuses(network, run, tmp_path):
     endpoint, put = network
     nodes = put(n1=has_it, n2=refuses(NoStore("it has no state_dir")))
     (tmp_path / "new.safetensors").write_bytes(b"whatever it is")
     code, out, err = run("push", tmp_path / "new.safetensors", "--connect", endpoint, "--all")
     assert code == 1
-    assert out.splitlines()[1] == f"n1: new ({'b' * 12}) is there, 1,234 bytes moved"
-    assert err == "neurove: n2: this node keeps no pushed models: it has no state_dir\n"
+    assert out.splitlines()[1] == f"n1: new ({'b' * 12}) is stored, 1,234 bytes transferred"
+    assert err == "neurove: n2: this node stores no pushed models: it has no state_dir\n"
     assert [node.asked for node in nodes.values()] == [["new.safetensors"]] * 2
 
 
 def test_a_conflict_on_the_last_node_keeps_its_own_exit_code(network, run):
     endpoint, put = network
-    put(n1=done, n2=refuses(Conflict("somebody was first")))
+    put(n1=done, n2=refuses(Conflict("another client was first")))
     code, _, err = run("activate", "new", "--connect", endpoint, "--all")
-    assert (code, err) == (3, "neurove: n2: conflict: somebody was first\n")
+    assert (code, err) == (3, "neurove: n2: conflict: another client was first\n")
 
 
-def test_a_fault_of_a_node_is_told_to_its_caller_and_the_node_answers_on(network):
+def test_an_internal_error_of_a_node_reaches_its_caller_and_the_node_keeps_answering(network):
     endpoint, put = network
     nodes = put(n1=refuses(ZeroDivisionError("a bug")))
     config = ClientConfig(connect=(endpoint,))
@@ -141,7 +141,7 @@ def test_a_fault_of_a_node_is_told_to_its_caller_and_the_node_answers_on(network
         assert ask.activate(transport, config, "new", "n1").active == NEW
 
 
-def test_a_message_that_can_not_be_read_costs_a_listener_nothing_but_itself(network):
+def test_a_listener_ignores_an_unreadable_message(network):
     endpoint, _ = network
     config, heard, status = ClientConfig(connect=(endpoint,)), [], StreamStatus.model_validate(STATUS)
     with client(endpoint) as transport, client(endpoint) as node:

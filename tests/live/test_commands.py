@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from neurove_core import bundle
-from neurove_core.io import open_source
 from neurove_core.io.packets import slices
+from neurove_core.models import bundle
+from neurove_core.sources import open_source
 from tests.live.conftest import Process, client, free_endpoint, neurove, running, service, wait_until
 from tests.live.test_feed import start_router
 from tests.recordings import shared
@@ -48,15 +48,15 @@ def test_drive_watch_health_models_and_activate_work_together(node, run):
         models = run("models", "--connect", node).out
         assert "active" in models
         assert "foreign.safetensors" in models
-        (told,) = json.loads(run("models", "--connect", node, "--json").out)
-        assert told["previous"]["name"] == "default"
+        (listed,) = json.loads(run("models", "--connect", node, "--json").out)
+        assert listed["previous"]["name"] == "default"
 
         code, out, _ = driver.end(signal.SIGINT)
         assert code == 0
         assert "packets" in out
 
 
-def test_activating_what_is_not_there_is_refused_by_the_node(node, run):
+def test_a_node_refuses_to_activate_an_unknown_model(node, run):
     refused = run("activate", "../foreign", "--connect", node)
     assert refused.code == 1
     assert refused.err.count("\n") == 1
@@ -64,22 +64,22 @@ def test_activating_what_is_not_there_is_refused_by_the_node(node, run):
     assert "not a safetensors file" in run("activate", "foreign", "--connect", node).err
 
 
-def test_a_taken_port_is_one_clear_line(node):
+def test_a_port_in_use_is_reported_in_one_line(node):
     second = neurove("serve", "--listen", node)
     assert second.returncode == 2
-    assert second.stderr.startswith(f"neurove: can not open a Zenoh session: listen={node}: Address already in use")
+    assert second.stderr.startswith(f"neurove: cannot open a Zenoh session: listen={node}: Address already in use")
     assert second.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize("command", [("health",), ("watch",), ("models",), ("activate", "other")])
-def test_without_a_service_a_client_says_so(command, run):
-    told = run(*command, "--connect", free_endpoint())
-    assert told.code == 1
-    assert told.err.startswith("neurove: no service")
-    assert told.err.count("\n") == 1
+def test_a_client_reports_a_missing_service(command, run):
+    ran = run(*command, "--connect", free_endpoint())
+    assert ran.code == 1
+    assert ran.err.startswith("neurove: no service")
+    assert ran.err.count("\n") == 1
 
 
-def test_a_router_without_a_service_is_no_service_either(run):
+def test_a_router_without_a_node_counts_as_no_service(run):
     endpoint = free_endpoint()
     router = start_router(endpoint)
     try:
@@ -87,28 +87,28 @@ def test_a_router_without_a_service_is_no_service_either(run):
             pass
         assert run("watch", "--connect", endpoint).code == 1
         assert "is `neurove serve` running there" in run("health", "--connect", endpoint).err
-        nobody = run("drive", "pattern://", "--connect", endpoint, "--wait", "0.5")
-        assert (nobody.code, "no service took up stream cam0" in nobody.err) == (1, True)
+        undriven = run("drive", "pattern://", "--connect", endpoint, "--wait", "0.5")
+        assert (undriven.code, "no service subscribed to stream cam0" in undriven.err) == (1, True)
     finally:
         router.kill()
         router.wait()
 
 
-def test_the_demo_accounts_for_every_packet_event_and_window(tmp_path):
+def test_the_demo_counts_every_packet_event_and_window(tmp_path):
     picture = tmp_path / "demo.svg"
-    shown = neurove("demo", "pattern://", "--duration", "2", "--json", "--screenshot", str(picture), timeout_s=180)
+    shown = neurove("demo", "pattern://", "--seconds", "2", "--json", "--screenshot", str(picture), timeout_s=180)
     assert shown.returncode == 0, shown.stderr
-    told = json.loads(shown.stdout)
-    assert told["packets_sent"] == 500
-    assert told["packets_received"] + sum(told["lost"].values()) == told["packets_sent"]
-    assert told["estimates"] == told["windows"] > 0
-    assert told["sensor"] == {"width": 173, "height": 130}
-    assert (told["model"], told["trained"]) == ("default", True)
-    assert 0 < told["latency_ms"]["p50"] <= told["latency_ms"]["p95"] <= told["latency_ms"]["p99"]
+    summary = json.loads(shown.stdout)
+    assert summary["packets_sent"] == 500
+    assert summary["packets_received"] + sum(summary["lost"].values()) == summary["packets_sent"]
+    assert summary["estimates"] == summary["windows"] > 0
+    assert summary["sensor"] == {"width": 173, "height": 130}
+    assert (summary["model"], summary["trained"]) == ("default", True)
+    assert 0 < summary["latency_ms"]["p50"] <= summary["latency_ms"]["p95"] <= summary["latency_ms"]["p99"]
     assert "UNTRAINED" not in picture.read_text()
 
 
-def test_the_demo_plays_a_real_recording_and_tells_people_what_came_of_it():
+def test_the_demo_plays_a_real_recording_and_prints_a_summary():
     path = shared("ecd/shapes_rotation")
     shown = neurove("demo", str(path), timeout_s=180)
     assert shown.returncode == 0, shown.stderr
@@ -119,7 +119,7 @@ def test_the_demo_plays_a_real_recording_and_tells_people_what_came_of_it():
     assert "model      default\n" in shown.stdout
 
 
-def test_the_demo_of_a_truncated_recording_plays_what_is_whole_and_says_where_it_broke(tmp_path):
+def test_the_demo_plays_a_truncated_recording_up_to_the_error_and_names_its_place(tmp_path):
     lines = [f"{i / 1000:.6f} {i % 240} {i % 180} {i % 2}" for i in range(300)]
     (tmp_path / "events.txt").write_text("\n".join(lines) + "\n0.300 7 br\n")
     shown = neurove("demo", str(tmp_path), timeout_s=180)
@@ -128,7 +128,7 @@ def test_the_demo_of_a_truncated_recording_plays_what_is_whole_and_says_where_it
     assert "line 301" in shown.stderr
 
 
-def test_the_demo_of_nothing_is_one_line_that_lists_what_is_supported():
+def test_the_demo_of_an_unknown_source_lists_the_supported_ones_in_one_line():
     shown = neurove("demo", "nowhere.xyz")
     assert shown.returncode == 2
     assert shown.stderr.count("\n") == 1
@@ -136,17 +136,17 @@ def test_the_demo_of_nothing_is_one_line_that_lists_what_is_supported():
     assert "aedat4" in shown.stderr
 
 
-def test_a_demo_whose_model_can_not_be_loaded_says_why(tmp_path):
+def test_a_demo_whose_model_cannot_be_loaded_prints_the_reason(tmp_path):
     foreign = tmp_path / "foreign.safetensors"
     foreign.write_text("hello, I am no model at all")
-    shown = neurove("demo", "pattern://", "--model", str(foreign), "--duration", "1", timeout_s=180)
+    shown = neurove("demo", "pattern://", "--model", str(foreign), "--seconds", "1", timeout_s=180)
     assert shown.returncode == 1
     assert "not a safetensors file" in shown.stderr
     assert "Traceback" not in shown.stderr
 
 
 def test_ctrl_c_ends_the_demo_and_all_its_processes_in_order():
-    demo = Process("demo", "pattern://", "--duration", "60", "--json")
+    demo = Process("demo", "pattern://", "--seconds", "60", "--json")
     wait_until(lambda: len(children(demo.child.pid)) == 2, timeout_s=90)  # the service and the driver
     started = children(demo.child.pid)
     code, out, errors = demo.end(signal.SIGINT)
@@ -156,7 +156,7 @@ def test_ctrl_c_ends_the_demo_and_all_its_processes_in_order():
 
 
 def children(pid):
-    """Processes that a process started; empty where it has ended."""
+    """Child processes of a process; empty if it has ended."""
     try:
         return [
             int(child)
@@ -167,15 +167,20 @@ def children(pid):
         return []
 
 
+def running_as(command, parent):
+    """Children that run one of our commands; a child that has not started its program yet is none of them."""
+    return [pid for pid in children(parent) if command in Path(f"/proc/{pid}/cmdline").read_text().split("\0")]
+
+
 def test_killing_the_demo_leaves_no_process_behind():
-    demo = Process("demo", "pattern://", "--duration", "60", "--json")
+    demo = Process("demo", "pattern://", "--seconds", "60", "--json")
     wait_until(lambda: len(children(demo.child.pid)) == 2, timeout_s=90)
     started = children(demo.child.pid)
     demo.end(signal.SIGKILL)
     wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in started))
 
 
-def test_a_service_that_waits_for_a_router_ends_in_order_when_told():
+def test_a_service_that_waits_for_a_router_ends_in_order_on_sigterm():
     with running("serve", "--mode", "client", "--connect", free_endpoint(), "--node", "n1") as waiting:
         for line in waiting.child.stderr:
             if "waiting for a router" in line:
@@ -184,14 +189,12 @@ def test_a_service_that_waits_for_a_router_ends_in_order_when_told():
     assert (code, "Traceback" in errors) == (0, False)
 
 
-@pytest.mark.parametrize(("victim", "telling"), [("serve", "the service ended"), ("drive", "the driver ended")])
-def test_a_demo_that_loses_one_of_its_processes_says_which(victim, telling):
-    demo = Process("demo", "pattern://", "--duration", "60", "--json")
-    wait_until(lambda: len(children(demo.child.pid)) == 2, timeout_s=90)
-    for pid in children(demo.child.pid):
-        if victim in Path(f"/proc/{pid}/cmdline").read_text():
-            os.kill(pid, signal.SIGKILL)
+@pytest.mark.parametrize(("victim", "words"), [("serve", "the service ended"), ("drive", "the driver ended")])
+def test_a_demo_that_loses_one_of_its_processes_says_which(victim, words):
+    demo = Process("demo", "pattern://", "--seconds", "60", "--json")
+    wait_until(lambda: len(running_as(victim, demo.child.pid)) == len(children(demo.child.pid)) - 1 == 1, timeout_s=90)
+    os.kill(*running_as(victim, demo.child.pid), signal.SIGKILL)
     out, errors = demo.child.communicate(timeout=60)
     assert (demo.child.returncode, out) == (1, "")
-    assert errors.startswith(f"neurove: {telling}")
+    assert errors.startswith(f"neurove: {words}")
     assert errors.count("\n") == 1

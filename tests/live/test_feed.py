@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from protocol import CameraInfo, Flag
-from protocol.control import HealthReply, HealthRequest
-from protocol.errors import NeuroVEError
-from protocol.events import decode_packet, encode_packet
-from service import ask
-from service.config import ClientConfig
-from service.transport import Transport
+from neurove_protocol import CameraInfo, Flag
+from neurove_protocol.control import HealthReply, HealthRequest
+from neurove_protocol.errors import NeuroVEError
+from neurove_protocol.events import decode_packet, encode_packet
+from neurove_service.clients import ask
+from neurove_service.config import ClientConfig
+from neurove_service.transport import Transport
 from tests.builders import SENSOR, make_packets
 from tests.live.conftest import START_S, Heard, Source, client, free_endpoint, is_alive, running, service, wait_until
 
@@ -43,7 +43,7 @@ def driver(node):
         yield transport
 
 
-def test_a_node_that_says_it_is_ready_answers_the_very_next_packets():
+def test_a_ready_node_answers_the_next_packets():
     endpoint = free_endpoint()
     config, packets = ClientConfig(connect=(endpoint,)), [encode_packet(one) for one in make_packets(40, stream="next")]
     with running("serve", "--listen", endpoint, "--node", "n1") as process, client(endpoint, START_S) as transport:
@@ -117,7 +117,7 @@ def test_ten_thousand_fuzzed_packets_leave_another_stream_undisturbed(node, hear
 
 
 def fuzz(valid, count):
-    """Valid packets with bytes flipped, cut, added, and plain garbage."""
+    """Valid packets with bytes changed, removed or added, and random bytes."""
     draw = random.Random(0)
     for _ in range(count):
         data = bytearray(draw.choice(valid))
@@ -147,7 +147,7 @@ def malformed(transport, config, stream):
     return statuses[stream].lost.malformed_packets
 
 
-def test_a_service_under_load_ends_in_time_on_sigterm_and_its_tokens_go():
+def test_a_service_under_load_ends_in_time_on_sigterm():
     with service(free_endpoint()) as (process, transport, config):
         heard = Heard(transport, config)
         loading = threading.Event()
@@ -162,7 +162,7 @@ def test_a_service_under_load_ends_in_time_on_sigterm_and_its_tokens_go():
             loading.set()
             thread.join()
     assert code == 0, errors
-    assert took_s < 3  # what the issue promises its users; it takes some tenths
+    assert took_s < 3  # the promised bound; it takes some tenths of a second
     assert "Traceback" not in errors
 
 
@@ -181,7 +181,7 @@ def start_router(endpoint):
     return subprocess.Popen([sys.executable, str(script), endpoint])
 
 
-def test_the_feed_comes_back_by_itself_after_the_router_was_killed():
+def test_the_data_feed_resumes_after_the_router_was_killed_and_restarted():
     endpoint = free_endpoint()
     router = start_router(endpoint)
     config = ClientConfig(connect=(endpoint,))
@@ -201,7 +201,9 @@ def test_the_feed_comes_back_by_itself_after_the_router_was_killed():
             wait_until(lambda: len(heard.of("cam0")) >= silent + 10, timeout_s=60)
             wait_until(lambda: is_alive(watcher, config))
             after = heard.of("cam0")[-1]
-            assert ask.health(watcher, config)[0].streams[0].lost.gap_packets > 0  # what the outage cost is counted
+            assert (
+                ask.health(watcher, config)[0].streams[0].lost.gap_packets > 0
+            )  # the packets lost in the outage are counted
             assert after.end_us <= 100_000 * 4000
             stop.set()
             thread.join()
@@ -220,7 +222,7 @@ def keep_driving(transport: Transport, config, stop):
             return
 
 
-def test_a_stream_is_forgotten_after_its_idle_time_and_a_full_node_refuses_more():
+def test_an_idle_stream_is_evicted_and_a_full_node_refuses_further_streams():
     arguments = ("--max-streams", "1", "--idle-evict-s", "1")
     with service(free_endpoint(), *arguments) as (_, transport, config), client(config.connect[0]) as driver:
         heard = Heard(transport, config)

@@ -3,13 +3,13 @@ import threading
 
 import pytest
 
-from neurove_core import bundle
-from protocol.control import CHUNK_SCHEMA, PeerError
-from protocol.errors import NeuroVEError
-from protocol.events import encode_packet
-from service import ask
-from service.push_source import PushSource
-from service.transport import open_transport
+from neurove_core.models import bundle
+from neurove_protocol.control import CHUNK_SCHEMA, PeerError
+from neurove_protocol.errors import NeuroVEError
+from neurove_protocol.events import encode_packet
+from neurove_service.clients import ask
+from neurove_service.clients.push_source import PushSource
+from neurove_service.transport import open_transport
 from tests.builders import make_packets
 from tests.live.conftest import Heard, Source, client, free_endpoint, service, wait_until
 from tests.live.killing import CONFIG, Node, slowly
@@ -20,10 +20,12 @@ pytestmark = pytest.mark.live
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
     folder = tmp_path_factory.mktemp("bundles")
-    bundle.save(bundle.untrained(1, name="one"), folder / "one.safetensors")  # sees as the default model does
+    bundle.save(
+        bundle.untrained(1, name="one"), folder / "one.safetensors"
+    )  # with the windows and the grid of the default model
     for seed, name in ((2, "two"), (3, "three")):
         bundle.save(bundle.untrained(seed, CONFIG, name), folder / f"{name}.safetensors")
-    (folder / "foreign.safetensors").write_text("hello, I am no model at all")
+    (folder / "foreign.safetensors").write_text("hello, I am not a model")
     (folder / "empty.safetensors").touch()
     return folder
 
@@ -39,7 +41,7 @@ def steps(text):
     return [json.loads(line)["step"] for line in text.splitlines() if "step" in json.loads(line)]
 
 
-def test_an_operator_pushes_activates_and_rolls_back_while_events_flow_without_a_hole(node, files, run):
+def test_an_operator_pushes_activates_and_rolls_back_without_a_gap_in_the_estimates(node, files, run):
     _, config, _ = node
     at = ("--connect", config.connect[0])
     stop = threading.Event()
@@ -51,9 +53,9 @@ def test_an_operator_pushes_activates_and_rolls_back_while_events_flow_without_a
             wait_until(lambda: heard.of("cam0"))
             pushed = run("push", str(files / "one.safetensors"), *at, "--activate", "--json")
             assert (pushed.code, pushed.err) == (0, "")
-            told = steps(pushed.out)
-            assert told[0] == "fetching"
-            assert [step for step in told if step in ("staged", "verified", "active", "done")] == [
+            reported = steps(pushed.out)
+            assert reported[0] == "fetching"
+            assert [step for step in reported if step in ("staged", "verified", "active", "done")] == [
                 "staged",
                 "verified",
                 "verified",
@@ -66,11 +68,11 @@ def test_an_operator_pushes_activates_and_rolls_back_while_events_flow_without_a
             (models,) = json.loads(run("models", *at, "--json").out)
             assert (models["active"]["digest"], models["previous"]["name"]) == (digest, "default")
             late = run("activate", "default", *at, "--expect", "00000000")
-            assert (late.code, "n1: conflict: 00000000 is expected to be active" in late.err) == (3, True)
+            assert (late.code, "n1: conflict: expected 00000000 to be active" in late.err) == (3, True)
             back = run("rollback", *at, "--expect", digest[:8])
             assert (back.code, "n1: rolled_back: to default" in back.out) == (0, True)
             nothing = run("rollback", *at)
-            assert (nothing.code, "nothing to roll back to" in nothing.err) == (1, True)
+            assert (nothing.code, "cannot roll back" in nothing.err) == (1, True)
             wait_until(lambda: heard.of("cam0")[-1].model == "default")
         finally:
             stop.set()
@@ -89,7 +91,7 @@ def keep_driving(transport, config, stop):
             return
 
 
-def test_what_is_no_model_is_refused_by_the_node_and_leaves_nothing(node, files, run):
+def test_a_node_refuses_a_file_that_is_not_a_model_and_stores_nothing(node, files, run):
     _, config, folder = node
     at = ("--connect", config.connect[0], "--node", "n1")
     foreign = run("push", str(files / "foreign.safetensors"), *at)
@@ -101,7 +103,7 @@ def test_what_is_no_model_is_refused_by_the_node_and_leaves_nothing(node, files,
     assert list((folder / "staging").iterdir()) == []
 
 
-def test_health_and_models_answer_while_a_push_goes_on_and_one_that_was_cut_goes_on_later(node, files):
+def test_health_and_models_answer_during_a_push_and_an_interrupted_push_resumes(node, files):
     transport, config, _ = node
     with PushSource(files / "two.safetensors") as source:
         gate = Gate(source.chunk, 3)
@@ -115,14 +117,14 @@ def test_health_and_models_answer_while_a_push_goes_on_and_one_that_was_cut_goes
         assert 0 < have < source.request.size
         with client(config.connect[0]) as pusher:
             pusher.answer(config.keys.chunks(source.digest), source.chunk, CHUNK_SCHEMA)
-            reply = ask.push(pusher, config, source.request, "n1")  # waits for the first one to give up, or helps it on
+            reply = ask.push(pusher, config, source.request, "n1")  # waits for the first push to end, or continues it
             assert reply.fetched < source.request.size
         assert partial(transport, config) == {}
         assert source.digest in {one.digest for one in ask.models(transport, config)[0].staged}
 
 
 class Gate:
-    """Answers some chunks and keeps the next one waiting."""
+    """Answers some chunks and delays the next one."""
 
     def __init__(self, chunk, count):
         self._chunk, self._left = chunk, count
@@ -144,13 +146,13 @@ def ignoring(run):
     def quietly():
         try:
             run()
-        except Exception:  # noqa: BLE001  # its session is closed under it
+        except Exception:  # noqa: BLE001  # its session is closed while it runs
             return
 
     return quietly
 
 
-def test_two_clients_that_push_one_bundle_at_once_both_succeed_and_it_is_moved_once(node, files):
+def test_two_clients_that_push_one_bundle_at_once_both_succeed_and_it_is_transferred_once(node, files):
     _, config, _ = node
     replies = []
     with (
@@ -177,38 +179,38 @@ def pair():
         yield listening, asking
 
 
-def test_every_reply_is_heard_as_it_comes_and_of_too_many_at_once_the_last_are_told_so(pair):
+def test_every_reply_arrives_when_it_is_sent_and_queries_beyond_the_bound_are_refused_as_busy(pair):
     listening, asking = pair
     go_on = threading.Event()
 
-    def handle(request, tell):
-        tell(b"began")
+    def handle(request, report):
+        report(b"began")
         assert go_on.wait(30)
         return request
 
     listening.answer_streaming("t/work", handle, at_once=2)
     working = [asking.ask_streaming("t/work", name, 30) for name in (b"first", b"second")]
-    assert [(next(one).payload) for one in working] == [b"began", b"began"]  # while they go on
+    assert [(next(one).payload) for one in working] == [b"began", b"began"]  # while both are in progress
     with pytest.raises(PeerError, match="at most 2 such requests at once") as refused:
         list(asking.ask_streaming("t/work", b"third", 30))
     assert refused.value.code == "busy"
     go_on.set()
     assert sorted(next(one).payload for one in working) == [b"first", b"second"]
-    assert [one.payload for one in asking.ask("t/work", b"plain", 30)] == [b"plain"]  # progress was not asked for
+    assert [one.payload for one in asking.ask("t/work", b"plain", 30)] == [b"plain"]  # `ask` does not return progress
 
 
-def test_a_caller_that_leaves_does_not_stop_the_work_nor_the_next_caller(pair):
+def test_a_caller_that_leaves_stops_neither_the_work_nor_the_next_caller(pair):
     listening, asking = pair
     go_on, done = threading.Event(), threading.Event()
 
-    def handle(request, tell):
+    def handle(request, report):
         assert go_on.wait(30)
-        tell(b"to nobody")
+        report(b"nobody receives this")
         done.set()
         return request
 
     listening.answer_streaming("t/work", handle, at_once=1)
-    assert list(asking.ask_streaming("t/work", b"first", 0.1)) == []  # the time is over
+    assert list(asking.ask_streaming("t/work", b"first", 0.1)) == []  # the timeout is over
     go_on.set()
     assert done.wait(30)
     wait_until(lambda: answers(asking))
@@ -217,12 +219,12 @@ def test_a_caller_that_leaves_does_not_stop_the_work_nor_the_next_caller(pair):
 def answers(transport):
     try:
         return [one.payload for one in transport.ask("t/work", b"again", 30)] == [b"again"]
-    except PeerError:  # busy: the first one is about to end
+    except PeerError:  # busy: the first query is ending
         return False
 
 
 @pytest.mark.parametrize("at_step", ["fetching", "loaded", "done"])
-def test_a_node_that_was_killed_in_a_change_starts_again_on_a_whole_model(tmp_path, at_step):
+def test_a_node_that_was_killed_during_a_change_restarts_with_a_complete_model(tmp_path, at_step):
     node = Node(tmp_path)
     new, _, before = node.kill_in_a_change(1, at_step=at_step)
     models = node.restarted()
@@ -230,5 +232,5 @@ def test_a_node_that_was_killed_in_a_change_starts_again_on_a_whole_model(tmp_pa
         assert models.active.digest == before
     if at_step == "done":
         assert (models.active.digest, models.previous.digest) == (new, before)
-        with node.started("--model", "untrained") as (_, _, configured):  # a newer decision than the one that was kept
+        with node.started("--model", "untrained") as (_, _, configured):  # it takes precedence over the saved one
             assert configured.active.name == "untrained"

@@ -4,11 +4,13 @@ import threading
 
 import pytest
 
-from neurove_core.io import McapRecording, PacketWriter, open_source
-from protocol import CameraInfo
-from protocol.events import decode_packet, encode_packet
-from protocol.keys import Keys
-from service.recorder import Recorder
+from neurove_core.io.formats.packet_log.reader import McapRecording
+from neurove_core.io.formats.packet_log.writer import PacketWriter
+from neurove_core.sources import open_source
+from neurove_protocol import CameraInfo
+from neurove_protocol.events import decode_packet, encode_packet
+from neurove_protocol.keys import Keys
+from neurove_service.clients.recorder import Recorder
 from tests.builders import make_packets
 from tests.live.conftest import client, free_endpoint, running, wait_until
 from tests.live.test_feed import start_router
@@ -29,7 +31,7 @@ def router():
 
 
 class Listener:
-    """Every packet and camera that is published."""
+    """Every published packet and CameraInfo."""
 
     def __init__(self, transport):
         self.payloads, self.cameras = [], {}
@@ -41,22 +43,27 @@ class Listener:
         )
 
 
-def test_what_was_driven_is_recorded_bit_for_bit_and_replayed_bit_for_bit(router, tmp_path, run):
+def test_driven_packets_are_recorded_and_replayed_bit_for_bit(router, tmp_path, run):
     file = tmp_path / "traffic.mcap"
     with client(router) as transport:
         heard = Listener(transport)
         with running("record", "--connect", router, "--out", str(file), "--json") as recorder:
             wait_until(lambda: file.with_name("traffic.mcap.part").exists())
             driven = run(
-                "drive", "pattern://?seed=4", "--connect", router, "--duration", "0.6", "--wait", "20", "--json"
+                "drive", "pattern://?seed=4", "--connect", router, "--seconds", "0.6", "--wait", "20", "--json"
             )
             sent = json.loads(driven.out)
             assert sent["packets"] == 150
             wait_until(lambda: len(heard.payloads) == 150)
             code, out, err = recorder.end(signal.SIGINT)
         assert (code, err) == (0, "")
-        told = json.loads(out)["streams"]["cam0"]
-        assert (told["packets"], told["events"], told["missing"], told["dropped"]) == (150, sent["events"], 0, 0)
+        summary = json.loads(out)["streams"]["cam0"]
+        assert (summary["packets"], summary["events"], summary["missing"], summary["dropped"]) == (
+            150,
+            sent["events"],
+            0,
+            0,
+        )
 
         recording = open_source(str(file))
         assert isinstance(recording, McapRecording)
@@ -82,7 +89,7 @@ def two_streams(path):
     return packets
 
 
-def test_a_replay_keeps_all_streams_or_the_one_picked_and_encodes_anew_under_another_name(router, tmp_path, run):
+def test_a_replay_keeps_all_streams_or_the_selected_one_and_encodes_again_under_another_name(router, tmp_path, run):
     packets = two_streams(tmp_path / "two.mcap")
     file = str(tmp_path / "two.mcap")
     with client(router) as transport:
@@ -108,13 +115,13 @@ def test_a_replay_keeps_all_streams_or_the_one_picked_and_encodes_anew_under_ano
     assert "give --stream NAME" in looped.err
 
 
-def test_a_recorder_counts_what_is_missing_and_keeps_what_can_not_be_read(router, tmp_path):
+def test_a_recorder_counts_missing_packets_and_keeps_unreadable_ones(router, tmp_path):
     file = tmp_path / "gaps.mcap"
     with client(router) as transport:
         transport.answer(Keys().camera("left"), lambda _: CAMERA.encode())
         publisher = transport.publisher(Keys().events("left"), "application/msgpack")
         other = transport.publisher(Keys().events("right"), "application/msgpack")
-        record = ("record", "--connect", router, "--out", str(file), "--stream", "left", "--duration", "3")
+        record = ("record", "--connect", router, "--out", str(file), "--stream", "left", "--seconds", "3")
         with running(*record, "--json") as recorder:
             wait_until(lambda: publisher.matching)
             for packet in make_packets(10, stream="left"):
@@ -123,16 +130,16 @@ def test_a_recorder_counts_what_is_missing_and_keeps_what_can_not_be_read(router
             publisher.put(b"no packet")
             assert not other.matching
             out, _ = recorder.child.communicate(timeout=20)
-        told = json.loads(out)["streams"]
+        streams = json.loads(out)["streams"]
     assert recorder.child.returncode == 1
-    assert {name: told["left"][name] for name in ("packets", "missing", "refused", "dropped")} == {
+    assert {name: streams["left"][name] for name in ("packets", "missing", "refused", "dropped")} == {
         "packets": 8, "missing": 3, "refused": 1, "dropped": 0,
     }  # fmt: skip
-    assert list(told) == ["left"]
+    assert list(streams) == ["left"]
     assert McapRecording.open(file).cameras() == {"left": CAMERA.encode()}
 
 
-def test_people_are_told_what_was_recorded_and_what_was_not(router, tmp_path, run):
+def test_the_summary_has_recorded_and_missing_packets(router, tmp_path, run):
     with client(router) as transport:
         publisher = transport.publisher(Keys().events("left"), "application/msgpack")
 
@@ -144,37 +151,37 @@ def test_people_are_told_what_was_recorded_and_what_was_not(router, tmp_path, ru
 
         driver = threading.Thread(target=drive)
         driver.start()
-        code, out, err = run("record", "--connect", router, "--out", tmp_path / "a.mcap", "--duration", "1")
+        code, out, err = run("record", "--connect", router, "--out", tmp_path / "a.mcap", "--seconds", "1")
         driver.join()
     assert (code, out) == (1, "left: 4 packets, 400 events, 1 missing\n")
     assert err.startswith(f"wrote {tmp_path / 'a.mcap'}, ")
 
 
-def test_a_recording_that_was_cut_is_replayed_as_far_as_it_is_whole_and_is_bad_news(router, tmp_path, run):
+def test_a_truncated_recording_is_replayed_up_to_its_end_and_exits_with_1(router, tmp_path, run):
     payloads = [encode_packet(packet) for packet in make_packets(300, n=4000)]
     with PacketWriter(tmp_path / "whole.mcap") as writer:
         for payload in payloads:
             writer.write("cam0", payload, 10**18)
     data = (tmp_path / "whole.mcap").read_bytes()
-    (tmp_path / "cut.mcap").write_bytes(data[: len(data) // 2])
+    (tmp_path / "truncated.mcap").write_bytes(data[: len(data) // 2])
     with client(router) as transport:
         heard = Listener(transport)
-        code, out, err = run("drive", tmp_path / "cut.mcap", "--connect", router, "--wait", "20")
+        code, out, err = run("drive", tmp_path / "truncated.mcap", "--connect", router, "--wait", "20")
         wait_until(lambda: out.startswith(f"cam0: {len(heard.payloads)} packets"))
     assert code == 1
-    assert "cut.mcap: broken at byte" in err
+    assert "truncated.mcap: broken at byte" in err
     assert 0 < len(heard.payloads) < 300
     assert [payload for _, payload in heard.payloads] == payloads[: len(heard.payloads)]
 
 
-def test_a_replay_that_nobody_listens_to_says_so(router, tmp_path, run):
+def test_a_replay_without_a_service_is_an_error(router, tmp_path, run):
     two_streams(tmp_path / "two.mcap")
     code, out, err = run("drive", tmp_path / "two.mcap", "--connect", router, "--wait", "0.2")
     assert (code, out) == (1, "")
-    assert "no service took up stream left, right within 0.2 s" in err
+    assert "no service subscribed to stream left, right within 0.2 s" in err
 
 
-def test_what_the_queue_can_not_hold_is_dropped_and_counted(router, tmp_path):
+def test_packets_beyond_the_size_of_the_queue_are_dropped_and_counted(router, tmp_path):
     packets = make_packets(20, stream="left", n=100)
     payloads = [encode_packet(packet) for packet in packets]
     cap = sum(map(len, payloads[:5]))
@@ -185,7 +192,7 @@ def test_what_the_queue_can_not_hold_is_dropped_and_counted(router, tmp_path):
         wait_until(lambda: publisher.matching)
         for payload in payloads:
             publisher.put(payload)
-        wait_until(lambda: len(heard.payloads) == 20)  # all before the first is written
+        wait_until(lambda: len(heard.payloads) == 20)  # all arrive before the first one is written
         stop = threading.Event()
         stop.set()
         account = recorder.run(stop, 1.0)["left"]
@@ -193,11 +200,11 @@ def test_what_the_queue_can_not_hold_is_dropped_and_counted(router, tmp_path):
     assert [payload for _, payload, _ in McapRecording.open(tmp_path / "a.mcap").packets()] == payloads[:5]
 
 
-def test_a_recording_is_not_written_over_and_silence_leaves_no_file(router, tmp_path, run):
+def test_an_existing_recording_is_not_overwritten_and_without_packets_there_is_no_file(router, tmp_path, run):
     (tmp_path / "old.mcap").write_bytes(b"dear")
     refused = run("record", "--connect", router, "--out", str(tmp_path / "old.mcap"))
-    assert (refused.code, "not written over" in refused.err) == (2, True)
-    silent = run("record", "--connect", router, "--out", str(tmp_path / "new.mcap"), "--duration", "0.3")
+    assert (refused.code, "never overwritten" in refused.err) == (2, True)
+    silent = run("record", "--connect", router, "--out", str(tmp_path / "new.mcap"), "--seconds", "0.3")
     assert (silent.code, silent.err.count("\n")) == (1, 1)
     assert "nothing was recorded" in silent.err
     assert [one.name for one in tmp_path.iterdir()] == ["old.mcap"]

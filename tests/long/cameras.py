@@ -1,6 +1,6 @@
 """Cameras in a process of their own: `python -m tests.long.cameras ENDPOINT WINDOW_US EVENTS NAME...`, until SIGTERM.
 
-Each publishes one packet per window, paced, so that what the run measures does not wait for what drives it.
+Each publishes one packet per window, paced, so that the measuring process does not delay them.
 """
 
 import signal
@@ -9,14 +9,14 @@ import threading
 import time
 from dataclasses import replace
 
-from protocol.events import encode_packet
-from service.config import ClientConfig
+from neurove_protocol.events import encode_packet
+from neurove_service.config import ClientConfig
 from tests.builders import make_packets
 from tests.live.conftest import Source, client
 
 
 class Camera:
-    """Publishes one packet per window, paced, until it is told to end."""
+    """Publishes one packet per window, paced, until `end` is called."""
 
     def __init__(self, source: Source, stream: str, window_us: int, events: int) -> None:
         self._source, self._window_us = source, window_us

@@ -1,8 +1,8 @@
 """Events while a model is pushed over a slow link: `python -m tests.long.link [--mbit 20] [--mib 8]`; needs root.
 
-Two network namespaces, a pair of virtual interfaces between them, and a token bucket (tbf) on both. The node runs in
-one; a driver, a consumer and `neurove push` in the other. Prints how long events were on their way to the node without
-a push and during it. Exit code 1 where the 99th percentile has more than doubled.
+Two network namespaces have a pair of virtual interfaces between them and a token bucket (tbf) on both. The node runs in
+one; a driver, a consumer and `neurove push` run in the other. The run prints the transfer time of events to the node
+without a push and during it. The exit code is 1 if the 99th percentile has more than doubled.
 """
 
 import argparse
@@ -22,12 +22,12 @@ from typing import Any
 
 import numpy as np
 
-from neurove_core import bundle
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from protocol import TwistEstimate
-from protocol.events import encode_packet
-from service import ask
-from service.config import ClientConfig
+from neurove_core.models import bundle
+from neurove_protocol import TwistEstimate
+from neurove_protocol.events import encode_packet
+from neurove_service.clients import ask
+from neurove_service.config import ClientConfig
 from tests.builders import make_packets
 from tests.live.conftest import START_S, Source, client, is_alive, neurove, wait_until
 
@@ -38,7 +38,7 @@ WINDOW = WindowConfig(duration_us=STEP_US, bins=2)
 
 
 def model(mib: float) -> bundle.Bundle:
-    """A model of so many MiB that is quick to run."""
+    """A model with a size of `mib` MiB that is fast to run."""
     features = max(8, round(mib * (1 << 20) / 4 / 1584))
     canonical, net = CanonicalConfig(width=44, height=33), NetworkConfig(channels=(8, 16), features=features, hidden=8)
     return bundle.untrained(1, ModelConfig(window=WINDOW, canonical=canonical, network=net), "pushed")
@@ -46,7 +46,7 @@ def model(mib: float) -> bundle.Bundle:
 
 @contextlib.contextmanager
 def namespaces(mbit: float) -> Iterator[tuple[str, str]]:
-    """Names of two network namespaces with a link of so many Mbit/s between them."""
+    """Names of two network namespaces with a link of `mbit` Mbit/s between them."""
     names = [f"neurove{os.getpid()}{part}" for part in "ab"]
     made = []
     try:
@@ -72,7 +72,7 @@ def _run(*command: str) -> None:
 
 
 class Driver(threading.Thread):
-    """Publishes packets, paced, and notes when each was sent."""
+    """Publishes packets, paced, and records when each was sent."""
 
     def __init__(self, source: Source) -> None:
         super().__init__()
@@ -97,7 +97,7 @@ class Driver(threading.Thread):
 
 
 def inside(endpoint: str, file: Path, quiet_s: float) -> dict[str, Any]:
-    """What is measured, from the namespace of driver and operator: time from the put to the node, of windows' ends."""
+    """Measure in the namespace of the driver and the operator: time from the put of a packet to the node."""
     config = ClientConfig(connect=(endpoint,))
     payloads: list[bytes] = []
     with client(endpoint, START_S) as transport, client(endpoint) as ours:
@@ -123,11 +123,11 @@ def inside(endpoint: str, file: Path, quiet_s: float) -> dict[str, Any]:
             if any(a <= sent_ns < b for a, b in parts):
                 took[name].append((estimate.trace.received_ns - sent_ns) / 1e6)
     shown = (50, 95, 99, 100)
-    tell = {name: {f"p{p}": round(float(np.percentile(ms, p)), 2) for p in shown} for name, ms in took.items()}
+    percentiles = {name: {f"p{p}": round(float(np.percentile(ms, p)), 2) for p in shown} for name, ms in took.items()}
     seconds = (ended - began) / 1e9
     return {
-        "events_ms": tell,
-        "p99_ratio": round(tell["with"]["p99"] / tell["without"]["p99"], 2),
+        "events_ms": percentiles,
+        "p99_ratio": round(percentiles["with"]["p99"] / percentiles["without"]["p99"], 2),
         "packets": {name: len(ms) for name, ms in took.items()},
         "pushed": pushed.returncode == 0,
         "push_s": round(seconds, 1),
@@ -137,14 +137,25 @@ def inside(endpoint: str, file: Path, quiet_s: float) -> dict[str, Any]:
 
 
 def measure(mbit: float, mib: float, quiet_s: float) -> dict[str, Any]:
-    """Namespaces, the node in one, `inside` in the other."""
+    """Make the namespaces; run the node in one and `inside` in the other."""
     with namespaces(mbit) as (node, remote), tempfile.TemporaryDirectory() as folder:
         models, endpoint = Path(folder) / "models", f"tcp/{HERE}:7447"
         models.mkdir()
         bundle.save(replace(model(0.1), name="small"), models / "small.safetensors")
         bundle.save(model(mib), Path(folder) / "pushed.safetensors")
         serve = ("serve", "--listen", endpoint, "--node", "n1", "--models-dir", str(models), "--model", "small")
-        command = ["ip", "netns", "exec", node, sys.executable, "-m", "service.cli", *serve, "--log-level", "warning"]
+        command = [
+            "ip",
+            "netns",
+            "exec",
+            node,
+            sys.executable,
+            "-m",
+            "neurove_service.cli",
+            *serve,
+            "--log-level",
+            "warning",
+        ]
         with subprocess.Popen(command) as service:
             try:
                 again = ("--inside", endpoint, f"{folder}/pushed.safetensors", "--quiet-s", str(quiet_s))
@@ -156,14 +167,14 @@ def measure(mbit: float, mib: float, quiet_s: float) -> dict[str, Any]:
                 )
             finally:
                 service.terminate()
-    return {"mbit_s": mbit, **json.loads(measured.stdout.splitlines()[-1])}  # after the log
+    return {"mbit_s": mbit, **json.loads(measured.stdout.splitlines()[-1])}  # the line after the log
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--mbit", type=float, default=20.0)
     parser.add_argument("--mib", type=float, default=16.0, help="size of the model")
-    parser.add_argument("--quiet-s", type=float, default=10.0, help="without a push before and after, to compare with")
+    parser.add_argument("--quiet-s", type=float, default=10.0, help="duration without a push, before and after it")
     parser.add_argument("--inside", nargs=2, metavar=("ENDPOINT", "FILE"), help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.inside:
@@ -172,9 +183,9 @@ def main() -> int:
     if os.geteuid() != 0 or shutil.which("ip") is None or shutil.which("tc") is None:
         print("tests.long.link: needs root, for network namespaces, and ip and tc of iproute2", file=sys.stderr)
         return 2
-    told = measure(args.mbit, args.mib, args.quiet_s)
-    print(json.dumps(told, indent=2))
-    return 0 if told["pushed"] and told["p99_ratio"] <= 2 and not told["lost"] else 1
+    report = measure(args.mbit, args.mib, args.quiet_s)
+    print(json.dumps(report, indent=2))
+    return 0 if report["pushed"] and report["p99_ratio"] <= 2 and not report["lost"] else 1
 
 
 if __name__ == "__main__":

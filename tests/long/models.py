@@ -1,4 +1,4 @@
-"""Bundles for the long runs: good ones, signed, and each kind of bad one that a node must refuse, and why."""
+"""Bundles for the long runs: good signed ones, and each kind of bad one with the reason of its refusal."""
 
 import json
 import struct
@@ -9,11 +9,11 @@ from pathlib import Path
 import safetensors.torch
 import torch
 
-from neurove_core import bundle, manifest, signing_keys
-from neurove_core.about import About
-from neurove_core.bundle import Bundle
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from neurove_core.network import NeuroVE
+from neurove_core.models import bundle, manifest, signing_keys
+from neurove_core.models.bundle import Bundle
+from neurove_core.models.metadata import Metadata
+from neurove_core.networks.neurove import NeuroVE
 
 WINDOW_US = 20_000
 CONFIG = ModelConfig(
@@ -21,7 +21,7 @@ CONFIG = ModelConfig(
     canonical=CanonicalConfig(width=44, height=33),
     network=NetworkConfig(channels=(8, 16), features=512, hidden=32),
 )
-"""Quick to run, for four streams share two cores with what drives them; 4 MiB, so that a copy that stays is seen."""
+"""Fast to run, because four streams share two cores with their driver; 4 MiB, so that a leaked copy is visible."""
 
 GOOD = ("one", "two")
 _RELEASE = 2
@@ -31,7 +31,7 @@ class Made:
     """A folder of models and the key that a node trusts.
 
     Args:
-        folder: for the bundles; the public key lies beside them.
+        folder: for the bundles and the public key.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -60,7 +60,7 @@ class Made:
 
 
 def _released(model: Bundle, release: int) -> Bundle:
-    return replace(model, about=About(release=release))
+    return replace(model, metadata=Metadata(release=release))
 
 
 def _tensors(change: Callable[[dict[str, torch.Tensor], str], None]) -> Callable[[bytes], bytes]:
@@ -107,8 +107,8 @@ def _slow() -> Bundle:
         }
     )
     zeros, ones = torch.zeros(6), torch.ones(6)
-    about = About(release=_RELEASE)
-    return Bundle("too-slow", False, "a test", config, NeuroVE(config).eval(), zeros, ones, about=about)  # trained
+    about = Metadata(release=_RELEASE)
+    return Bundle("too-slow", False, "a test", config, NeuroVE(config).eval(), zeros, ones, metadata=about)  # trained
 
 
 _SPOILT: dict[str, Callable[[bytes], bytes]] = {
@@ -118,7 +118,7 @@ _SPOILT: dict[str, Callable[[bytes], bytes]] = {
     "wrong-dtype": _tensors(_retype),
     "nan": _tensors(_fill_nan),
     "duplicate-keys": _doubled,
-    "foreign": lambda _: b"PNG, or anything else that is no model" * 100,
+    "foreign": lambda _: b"PNG, or anything else that is not a model" * 100,
     "empty": lambda _: b"",
 }
 
@@ -128,7 +128,7 @@ REASONS = {
     "wrong-shape": ("bad_model", "needs torch.float32 ("),
     "wrong-dtype": ("bad_model", "torch.float64"),
     "nan": ("bad_model", "not finite"),
-    "duplicate-keys": ("bad_model", "stands twice"),
+    "duplicate-keys": ("bad_model", "occurs twice"),
     "foreign": ("bad_model", "not a safetensors file"),
     "empty": ("bad_model", "size=0"),
     "bad-signature": ("untrusted", "not trusted"),
@@ -136,4 +136,4 @@ REASONS = {
     "too-slow": ("too_slow", "may take at most"),
     "too-large": ("bad_model", "has at most"),
 }
-"""Code of the error that refuses each, and what its sentence must say."""
+"""Code of the error that refuses each, and words of its message."""

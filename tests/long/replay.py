@@ -1,8 +1,8 @@
 """A long replay at a high rate: `python -m tests.long.replay --rate 10e6 --seconds 60`; not part of `make test`.
 
-`neurove drive --loop` plays an EVT3 file to `neurove serve`, real processes with Zenoh on loopback. Prints the rate
-that was reached, what was lost, latencies, CPU time, and the resident size of the service in each quarter. Exit code 1
-where events were lost, or where resident size grew by more than a twentieth after the first quarter.
+`neurove drive --loop` plays an EVT3 file to `neurove serve`; both are real processes with Zenoh on loopback. The run
+prints the event rate, the losses, latencies, CPU time, and the resident size of the service in each quarter. The exit
+code is 1 if events were lost, or if the resident size grew by more than 5 % after the first quarter.
 """
 
 import argparse
@@ -19,13 +19,13 @@ from typing import Any, Final
 import numpy as np
 import torch
 
-from neurove_core import bundle
 from neurove_core.config import CanonicalConfig, ModelConfig
 from neurove_core.estimator import Estimator
-from protocol import Events, Sensor
-from service import ask
-from service.config import ServiceConfig
-from service.ring import Ring, packed
+from neurove_core.models import bundle
+from neurove_protocol import Events, Sensor
+from neurove_service.clients import ask
+from neurove_service.config import ServiceConfig
+from neurove_service.streams.ring import Ring, pack
 from tests.live.conftest import Heard, client, free_endpoint, running, service, wait_until
 from tests.long.swaps import resident_kib
 
@@ -36,7 +36,7 @@ SENSORS: Final = {"davis346": Sensor(346, 260), "1280x720": Sensor(1280, 720)}
 
 
 def draw(rate_hz: float, sensor: Sensor, seconds: float = FILE_S, seed: int = 0) -> Events:
-    """Events of a bright bar that wanders over noise: rows and columns as a moving camera gives them."""
+    """Events of a moving bar over noise, with rows and columns as those of a moving camera."""
     rng = np.random.default_rng(seed)
     n = int(rate_hz * seconds)
     t = np.sort(rng.integers(0, int(seconds * 1e6), n))
@@ -46,15 +46,15 @@ def draw(rate_hz: float, sensor: Sensor, seconds: float = FILE_S, seed: int = 0)
 
 
 def write_evt3(events: Events, sensor: Sensor, path: Path) -> None:
-    """The events as words of single events; TIME_HIGH, TIME_LOW and ADDR_Y where they change."""
+    """Write each event as one word, with TIME_HIGH, TIME_LOW and ADDR_Y if they change."""
     t, y = events.t, events.y.astype(np.int64)
     kinds = (0x8000 | t >> 12, 0x6000 | t & 0xFFF, y, 0x2000 | events.p.astype(np.int64) << 11 | events.x)
     words = np.stack(kinds)
-    said = np.ones(words.shape, np.bool_)
+    written = np.ones(words.shape, np.bool_)
     for row, value in enumerate((t >> 12, t, y)):
-        said[row, 1:] = np.diff(value) != 0
+        written[row, 1:] = np.diff(value) != 0
     header = f"% evt 3.0\n% format EVT3;height={sensor.height};width={sensor.width}\n% end\n"
-    path.write_bytes(header.encode() + words.T[said.T].astype("<u2").tobytes())
+    path.write_bytes(header.encode() + words.T[written.T].astype("<u2").tobytes())
 
 
 def cpu_s(pid: int) -> float:
@@ -64,20 +64,20 @@ def cpu_s(pid: int) -> float:
 
 
 def run(rate_hz: float, seconds: float, sensor: Sensor) -> dict[str, Any]:
-    """Play so many events a second for so long, and tell what came of it."""
+    """Play events at a rate for some seconds; return the figures."""
     endpoint = free_endpoint()
     with contextlib.ExitStack() as stack:
         path = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "replay.raw"
         write_evt3(draw(rate_hz, sensor), sensor, path)
         node, transport, config = stack.enter_context(service(endpoint))
         heard = Heard(stack.enter_context(client(endpoint)), config)
-        playing = ("--loop", "--duration", str(seconds), "--stream", STREAM, "--json")
+        playing = ("--loop", "--seconds", str(seconds), "--stream", STREAM, "--json")
         driver = stack.enter_context(running("drive", str(path), "--connect", endpoint, *playing))
         wait_until(lambda: len(heard.of(STREAM)) > 0, 180)
         began, spent_s, start_s = time.monotonic(), cpu_s(node.child.pid), cpu_s(driver.child.pid)
         driven_s, resident = start_s, []
         while driver.child.poll() is None:
-            with contextlib.suppress(OSError, ValueError, IndexError):  # it may end between two looks
+            with contextlib.suppress(OSError, ValueError, IndexError):  # it may end between two samples
                 driven_s = cpu_s(driver.child.pid)
             resident.append(resident_kib(node.child.pid))
             time.sleep(seconds / SAMPLES)
@@ -97,7 +97,7 @@ def run(rate_hz: float, seconds: float, sensor: Sensor) -> dict[str, Any]:
         "packets_received": status.packets_received,
         "lost": status.lost.nonzero(),
         "estimates": len(estimates),
-        "holes": sum(b.start_us != a.end_us for a, b in pairwise(estimates)),
+        "gaps": sum(b.start_us != a.end_us for a, b in pairwise(estimates)),
         "latency_ms": {f"p{q}": round(float(np.percentile(latencies_ms, q)), 1) for q in (50, 99, 100)},
         "cpu_of_a_core": {"service": round(spent_s / took_s, 2), "driver": round((driven_s - start_s) / took_s, 2)},
         "resident_mib": [[round(float(q.min()), 1), round(float(q.max()), 1)] for q in quarters],
@@ -118,7 +118,7 @@ GRIDS: Final = {
 
 
 def state_bytes(sensor: Sensor, grid: CanonicalConfig) -> int:
-    """What a stream of this sensor keeps once its ring of windows is full: all arrays of its state, and the ring."""
+    """Memory of a stream with this sensor when its ring is full: all arrays of its state, and the ring [bytes]."""
     estimator = Estimator(bundle.untrained(0, ModelConfig(canonical=grid)))
     duration_us = estimator.config.window.duration_us
     settings, state = ServiceConfig(), estimator.initial_state(sensor)
@@ -126,15 +126,15 @@ def state_bytes(sensor: Sensor, grid: CanonicalConfig) -> int:
     events = draw(10e6, sensor, duration_us / 1e6)
     for number in range(settings.ring_windows + 2):
         shift_us = number * duration_us
-        pushed = estimator.cut(events._replace(t=events.t + shift_us), state, shift_us)
+        pushed = estimator.to_windows(events._replace(t=events.t + shift_us), state, shift_us)
         _, state = estimator.follow(pushed.windows, state._replace(windows=pushed.state))
         for window in pushed.windows:
-            ring.append(packed(window))
+            ring.append(pack(window))
     return sum(_arrays(state).values()) + ring.bytes
 
 
 def _arrays(value: object) -> dict[int, int]:
-    """Bytes of all arrays and tensors within nested tuples, each counted once, with what a view keeps alive."""
+    """Bytes of all arrays and tensors in nested tuples, each counted once, with the base of a view."""
     if isinstance(value, torch.Tensor):
         return {value.untyped_storage().data_ptr(): value.untyped_storage().nbytes()}
     if isinstance(value, np.ndarray):
@@ -144,10 +144,10 @@ def _arrays(value: object) -> dict[int, int]:
 
 
 def holds(report: dict[str, Any]) -> bool:
-    """Whether all that was sent became part of an estimate, and resident size stayed."""
+    """Whether every sent event is part of an estimate, and the resident size stayed constant."""
     first, last = report["resident_mib"][1], report["resident_mib"][-1]
-    all_came = report["events_received"] == report["events_sent"] and not report["lost"] and not report["holes"]
-    return bool(all_came and last[1] <= 1.05 * first[0])
+    all_arrived = report["events_received"] == report["events_sent"] and not report["lost"] and not report["gaps"]
+    return bool(all_arrived and last[1] <= 1.05 * first[0])
 
 
 if __name__ == "__main__":
@@ -156,6 +156,6 @@ if __name__ == "__main__":
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--sensor", choices=list(SENSORS), default="1280x720")
     given = parser.parse_args()
-    told = run(given.rate, given.seconds, SENSORS[given.sensor])
-    print(json.dumps(told, indent=2))
-    sys.exit(0 if holds(told) else 1)
+    report = run(given.rate, given.seconds, SENSORS[given.sensor])
+    print(json.dumps(report, indent=2))
+    sys.exit(0 if holds(report) else 1)

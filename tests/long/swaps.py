@@ -1,9 +1,9 @@
 """Model changes under load: `python -m tests.long.swaps --swaps 100 --streams 4`; minutes, not part of `make test`.
 
-A node serves streams of 50 windows/s while its model is changed again and again, now and then by a bundle that is bad.
-Prints what was lost or doubled and what only this listener missed, the longest gap between two estimates with and
-without changes, what each bad bundle was refused with, and the resident size over the run. Exit code 1 where a figure
-of the contract does not hold.
+A node serves streams of 50 windows/s while its model is changed again and again, sometimes to a bad bundle. The run
+prints the windows that were lost or answered twice, the estimates that only this listener missed, the longest gap
+between two estimates with and without changes, the reason for each refusal, and the resident size. The exit code is 1
+if a figure of the contract does not hold.
 """
 
 import argparse
@@ -21,33 +21,33 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from protocol import TwistEstimate
-from protocol.control import PeerError
-from service import ask
-from service.config import ClientConfig
-from service.transport import Transport
+from neurove_protocol import TwistEstimate
+from neurove_protocol.control import PeerError
+from neurove_service.clients import ask
+from neurove_service.config import ClientConfig
+from neurove_service.transport import Transport
 from tests.live.conftest import Process, client, free_endpoint, service, wait_until
 from tests.long.models import GOOD, REASONS, WINDOW_US, Made
 
 EVENTS = 400
-"""Of each packet, one per window."""
+"""Events per packet; one packet per window."""
 
 
 PAUSE_S = 0.2
-"""Between two changes."""
+"""Pause between two changes [s]."""
 
 
 class Gap(NamedTuple):
-    """A time without an estimate of a stream."""
+    """A time between two estimates of a stream."""
 
     ms: float
-    late_ms: float  # of it, between the arrival of the packet and its estimate
+    late_ms: float  # the part between the arrival of the packet and its estimate
     stream: str
     at_ns: int
 
 
 class Marks:
-    """What was going on, and when."""
+    """Log of the running steps with their times."""
 
     def __init__(self) -> None:
         self._marks: list[tuple[int, str]] = []
@@ -60,7 +60,7 @@ class Marks:
 
 
 class Recorded:
-    """Estimates as they came, read when all is over: what listens must not hold up what it listens to."""
+    """Estimates as they arrived, decoded after the run, so that the listener does not slow the service down."""
 
     def __init__(self, transport: Transport, config: ClientConfig) -> None:
         self._payloads: dict[str, list[bytes]] = {}
@@ -84,7 +84,7 @@ def resident_kib(pid: int) -> int:
 
 
 class Resident:
-    """Looks at a process's resident size, also between the changes."""
+    """Samples the resident size of a process, also between the changes."""
 
     def __init__(self, pid: int, period_s: float = 0.1) -> None:
         self._pid, self._period_s = pid, period_s
@@ -106,7 +106,7 @@ class Resident:
 
 
 def gaps(estimates: list[TwistEstimate]) -> list[Gap]:
-    """The times between estimates of one stream that were published one after the other."""
+    """The times between consecutive estimates of one stream."""
     found = []
     for before, after in pairwise(one.trace for one in estimates):
         apart = after.published_ns - before.published_ns
@@ -116,7 +116,7 @@ def gaps(estimates: list[TwistEstimate]) -> list[Gap]:
 
 
 def follows(before: TwistEstimate, after: TwistEstimate) -> bool:
-    """Whether every window between two estimates was answered once: those that a busy listener missed have a seq."""
+    """Whether every window between two estimates was answered once; an estimate that the listener missed has a seq."""
     return after.seq > before.seq and after.start_us - before.end_us == (after.seq - before.seq - 1) * WINDOW_US
 
 
@@ -130,7 +130,7 @@ def cameras(endpoint: str, names: list[str]) -> Any:
 
 
 def run(swaps: int, bad: int, streams: int, quiet_s: float = 5.0) -> dict[str, Any]:
-    """Change the model so often, so many of the changes by a bad bundle, and tell what came of it."""
+    """Change the model `swaps` times, `bad` of them to a bad bundle; return the figures."""
     endpoint, names = free_endpoint(), [f"cam{i}" for i in range(streams)]
     marks = Marks()
     with contextlib.ExitStack() as stack:
@@ -148,7 +148,7 @@ def run(swaps: int, bad: int, streams: int, quiet_s: float = 5.0) -> dict[str, A
         refused: dict[str, tuple[str, str]] = {}
         unrefused, resident, active = [], [memory.kib()], GOOD[0]
         is_bad = set(np.linspace(1, swaps - 1, bad, dtype=int).tolist()) if bad else set()
-        with contextlib.suppress(KeyboardInterrupt):  # an impatient caller hears of what was done
+        with contextlib.suppress(KeyboardInterrupt):  # after Ctrl-C the figures so far are reported
             for number in range(swaps):
                 is_next_bad = number in is_bad
                 if is_next_bad:
@@ -158,13 +158,13 @@ def run(swaps: int, bad: int, streams: int, quiet_s: float = 5.0) -> dict[str, A
                 marks.set(f"{model}: asked")
                 try:
                     ask.activate(
-                        transport, config, model, "n1", on_progress=lambda said, m=model: marks.set(f"{m}: {said.step}")
+                        transport, config, model, "n1", on_progress=lambda step, m=model: marks.set(f"{m}: {step.step}")
                     )
                     unrefused += [model] * is_next_bad
                 except PeerError as error:
                     refused[model] = error.code, error.message
                 marks.set(f"{model}: answered")
-                time.sleep(PAUSE_S)  # the answer comes before the memory goes
+                time.sleep(PAUSE_S)  # the answer precedes the release of the memory
                 resident.append(memory.kib())
                 print(f"change {number + 1} of {swaps}, {model}: {resident[-1] >> 10} MiB", file=sys.stderr)
         time.sleep(1.0)
@@ -182,7 +182,7 @@ def run(swaps: int, bad: int, streams: int, quiet_s: float = 5.0) -> dict[str, A
         "epochs": sorted({one.epoch for all_of in of.values() for one in all_of})[-1],
         "estimates": {name: len(one) for name, one in of.items()},
         "lost_or_doubled": sum(not follows(a, b) for one in of.values() for a, b in pairwise(one)),
-        "not_heard": sum(b.seq - a.seq - 1 for one in of.values() for a, b in pairwise(one) if follows(a, b)),
+        "not_received": sum(b.seq - a.seq - 1 for one in of.values() for a, b in pairwise(one) if follows(a, b)),
         "lost": {status.stream: status.lost.nonzero() for status in health.streams},
         "gap_ms_without": round(without, 1),
         "gap_ms_with": round(longest[0].ms, 1),
@@ -206,15 +206,15 @@ def run(swaps: int, bad: int, streams: int, quiet_s: float = 5.0) -> dict[str, A
     }
 
 
-def broken(told: dict[str, Any]) -> list[str]:
-    """What of the contract does not hold."""
-    memory = told["resident_mib"]
-    flat = abs(memory["last_eighths"][1] - memory["last_eighths"][0]) <= 0.5 * told["model_mib"]
+def broken(report: dict[str, Any]) -> list[str]:
+    """The parts of the contract that do not hold."""
+    memory = report["resident_mib"]
+    flat = abs(memory["last_eighths"][1] - memory["last_eighths"][0]) <= 0.5 * report["model_mib"]
     holds = {
-        "no window lost or doubled": not told["lost_or_doubled"] and not any(told["lost"].values()),
-        "every bad bundle refused with its own reason": not told["not_refused"] and not told["wrong_reason"],
-        "the active model is the one that was last made so": not told["active_is_wrong"] and not told["rollbacks"],
-        "a gap at most one window longer": told["gap_ms_with"] <= told["gap_ms_without"] + WINDOW_US / 1e3,
+        "no window lost or answered twice": not report["lost_or_doubled"] and not any(report["lost"].values()),
+        "every bad bundle refused with its own reason": not report["not_refused"] and not report["wrong_reason"],
+        "the active model is the one of the last change": not report["active_is_wrong"] and not report["rollbacks"],
+        "a gap at most one window longer": report["gap_ms_with"] <= report["gap_ms_without"] + WINDOW_US / 1e3,
         "at most 1.5 models more": memory["grown_by_models"] <= 1.5,
         "flat over the last quarter": flat,
     }
@@ -224,11 +224,11 @@ def broken(told: dict[str, Any]) -> list[str]:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--swaps", type=int, default=100)
-    parser.add_argument("--bad", type=int, default=20, help="so many of them by a bad bundle")
+    parser.add_argument("--bad", type=int, default=20, help="number of changes to a bad bundle")
     parser.add_argument("--streams", type=int, default=4)
-    parser.add_argument("--quiet-s", type=float, default=100.0, help="so long without a change before, to compare with")
+    parser.add_argument("--quiet-s", type=float, default=100.0, help="duration without a change at the start [s]")
     given = parser.parse_args()
-    gc.disable()  # what was heard is kept: looking through it again and again would cost what is heard
+    gc.disable()  # all payloads are kept: repeated collections over them would delay the listener
     result = run(given.swaps, given.bad, given.streams, given.quiet_s)
     print(json.dumps(result, indent=2))
     for what in broken(result):

@@ -1,4 +1,4 @@
-"""Configurations: a wrong value is named with its bound, and every value that passes makes a model that runs."""
+"""Configurations: a wrong value is named with its bound, and every accepted value gives a model that runs."""
 
 from typing import Any
 
@@ -7,16 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from neurove_core import bundle
-from neurove_core.config import (
-    MAX_CANONICAL_CELLS,
-    CanonicalConfig,
-    Config,
-    ModelConfig,
-    NetworkConfig,
-    WindowConfig,
-)
+from neurove_core.config import MAX_CANONICAL_CELLS, CanonicalConfig, Config, ModelConfig, NetworkConfig, WindowConfig
 from neurove_core.estimator import Estimator
+from neurove_core.models import bundle
 
 WRONG = [
     (WindowConfig, "duration_us", 0, "greater than 0"),
@@ -62,7 +55,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("model", "field", "value", "bound"), WRONG)
-def test_a_wrong_value_is_refused_with_its_field_its_value_and_its_bound(model, field, value, bound):
+def test_a_wrong_value_is_rejected_with_field_value_and_bound(model, field, value, bound):
     with pytest.raises(ValidationError) as refused:
         model(**{field: value})
     message = str(refused.value)
@@ -71,7 +64,7 @@ def test_a_wrong_value_is_refused_with_its_field_its_value_and_its_bound(model, 
     assert bound in message
 
 
-def test_every_setting_with_a_bound_is_tried_with_a_wrong_value():
+def test_every_setting_with_a_bound_is_tested_with_a_wrong_value():
     tried = {(model, field) for model, field, _, _ in WRONG}
     parts = {(ModelConfig, name) for name in ("window", "canonical", "network")}
     models: tuple[type[Config], ...] = (WindowConfig, CanonicalConfig, NetworkConfig, ModelConfig)
@@ -79,13 +72,13 @@ def test_every_setting_with_a_bound_is_tried_with_a_wrong_value():
 
 
 @pytest.mark.parametrize("model", [WindowConfig, CanonicalConfig, NetworkConfig, ModelConfig])
-def test_an_unknown_key_is_refused_and_named(model):
+def test_an_unknown_key_is_rejected_by_name(model):
     with pytest.raises(ValidationError, match=r"durations_ms\n.*not permitted"):
         model(durations_ms=5)
 
 
 @pytest.mark.parametrize("model", [WindowConfig, CanonicalConfig, NetworkConfig, ModelConfig])
-def test_a_configuration_is_never_changed_in_place(model):
+def test_a_configuration_is_immutable(model):
     name = next(iter(model.model_fields))
     config = model()
     with pytest.raises(ValidationError, match="frozen"):
@@ -93,7 +86,7 @@ def test_a_configuration_is_never_changed_in_place(model):
 
 
 @given(duration_us=st.integers(1, 10_000_000), bins=st.integers(1, 64))
-def test_bins_fill_the_window_exactly_or_the_window_is_refused_by_both_numbers(duration_us, bins):
+def test_bins_that_do_not_fill_the_window_are_rejected_with_both_numbers(duration_us, bins):
     if duration_us % bins == 0:
         assert WindowConfig(duration_us=duration_us, bins=bins).bin_us * bins == duration_us
     else:
@@ -101,7 +94,7 @@ def test_bins_fill_the_window_exactly_or_the_window_is_refused_by_both_numbers(d
             WindowConfig(duration_us=duration_us, bins=bins)
 
 
-def test_a_canonical_camera_has_at_most_as_many_cells_as_the_cap():
+def test_a_canonical_camera_has_at_most_the_maximum_number_of_cells():
     side = int(MAX_CANONICAL_CELLS**0.5)
     assert CanonicalConfig(width=side, height=side).width == side
     with pytest.raises(ValidationError, match=rf"{side * (side + 1)}: at most {MAX_CANONICAL_CELLS} cells"):
@@ -131,7 +124,7 @@ small: dict[str, st.SearchStrategy[Any]] = {
 
 
 @given(st.fixed_dictionaries(small))
-def test_every_configuration_that_passes_makes_a_model_that_warms_up_and_survives_its_file(parts):
+def test_every_accepted_configuration_gives_a_model_that_warms_up_and_survives_save_and_load(parts):
     config = ModelConfig(**parts)
     assert ModelConfig.model_validate_json(config.model_dump_json()) == config
     model = bundle.untrained(0, config)

@@ -1,5 +1,6 @@
-"""Estimator.push: the same answers however packets are cut, for each stream alone, and honest flags."""
+"""Estimator.push: answers independent of packet sizes, independent streams, and correct flags."""
 
+import contextlib
 import doctest
 import importlib
 import re
@@ -7,19 +8,18 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import chain, pairwise
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 import torch
 
 import neurove_core
-from neurove_core import bundle
-from neurove_core.bundle import Bundle
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from neurove_core.estimator import Answer, Estimator, Push, StreamState, WindowEstimate
-from protocol import CameraInfo, Events, Sensor
-from protocol.errors import BadModel, InvalidField
+from neurove_core.estimator import Estimator, Push, PushResult, StreamState, WindowEstimate
+from neurove_core.models import bundle
+from neurove_core.models.bundle import Bundle
+from neurove_protocol import CameraInfo, Events, Sensor
+from neurove_protocol.errors import BadModel, InvalidField
 from tests.builders import SENSOR, make_events
 
 README = Path(neurove_core.__file__).with_name("README.md")
@@ -53,8 +53,8 @@ def estimator() -> Estimator:
     return Estimator(make_bundle())
 
 
-def feed(estimator: Estimator, packets: list[Events], state: StreamState | None = None) -> Answer:
-    """All that comes of packets, each pushed with the time of its first event."""
+def feed(estimator: Estimator, packets: list[Events], state: StreamState | None = None) -> PushResult:
+    """The combined result of packets, each pushed with the time of its first event."""
     state = state or estimator.initial_state(SENSOR)
     estimates, late, outside, skipped = [], 0, 0, 0
     for events in packets:
@@ -63,10 +63,10 @@ def feed(estimator: Estimator, packets: list[Events], state: StreamState | None 
         estimates += answer.estimates
         late, outside = late + answer.late_events, outside + answer.outside_events
         skipped += answer.skipped_windows
-    return Answer(estimates, state, late, outside, skipped)
+    return PushResult(estimates, state, late, outside, skipped)
 
 
-def cut_at_random(events: Events, seed: int, cuts: int = 25) -> list[Events]:
+def split_randomly(events: Events, seed: int, cuts: int = 25) -> list[Events]:
     edges = [0, *np.unique(np.random.default_rng(seed).integers(1, events.n, cuts)).tolist(), events.n]
     return [events.span(a, b) for a, b in pairwise(edges)]
 
@@ -105,14 +105,14 @@ def differ(one: WindowEstimate, other: WindowEstimate) -> bool:
 
 @pytest.mark.parametrize("camera", [None, LENS], ids=["scaled", "lens"])
 @pytest.mark.parametrize("seed", range(8))
-def test_answers_do_not_depend_on_how_the_driver_cuts_packets(estimator, seed, camera):
+def test_answers_do_not_depend_on_packet_sizes(estimator, seed, camera):
     events = make_events(3_000, seed=seed, start_us=-42_000, duration_us=120_000)
     one = feed(estimator, [events], estimator.initial_state(SENSOR, camera))
-    cut = feed(estimator, cut_at_random(events, seed), estimator.initial_state(SENSOR, camera))
+    split = feed(estimator, split_randomly(events, seed), estimator.initial_state(SENSOR, camera))
     assert len(one.estimates) == 12
-    assert_same_estimates(cut.estimates, one.estimates)
-    assert_same_state(cut.state, one.state)
-    assert cut[2:] == one[2:]
+    assert_same_estimates(split.estimates, one.estimates)
+    assert_same_state(split.state, one.state)
+    assert split[2:] == one[2:]
 
 
 def test_every_window_is_answered_once_in_order_with_one_twist_for_each_bin(estimator):
@@ -121,7 +121,7 @@ def test_every_window_is_answered_once_in_order_with_one_twist_for_each_bin(esti
     assert all(one.twists.shape == (2, 6) and one.events == 150 for one in estimates)
 
 
-def test_what_the_camera_saw_before_changes_the_answer_to_the_same_window(estimator):
+def test_earlier_windows_change_the_answer_to_the_same_window(estimator):
     one, other = windows_of_events(1), windows_of_events(1, seed=50)
     same = [*windows_of_events(1, first=1), tick(2)]
     assert differ(feed(estimator, one + same).estimates[1], feed(estimator, other + same).estimates[1])
@@ -143,7 +143,7 @@ def test_two_streams_pushed_in_turn_are_answered_as_each_alone(estimator):
     assert differ(alone[0].estimates[3], alone[1].estimates[3])
 
 
-def test_streams_of_several_threads_share_an_estimator_and_are_answered_as_each_alone(estimator):
+def test_streams_in_several_threads_share_an_estimator_and_are_answered_as_each_alone(estimator):
     streams = [windows_of_events(10, seed=100 * i) for i in range(4)]
     alone = [feed(estimator, packets).estimates for packets in streams]
     with ThreadPoolExecutor(4) as threads:
@@ -154,13 +154,13 @@ def test_streams_of_several_threads_share_an_estimator_and_are_answered_as_each_
 
 @pytest.mark.parametrize("precision", ["float32", "int8"])
 def test_streams_pushed_at_once_are_answered_as_each_alone(precision):
-    """Streams of different ages, one with a hole and one without a window; in int8 equal bit for bit."""
+    """Streams of different ages, one with a gap and one without a window; in int8 equal bit for bit."""
     estimator = Estimator(make_bundle(network=CONFIG.network.model_copy(update={"precision": precision})))
-    hole = [*windows_of_events(3), *windows_of_events(3, first=20)]
-    packets = [windows_of_events(6, seed=50), hole, [make_events(9, seed=1)] * 6, [Events.join(hole), *[tick(30)] * 5]]
+    gap = [*windows_of_events(3), *windows_of_events(3, first=20)]
+    packets = [windows_of_events(6, seed=50), gap, [make_events(9, seed=1)] * 6, [Events.join(gap), *[tick(30)] * 5]]
     alone = [feed(estimator, one) for one in packets]
     states = [estimator.initial_state(SENSOR) for _ in packets]
-    together: list[list[Answer]] = []
+    together: list[list[PushResult]] = []
     for turn in zip(*packets, strict=True):
         pushes = [Push(events, state, int(events.t[0])) for events, state in zip(turn, states, strict=True)]
         answers = estimator.push_many(pushes)
@@ -180,7 +180,7 @@ def test_streams_pushed_at_once_are_answered_as_each_alone(precision):
 
 
 @pytest.mark.parametrize("as_one_packet", [True, False])
-def test_after_a_hole_too_long_to_bridge_a_stream_answers_as_a_fresh_one(estimator, as_one_packet):
+def test_after_a_skipped_gap_a_stream_answers_as_a_new_one(estimator, as_one_packet):
     before, after = windows_of_events(5), [*windows_of_events(3, first=9), tick(12)]
     packets = [Events.join(before + after)] if as_one_packet else before + after
     result, fresh = feed(estimator, packets), feed(estimator, after)
@@ -190,7 +190,7 @@ def test_after_a_hole_too_long_to_bridge_a_stream_answers_as_a_fresh_one(estimat
     assert [one.first for one in result.estimates] == [k in (0, 5) for k in range(8)]
 
 
-def test_a_hole_that_is_bridged_is_answered_and_keeps_the_state(estimator):
+def test_a_short_gap_is_answered_and_keeps_the_state(estimator):
     after = [*windows_of_events(1, first=8), tick(9)]
     result, fresh = feed(estimator, windows_of_events(5) + after), feed(estimator, after)
     assert [one.events for one in result.estimates] == [150] * 5 + [0] * 3 + [150]
@@ -198,13 +198,13 @@ def test_a_hole_that_is_bridged_is_answered_and_keeps_the_state(estimator):
     assert differ(result.estimates[-1], fresh.estimates[0])
 
 
-def test_settled_is_true_once_a_stream_is_as_old_as_the_model_says_and_first_only_at_its_birth(estimator):
+def test_settled_is_true_after_settle_windows_and_first_only_in_the_first_window(estimator):
     estimates = feed(estimator, windows_of_events(SETTLE + 4)).estimates
     assert [one.settled for one in estimates] == [False] * SETTLE + [True] * 3
     assert [one.first for one in estimates] == [True] + [False] * (SETTLE + 2)
 
 
-def test_low_activity_counts_only_events_that_the_model_sees():
+def test_low_activity_counts_only_events_inside_the_grid():
     estimator = Estimator(make_bundle(low_activity_events=LOW, low_activity_per_pixel=0))
     state = estimator.initial_state(SENSOR, LENS)
     seen, unseen = ((int(x), int(y)) for y, x in (np.argwhere(state.lut >= 0)[0], np.argwhere(state.lut < 0)[0]))
@@ -219,7 +219,7 @@ def test_low_activity_counts_only_events_that_the_model_sees():
     assert window(LOW, 10).events == LOW + 10
 
 
-def test_a_large_sensor_needs_more_events_for_its_noise_is_no_motion():
+def test_a_large_sensor_needs_more_events_because_its_noise_is_no_motion():
     estimator = Estimator(make_bundle(low_activity_events=LOW, low_activity_per_pixel=2.0))
     state = estimator.initial_state(SENSOR, LENS)
     rows, columns = np.nonzero(state.lut >= 0)
@@ -240,7 +240,7 @@ def test_a_window_with_a_full_cell_is_flagged_saturated(estimator, n, saturated)
     assert estimate.saturated is saturated
 
 
-def test_late_outside_and_skipped_are_told(estimator):
+def test_late_outside_and_skipped_are_reported(estimator):
     state = estimator.initial_state(SENSOR, LENS)
     blind = int((state.lut < 0).sum())
     assert blind > 0
@@ -261,38 +261,38 @@ def test_twists_are_the_networks_answers_times_scale_plus_offset():
         np.testing.assert_allclose(one.twists, other.twists * scale.numpy() + offset.numpy(), rtol=1e-6)
 
 
-def test_push_is_cut_and_then_follow(estimator):
+def test_push_is_to_windows_and_then_follow(estimator):
     packets = windows_of_events(6)
     whole, state, estimates = feed(estimator, packets), estimator.initial_state(SENSOR), []
     for events in packets:
-        pushed = estimator.cut(events, state, int(events.t[0]))
+        pushed = estimator.to_windows(events, state, int(events.t[0]))
         answers, state = estimator.follow(pushed.windows, state._replace(windows=pushed.state))
         estimates += answers
     assert_same_estimates(estimates, whole.estimates)
     assert_same_state(state, whole.state)
 
 
-def cut_all(estimator, packets):
+def windows_of_packets(estimator, packets):
     """Every window that packets complete."""
     state, windows = estimator.initial_state(SENSOR), []
     for events in packets:
-        pushed = estimator.cut(events, state, int(events.t[0]))
+        pushed = estimator.to_windows(events, state, int(events.t[0]))
         state, windows = state._replace(windows=pushed.state), windows + pushed.windows
     return windows
 
 
-def test_another_model_that_cuts_alike_follows_the_same_windows_as_if_it_had_cut_them_itself(estimator):
+def test_a_model_with_the_same_windows_can_follow_those_of_another(estimator):
     other = Estimator(make_bundle(seed=7, network=CONFIG.network.model_copy(update={"hidden": 5, "diffusion": False})))
     packets = windows_of_events(5)
-    assert other.cuts_like(estimator)
+    assert other.has_same_windows(estimator)
     own = feed(other, packets)
-    estimates, state = other.follow(cut_all(estimator, packets), other.initial_state(SENSOR))
+    estimates, state = other.follow(windows_of_packets(estimator, packets), other.initial_state(SENSOR))
     assert_same_estimates(estimates, own.estimates)
     assert_same_state(state, own.state)
 
 
-def test_windows_after_a_hole_are_followed_from_rest(estimator):
-    windows = cut_all(estimator, windows_of_events(8))
+def test_windows_after_a_gap_are_followed_from_the_zero_state(estimator):
+    windows = windows_of_packets(estimator, windows_of_events(8))
     _, state = estimator.follow([*windows[:2], *windows[4:]], estimator.initial_state(SENSOR))
     _, fresh = estimator.follow(windows[4:], estimator.initial_state(SENSOR))
     assert state.age == len(windows[4:])
@@ -309,8 +309,8 @@ def test_windows_after_a_hole_are_followed_from_rest(estimator):
     ],
     ids=["bins", "duration", "grid", "field_of_view"],
 )
-def test_models_that_cut_or_see_otherwise_are_told_apart(estimator, change):
-    assert not Estimator(make_bundle(seed=3, **change)).cuts_like(estimator)
+def test_models_with_other_windows_or_another_camera_are_told_apart(estimator, change):
+    assert not Estimator(make_bundle(seed=3, **change)).has_same_windows(estimator)
 
 
 def arrays_of(value) -> list[np.ndarray]:
@@ -332,10 +332,10 @@ def arrays_of(value) -> list[np.ndarray]:
     ],
     ids=str,
 )
-def test_a_stream_that_has_run_for_long_holds_a_bounded_state(sensor, grid, most_mib):
+def test_the_state_of_a_long_stream_is_bounded(sensor, grid, most_mib):
     estimator = Estimator(bundle.untrained(0, ModelConfig(canonical=grid)))
     state, sizes = estimator.initial_state(sensor), []
-    for k in range(20):  # more than the 16 windows that prime another model
+    for k in range(20):  # more than the 16 windows that another model needs to settle
         events = make_events(50, seed=k, sensor=sensor, start_us=k * 50_000, duration_us=50_000)
         state = estimator.push(events, state, k * 50_000).state
         whole = {id(array.base if array.base is not None else array): array for array in arrays_of(state)}
@@ -344,7 +344,7 @@ def test_a_stream_that_has_run_for_long_holds_a_bounded_state(sensor, grid, most
     assert sizes[-1] < most_mib << 20
 
 
-def test_a_model_that_is_fit_warms_up_and_answers_as_before():
+def test_warm_up_does_not_change_the_answers():
     cold, warm = Estimator(make_bundle()), Estimator(make_bundle())
     warm.warm_up()
     packets = windows_of_events(4)
@@ -353,14 +353,14 @@ def test_a_model_that_is_fit_warms_up_and_answers_as_before():
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
 @pytest.mark.parametrize("part", ["scale", "offset"])
-def test_warm_up_refuses_a_model_whose_answers_are_not_finite(part, value):
+def test_warm_up_rejects_a_model_whose_answers_are_not_finite(part, value):
     broken, six = make_bundle(), torch.full((6,), value)
     broken = replace(broken, scale=six) if part == "scale" else replace(broken, offset=six)
     with pytest.raises(BadModel, match=r"untrained.*not finite"):
         Estimator(broken).warm_up()
 
 
-def test_warm_up_refuses_a_model_whose_neurons_compute_nan_even_if_its_answers_do_not_show_it():
+def test_warm_up_rejects_a_model_whose_neurons_are_nan_even_if_its_answers_are_finite():
     broken = make_bundle()
     next(norm for name, norm in broken.network.named_modules() if name == "blocks.0.norm").running_var.fill_(-1)
     assert all(np.isfinite(one.twists).all() for one in feed(Estimator(broken), windows_of_events(4)).estimates)
@@ -368,7 +368,7 @@ def test_warm_up_refuses_a_model_whose_neurons_compute_nan_even_if_its_answers_d
         Estimator(broken).warm_up()
 
 
-def test_camera_info_of_another_sensor_is_refused(estimator):
+def test_camera_info_of_another_sensor_is_rejected(estimator):
     with pytest.raises(InvalidField, match="64x48"):
         estimator.initial_state(Sensor(64, 47), LENS)
 
@@ -379,15 +379,21 @@ def test_the_example_of_the_readme_runs_as_written():
     assert result.failed == 0
 
 
+def resolved(parts):
+    """What a dotted name below neurove_core means: modules first, then attributes or fields; None if nothing."""
+    found, depth = neurove_core, 0
+    for depth in range(len(parts), 0, -1):
+        with contextlib.suppress(ModuleNotFoundError):
+            found = importlib.import_module(".".join(["neurove_core", *parts[:depth]]))
+            break
+    for attribute in parts[depth:]:
+        found = getattr(found, attribute, None) or getattr(found, "model_fields", {}).get(attribute)
+    return found
+
+
 def test_the_paper_map_of_the_readme_names_only_what_exists():
     rows = [line for line in README.read_text().splitlines() if line.startswith("|")]
     names = {name for row in rows for name in re.findall(r"`([a-z]+\.[\w.]+)`", row)}
     assert len(names) > 15
     for name in names:
-        found: object = neurove_core
-        for part in name.split("."):
-            if isinstance(found, ModuleType) and not hasattr(found, part):
-                found = importlib.import_module(f"{found.__name__}.{part}")
-            else:
-                found = getattr(found, part, None) or getattr(found, "model_fields", {}).get(part)
-        assert found is not None, name
+        assert resolved(name.split(".")) is not None, name

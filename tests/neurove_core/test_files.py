@@ -1,16 +1,16 @@
-"""Files that are whole or what they were before."""
+"""Atomic writes: a file has its new content or its old one."""
 
 import pytest
 
 from neurove_core.figures import blank_figure, save_figure
-from neurove_core.files import move_folder, write_whole, written_whole
-from protocol.errors import InvalidField
+from neurove_core.files import atomic_path, move_folder, write_atomically
+from neurove_protocol.errors import InvalidField
 
 
-def test_a_file_is_what_it_was_until_all_is_written(tmp_path):
+def test_a_file_keeps_its_old_content_until_all_is_written(tmp_path):
     file = tmp_path / "a.txt"
-    write_whole(file, b"before")
-    with written_whole(file) as part:
+    write_atomically(file, b"before")
+    with atomic_path(file) as part:
         part.write_bytes(b"after")
         assert file.read_bytes() == b"before"
     assert file.read_bytes() == b"after"
@@ -18,12 +18,12 @@ def test_a_file_is_what_it_was_until_all_is_written(tmp_path):
 
 
 @pytest.mark.parametrize("error", [OSError, KeyboardInterrupt])
-def test_writing_that_fails_leaves_what_was_there_and_nothing_beside_it(tmp_path, error):
+def test_a_failed_write_keeps_the_old_file_and_leaves_no_temporary_file(tmp_path, error):
     file = tmp_path / "a.txt"
-    write_whole(file, b"before")
+    write_atomically(file, b"before")
 
     def stopped():
-        with written_whole(file) as part:
+        with atomic_path(file) as part:
             part.write_bytes(b"aft")
             raise error
 
@@ -33,18 +33,18 @@ def test_writing_that_fails_leaves_what_was_there_and_nothing_beside_it(tmp_path
     assert list(tmp_path.iterdir()) == [file]
 
 
-def test_a_block_that_writes_nothing_is_told_and_the_file_stays(tmp_path):
+def test_a_block_that_writes_nothing_raises_and_the_file_stays(tmp_path):
     file = tmp_path / "a.txt"
-    write_whole(file, b"before")
-    with pytest.raises(FileNotFoundError), written_whole(file):
+    write_atomically(file, b"before")
+    with pytest.raises(FileNotFoundError), atomic_path(file):
         pass
     assert file.read_bytes() == b"before"
 
 
-def test_a_folder_moves_whole_and_not_onto_one_that_is_in_use(tmp_path):
+def test_a_folder_moves_completely_and_not_onto_one_that_has_files(tmp_path):
     for name in ("new", "used"):
         (tmp_path / name).mkdir()
-        write_whole(tmp_path / name / "a.txt", name.encode())
+        write_atomically(tmp_path / name / "a.txt", name.encode())
     with pytest.raises(OSError, match="not empty"):
         move_folder(tmp_path / "new", tmp_path / "used")
     assert (tmp_path / "used" / "a.txt").read_bytes() == b"used"
@@ -53,7 +53,7 @@ def test_a_folder_moves_whole_and_not_onto_one_that_is_in_use(tmp_path):
     assert not (tmp_path / "new").exists()
 
 
-def test_a_figure_is_the_same_bytes_each_time_or_says_where_it_can_not_be_written(tmp_path):
+def test_a_figure_has_the_same_bytes_each_time_and_a_failed_write_names_the_file(tmp_path):
     pytest.importorskip("matplotlib")
 
     def drawn():

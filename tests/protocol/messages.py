@@ -10,9 +10,9 @@ import msgpack
 from hypothesis import settings
 from hypothesis import strategies as st
 
-from protocol import CameraInfo, EventPacket, Events, Sensor, TwistEstimate
-from protocol.codec import Message
-from protocol.control import (
+from neurove_protocol import CameraInfo, EventPacket, Events, Sensor, TwistEstimate
+from neurove_protocol.codec import Message
+from neurove_protocol.control import (
     ActivateReply,
     ActivateRequest,
     ChunkRequest,
@@ -28,7 +28,7 @@ from protocol.control import (
     RollbackRequest,
     StreamStatus,
 )
-from protocol.events import decode_packet, encode_packet
+from neurove_protocol.events import decode_packet, encode_packet
 
 Fields = dict[str, Any]
 Path = tuple[str | int, ...]

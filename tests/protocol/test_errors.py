@@ -4,32 +4,36 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol import NeuroVEError, Sensor
-from protocol.codec import MAX_STRING_BYTES
-from protocol.control import ErrorReply, PeerError
-from protocol.errors import (
+from neurove_protocol import NeuroVEError, Sensor
+from neurove_protocol.codec import MAX_STRING_BYTES
+from neurove_protocol.control import ErrorReply, PeerError
+from neurove_protocol.errors import (
     MAX_TEXT_BYTES,
     BadModel,
     BlobLength,
     Busy,
     Conflict,
-    Cut,
     Detail,
     Diverged,
     Downgrade,
     EventOutsideSensor,
+    InputError,
     InternalError,
     InvalidField,
     Malformed,
+    ModelError,
     NoMemory,
     NoQuota,
     NoSpace,
     NoStore,
     NothingBefore,
+    RequestError,
     RolledBack,
     TimeBackwards,
     TooLarge,
     TooSlow,
+    TransferError,
+    TransferInterrupted,
     UnknownFormat,
     UnknownModel,
     UnsupportedVersion,
@@ -55,7 +59,7 @@ ERRORS: list[NeuroVEError] = [
     TooLarge("spire-9.safetensors", 300_000_000, 268_435_456),
     NoQuota("spire-9.safetensors", 3_000_000, 2_000_000, 4_000_000),
     NoSpace("spire-9.safetensors", 3_000_000, 1_000),
-    Cut("spire-9.safetensors", 1_000, 3_000_000, "whoever pushed it does not answer"),
+    TransferInterrupted("spire-9.safetensors", 1_000, 3_000_000, "whoever pushed it does not answer"),
     Busy(4),
     Conflict("another model change is under way"),
     NoMemory("spire-8", 1_000, 2_000),
@@ -63,25 +67,35 @@ ERRORS: list[NeuroVEError] = [
     Diverged("spire-8", "divergence", 2.34567, 1.0),
     Diverged("spire-8", "fault", "not finite", "none"),
     NothingBefore(),
-    RolledBack("spire-8 was rolled back by itself: stream cam0: divergence 4, the bound is 3"),
+    RolledBack("spire-8 was rolled back automatically: stream cam0: divergence 4, the bound is 3"),
 ]
 every_error = pytest.mark.parametrize("error", ERRORS, ids=lambda error: error.code)
+
+
+MIDDLE = {InputError, ModelError, TransferError, RequestError}
 
 
 def subclasses(kind: type[NeuroVEError]) -> set[type[NeuroVEError]]:
     """All errors of this package below this one; other packages may add their own."""
     below = {kind, *(found for child in kind.__subclasses__() for found in subclasses(child))}
-    return {found for found in below if found.__module__.startswith("protocol.")}
+    return {found for found in below if found.__module__.startswith("neurove_protocol.")}
 
 
 def test_the_table_of_this_test_is_complete() -> None:
-    assert {type(error) for error in ERRORS} == subclasses(NeuroVEError) - {NeuroVEError, PeerError}
+    assert {type(error) for error in ERRORS} == subclasses(NeuroVEError) - {NeuroVEError, PeerError, *MIDDLE}
 
 
 def test_every_error_has_a_code_of_its_own() -> None:
     codes = [vars(kind)["code"] for kind in {type(error) for error in ERRORS}]
     assert len(set(codes)) == len(codes)
     assert all(code.replace("_", "").isalpha() and code.islower() for code in codes)
+
+
+@every_error
+def test_every_error_has_a_place_in_the_tree_and_an_exit_code(error: NeuroVEError) -> None:
+    assert isinstance(error, (*MIDDLE, InternalError))
+    assert error.exit_code == (3 if error.code == "conflict" else 2)
+    assert PeerError(ErrorReply.of(error)).exit_code == (3 if error.code == "conflict" else 1)
 
 
 def test_an_error_without_a_code_of_its_own_is_an_internal_one() -> None:
@@ -99,7 +113,7 @@ def test_code_sentence_and_details_survive_the_wire(error: NeuroVEError) -> None
 
 
 @every_error
-def test_every_detail_stands_in_the_sentence(error: NeuroVEError) -> None:
+def test_the_sentence_contains_every_detail(error: NeuroVEError) -> None:
     for name, value in error.details.items():
         assert str(value) in error.message, name
 

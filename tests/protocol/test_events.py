@@ -7,8 +7,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from protocol import EVENT_DTYPE, EventPacket, Events, NeuroVEError, Sensor
-from protocol.errors import (
+from neurove_protocol import EVENT_DTYPE, EventPacket, Events, NeuroVEError, Sensor
+from neurove_protocol.errors import (
     BlobLength,
     EventOutsideSensor,
     InvalidField,
@@ -16,7 +16,7 @@ from protocol.errors import (
     TimeBackwards,
     UnknownFormat,
 )
-from protocol.events import FORMATS, Limits, check_events, decode_packet, encode_packet
+from neurove_protocol.events import FORMATS, PacketLimits, check_events, decode_packet, encode_packet
 from tests.builders import make_events, make_packet
 from tests.protocol.messages import (
     EVENT_PACKET,
@@ -160,14 +160,14 @@ def test_the_first_event_that_goes_back_in_time_is_named(wide: bool) -> None:
 @pytest.mark.parametrize(
     ("limits", "field", "bound"),
     [
-        (Limits(max_events=3), "n", 3),
-        (Limits(max_side_px=345), "width", 345),
-        (Limits(max_side_px=200), "width", 200),
-        (Limits(max_events=0), "n", 0),
+        (PacketLimits(max_events=3), "n", 3),
+        (PacketLimits(max_side_px=345), "width", 345),
+        (PacketLimits(max_side_px=200), "width", 200),
+        (PacketLimits(max_events=0), "n", 0),
     ],
 )
 def test_a_packet_beyond_a_configured_cap_is_refused_with_the_cap_in_the_sentence(
-    limits: Limits, field: str, bound: int
+    limits: PacketLimits, field: str, bound: int
 ) -> None:
     with pytest.raises(InvalidField) as caught:
         decode_packet(EVENT_PACKET.bytes(), limits)
@@ -177,21 +177,21 @@ def test_a_packet_beyond_a_configured_cap_is_refused_with_the_cap_in_the_sentenc
 
 def test_a_tall_sensor_beyond_the_cap_is_refused_by_its_height() -> None:
     with pytest.raises(InvalidField, match=r"height=260: .*cap is 250"):
-        decode_packet(pack(fields_of([], width=100)), Limits(max_side_px=250))
+        decode_packet(pack(fields_of([], width=100)), PacketLimits(max_side_px=250))
 
 
 def test_a_packet_of_just_the_configured_caps_is_taken() -> None:
-    limits = Limits(max_events=len(EVENTS), max_side_px=346)
+    limits = PacketLimits(max_events=len(EVENTS), max_side_px=346)
     assert decode_packet(EVENT_PACKET.bytes(), limits).events.n == len(EVENTS)
 
 
 def test_a_sensor_that_no_coordinate_can_address_is_refused_under_any_cap() -> None:
     with pytest.raises(InvalidField, match="width=40000"):
-        decode_packet(pack(fields_of([], width=40_000)), Limits(max_side_px=1 << 20))
+        decode_packet(pack(fields_of([], width=40_000)), PacketLimits(max_side_px=1 << 20))
 
 
 def test_bytes_beyond_the_configured_cap_are_refused_before_they_are_read() -> None:
-    limits = Limits(max_events=10)
+    limits = PacketLimits(max_events=10)
     with pytest.raises(InvalidField) as caught:
         decode_packet(bytes(limits.max_bytes + 1), limits)
     assert caught.value.details["field"] == "size"
@@ -201,7 +201,7 @@ def test_bytes_beyond_the_configured_cap_are_refused_before_they_are_read() -> N
 
 
 def test_the_largest_packet_of_the_caps_fits_its_bytes() -> None:
-    limits = Limits(max_events=500)
+    limits = PacketLimits(max_events=500)
     n = limits.max_events
     events = Events.from_columns(range(n), [4095] * n, [4095] * n, [1] * n)
     packet = EventPacket("s" * 64, (1 << 63) - 1, Sensor(4096, 4096), -(1 << 62), events)

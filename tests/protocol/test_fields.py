@@ -5,7 +5,7 @@ from typing import Any, Self
 import pytest
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from protocol.fields import WrongField
+from neurove_protocol.fields import WrongField
 
 
 class Inner(BaseModel):
@@ -43,7 +43,7 @@ def wrong(**fields: Any) -> WrongField:
         ({"inner": [], "least": 1}, "least=1 goes with nothing"),
     ],
 )
-def test_the_first_wrong_field_is_told_with_its_value_and_its_bound(fields, sentence):
+def test_the_sentence_names_the_first_wrong_field_its_value_and_its_bound(fields, sentence):
     assert wrong(**fields).sentence.startswith(sentence)
 
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from protocol import NeuroVEError
-from protocol.errors import InvalidField
-from protocol.keys import DEFAULT_PREFIX, NAME_RULE, Keys, check_name, is_name
+from neurove_protocol import NeuroVEError
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.keys import DEFAULT_PREFIX, NAME_RULE, Keys, check_name, is_name
 from tests.protocol.messages import bounded, names
 
 STREAM_KEYS: list[Callable[..., str]] = [Keys.events, Keys.camera, Keys.velocity, Keys.status]
@@ -124,7 +124,7 @@ def test_a_key_that_is_no_stream_key_has_no_stream(key: str) -> None:
         Keys().stream_of(key)
 
 
-def test_a_wildcard_stands_for_any_one_name_and_never_for_a_node() -> None:
+def test_a_wildcard_matches_any_one_name_and_never_a_node() -> None:
     assert Keys().events() == "neurove/v1/*/events"
     assert Keys().serves() == "neurove/v1/@node/*/serves/*"
     assert all("@node" not in build(Keys()) for build in STREAM_KEYS)
@@ -161,7 +161,7 @@ def test_a_key_that_is_no_node_key_has_no_node(key: str) -> None:
 @example("5e" * 32 + "\n")
 @example("*")
 @example("../" * 20)
-def test_chunks_are_asked_for_by_digest_and_by_nothing_else(digest: str) -> None:
+def test_only_a_digest_makes_a_key_for_chunks(digest: str) -> None:
     if len(digest) == 64 and set(digest) <= set("0123456789abcdef"):
         assert Keys("p").chunks(digest) == f"p/@push/{digest}"
     else:

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from protocol import CameraInfo, NeuroVEError, Sensor, Trace, Twist, TwistEstimate
-from protocol.control import Losses
-from protocol.errors import InvalidField, UnsupportedVersion
+from neurove_protocol import CameraInfo, NeuroVEError, Sensor, Trace, Twist, TwistEstimate
+from neurove_protocol.control import Losses
+from neurove_protocol.errors import InvalidField, UnsupportedVersion
 from tests.protocol.messages import (
     ANY,
     BY_NAME,
@@ -243,7 +243,7 @@ def test_every_value_out_of_bound_is_refused_by_the_name_of_its_field(name: str,
 
 @every_kind
 @pytest.mark.parametrize("version", [0, 2, -1, 1 << 40, "1", 1.0, True, False, None, b"\x01", [1], {"v": 1}])
-def test_another_major_version_is_refused_whatever_else_the_message_holds(kind: Kind, version: object) -> None:
+def test_another_major_version_is_refused_for_any_content(kind: Kind, version: object) -> None:
     for fields in (kind.fields() | {"v": version}, {"v": version}, {"v": version, "new": [1]}):
         error = refused(kind, fields)
         assert isinstance(error, UnsupportedVersion)
@@ -282,7 +282,7 @@ def test_the_order_of_the_fields_does_not_matter(kind: Kind) -> None:
     assert kind.encode(kind.decode(pack(fields))) == kind.bytes()
 
 
-def test_whole_numbers_and_short_floats_are_good_floats() -> None:
+def test_integers_and_float32_are_valid_floats() -> None:
     kind = BY_NAME["CameraInfo"]
     assert kind.decode(pack(kind.fields() | {"fx": 226, "cx": 0})).fx == 226.0
     short = pack(kind.fields()).replace(pack("cx") + pack(173.6), pack("cx") + b"\xca\x43\x2d\x80\x00")
@@ -320,7 +320,7 @@ def test_latency_is_publishing_minus_receiving() -> None:
     assert trace.latency_ms == 3.5
 
 
-def test_only_the_losses_that_happened_are_told() -> None:
+def test_nonzero_reports_only_losses_above_zero() -> None:
     assert Losses().nonzero() == {}
     assert Losses(gap_packets=2, late_events=1).nonzero() == {"gap_packets": 2, "late_events": 1}
 

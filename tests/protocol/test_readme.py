@@ -17,18 +17,19 @@ import msgpack
 import pytest
 from pydantic import BaseModel
 
-import protocol
-from protocol import EventPacket, Events, Flag, Sensor, Trace, TwistEstimate, camera, control, events, velocity
-from protocol.codec import PROTOCOL_VERSION
-from protocol.control import Latency, Losses, ModelInfo, Verdict
-from protocol.events import FORMATS, decode_packet, encode_packet
-from protocol.keys import Keys
-from protocol.velocity import AXES
-from service.progress import Step
+import neurove_protocol
+from neurove_protocol import EventPacket, Events, Flag, Sensor, Trace, TwistEstimate, camera, control, events, velocity
+from neurove_protocol.codec import PROTOCOL_VERSION
+from neurove_protocol.control import Latency, Losses, ModelInfo, Verdict
+from neurove_protocol.events import FORMATS, decode_packet, encode_packet
+from neurove_protocol.keys import Keys
+from neurove_protocol.velocity import AXES
+from neurove_service.models.progress import Step
 from tests.protocol.messages import KINDS, MODELS, assert_same_packet
 from tests.protocol.test_errors import ERRORS
 
-README = Path(protocol.__file__).with_name("README.md").read_text(encoding="utf-8")
+ROOT = Path(__file__).parents[2]
+README = Path(neurove_protocol.__file__).with_name("README.md").read_text(encoding="utf-8")
 DUMPS = re.findall(r"```hex (\w+)\n(.*?)```\n\n```json\n(.*?)```", README, re.DOTALL)
 EXAMPLES = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 BY_NAME = {model.__name__: model for model in MODELS}
@@ -170,7 +171,7 @@ def test_the_table_of_steps_has_all_steps() -> None:
     assert column(table("`step`")) == list(get_args(Step))
 
 
-def test_the_verdicts_and_the_lenses_are_all_told() -> None:
+def test_the_page_lists_all_verdicts_and_lenses() -> None:
     cells = {row[0]: code(row[3]) for rows in tables() for row in rows if rows[0][0] == "field"}
     assert cells["`verdict`"] == list(get_args(Verdict))
     assert cells["`lens`"] == list(get_args(camera.CameraInfo.model_fields["lens"].annotation))
@@ -187,13 +188,13 @@ def test_the_table_of_formats_has_all_formats_with_their_sizes() -> None:
 def test_the_caps_are_those_of_the_code() -> None:
     for name, value, _ in table("cap"):
         module, *path = code(name)[0].split(".")
-        found: object = importlib.import_module(f"protocol.{module}")
+        found: object = importlib.import_module(f"neurove_protocol.{module}")
         for part in path:
             found = getattr(found, part)
         assert found == int(value), name
 
 
-def test_the_order_of_a_twist_is_told() -> None:
+def test_the_page_gives_the_order_of_a_twist() -> None:
     assert f"{' '.join(AXES[:3])} [m/s] and {' '.join(AXES[3:])} [rad/s]" in section("### TwistEstimate")
     assert f"default `{TwistEstimate.model_fields['frame_id'].default}`" in section("### TwistEstimate")
 
@@ -205,19 +206,33 @@ def test_the_links_of_the_page_lead_to_its_sections() -> None:
     assert set(re.findall(r"\]\(#([^)]*)\)", README)) <= sections
 
 
+# --- the picture
+
+
+def test_the_picture_names_only_files_and_keys_that_exist() -> None:
+    picture = re.findall(r"```mermaid\n(.*?)```", README, re.DOTALL)[0]
+    files = set(re.findall(r"\b(?:service|neurove_core|protocol)/[\w/]+\.py", picture))
+    assert len(files) >= 10
+    assert all((ROOT / file).is_file() for file in files), [file for file in files if not (ROOT / file).is_file()]
+    drawn = {re.sub(r"[{}]", "`", key).replace("`", "") for key in re.findall(r"\{prefix\}[\w/@{}]*", picture)}
+    table_of_keys = {re.sub(r"[<>]", "", key) for key in column(table("key"))}
+    assert len(drawn) >= 8
+    assert drawn <= table_of_keys
+
+
 # --- the examples
 
 
-@pytest.mark.parametrize("example", EXAMPLES, ids=["driver", "consumer"])
-def test_an_example_is_short_and_uses_only_what_the_package_has(example: str) -> None:
-    known = {"camera": camera, "events": events, "keys": Keys}
-    assert len(example.splitlines()) < 30
+@pytest.mark.parametrize(("example", "lines"), list(zip(EXAMPLES, (20, 10), strict=True)), ids=["driver", "consumer"])
+def test_an_example_is_short_and_uses_only_what_the_package_has(example: str, lines: int) -> None:
+    known = {"camera": camera, "events": events, "key": Keys}
+    assert len([line for line in example.splitlines() if line]) <= lines
     for node in ast.walk(ast.parse(example)):
         if isinstance(node, ast.Import):
             assert {name.name for name in node.names} <= {"time", "numpy", "zenoh"}
         if isinstance(node, ast.ImportFrom):
             module = importlib.import_module(str(node.module))
-            assert module.__name__.partition(".")[0] == "protocol"
+            assert module.__name__.partition(".")[0] == "neurove_protocol"
             assert all(hasattr(module, name.name) for name in node.names)
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in known:
             assert hasattr(known[node.value.id], node.attr)

@@ -1,8 +1,9 @@
 import pytest
 
-from neurove_core import bundle
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
-from service.model_slot import ModelSlot, Rules
+from neurove_core.models import bundle
+from neurove_service.models.change import Rules
+from neurove_service.models.slot import ModelSlot
 
 SMALL = ModelConfig(
     canonical=CanonicalConfig(width=24, height=16),

@@ -1,0 +1,95 @@
+"""Spike lists: the neurons of a feature map that fired, by their index, and conversions between memory layouts."""
+
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from neurove_core.compiled import compiled
+from neurove_core.engine.tiles import LANES
+
+Array = NDArray[np.float32]
+Indices = NDArray[np.int32]
+
+SPARE: Final = 2 * LANES
+"""Unused numbers at the end of a list: kernels read and write whole vectors there."""
+
+
+class SpikeList(NamedTuple):
+    """The neurons that fired in R maps of shape (H, W, C)."""
+
+    indices: Indices  # index of each spike in its map, channels last, ascending; one map after the other, then SPARE
+    starts: Indices  # (R * H * W + 1): where in `indices` each cell begins
+    shape: tuple[int, int, int, int]  # (R, H, W, C)
+    total: int  # number of spikes
+
+
+def to_maps(spikes: SpikeList, kind: type[np.generic] = np.float32) -> Tensor:
+    """Spikes of 0 and 1 (R, C, H, W), channels last in memory."""
+    maps = np.zeros((spikes.shape[0], spikes.shape[1] * spikes.shape[2] * spikes.shape[3]), kind)
+    fill_spikes(spikes.indices, spikes.starts, maps)
+    return channels_first(maps.reshape(spikes.shape))
+
+
+def to_list(maps: Tensor) -> SpikeList:
+    """The spike list of maps (R, C, H, W); the inverse of `to_maps`."""
+    rows = channels_last(maps)
+    flat = rows.reshape(rows.shape[0], -1)
+    found = np.nonzero(flat)[1]
+    indices = np.zeros(found.size + SPARE, np.int32)
+    indices[: found.size] = found
+    cells = np.count_nonzero(rows.reshape(-1, rows.shape[3]), axis=1)
+    starts = np.concatenate([[0], np.cumsum(cells)]).astype(np.int32)
+    return SpikeList(indices, starts, rows.shape, found.size)
+
+
+def output_shape(given: tuple[int, ...], weights: tuple[int, int], v: Array) -> tuple[int, int, int, int]:
+    """Shape (R, H', W', C') after a convolution of 3x3 with stride 2; checks what compiled code does not check.
+
+    Args:
+        given: shape (R, H, W, C) of the input.
+        weights: C and C' of the layer.
+        v: membrane potentials (B, H', W', C'), R a multiple of B.
+
+    Raises:
+        ValueError: input, weights and potentials do not fit together.
+    """
+    maps, rows, columns, inputs = given
+    shape = (rows + 1) // 2, (columns + 1) // 2, weights[1]
+    if v.shape[1:] != shape or maps % v.shape[0] or inputs != weights[0] or v.dtype != np.float32:
+        have = f"{v.dtype} {v.shape}"
+        raise ValueError(f"maps {given} and weights {weights} give {shape} for each stream, potentials are {have}")
+    return maps, *shape
+
+
+def as_numpy(x: Tensor) -> NDArray[Any]:
+    """The values of a tensor without its gradient. It is detached only where needed, because each call costs time."""
+    values: NDArray[Any] = (x.detach() if x.requires_grad else x).numpy()
+    return values
+
+
+def channels_last(maps: Tensor) -> NDArray[Any]:
+    """Maps (R, C, H, W) as an array (R, H, W, C); no copy where they are channels last in memory."""
+    return np.ascontiguousarray(as_numpy(maps).transpose(0, 2, 3, 1))
+
+
+def channels_first(cells: Array) -> Tensor:
+    """An array (R, H, W, C) as a tensor (R, C, H, W) of the same memory; the inverse of `channels_last`."""
+    return torch.from_numpy(cells.transpose(0, 3, 1, 2))
+
+
+def empty_list(shape: tuple[int, int, int, int]) -> tuple[Indices, Indices]:
+    """Memory for `indices` and `starts` of a list, enough for every neuron of these maps."""
+    cells = shape[0] * shape[1] * shape[2]
+    return np.empty(cells * shape[3] + SPARE, np.int32), np.empty(cells + 1, np.int32)
+
+
+@compiled
+def fill_spikes(indices: Indices, starts: Indices, maps: NDArray[Any]) -> None:  # pragma: no cover (machine code)
+    """Write 1 for each spike into maps (R, H * W * C) of zeros."""
+    cells = (starts.size - 1) // maps.shape[0]
+    for r in range(maps.shape[0]):
+        for i in range(starts[r * cells], starts[(r + 1) * cells]):
+            maps[r, indices[i]] = 1

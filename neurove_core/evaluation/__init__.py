@@ -1,0 +1,1 @@
+"""Evaluation of estimates against the ground truth, and contrast maximisation."""

@@ -1,0 +1,1 @@
+"""The velocity experiment, the paper's Tables III and IV: velocity estimates of all methods."""

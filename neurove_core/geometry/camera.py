@@ -1,0 +1,146 @@
+"""Camera: lens models, and the look-up table from the pixels of any sensor to the canonical camera."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurove_core.config import CanonicalConfig
+from neurove_protocol import CameraInfo, Sensor
+from neurove_protocol.errors import InvalidField
+
+OUTSIDE = -1
+"""Entry of a look-up table for a pixel outside the canonical camera's field of view."""
+
+_ITERATIONS = 20  # most iterations of undistortion
+_TOLERANCE = 1e-7  # undistortion stops below this error or step (in focal lengths or radians)
+
+
+def focal_px(canonical: CanonicalConfig) -> float:
+    """Focal length of the canonical camera [cells].
+
+    >>> round(focal_px(CanonicalConfig(width=100, height=100, hfov_deg=90)), 3)
+    50.0
+    """
+    return canonical.width / 2 / math.tan(math.radians(canonical.hfov_deg) / 2)
+
+
+def lookup_table(canonical: CanonicalConfig, sensor: Sensor, camera: CameraInfo | None) -> NDArray[np.int32]:
+    """The cell of the canonical camera for each pixel of a sensor.
+
+    With this table, undistortion, scaling and cropping cost one table read per event. Without CameraInfo, the whole
+    sensor is scaled to the grid.
+
+    Args:
+        canonical: the grid that the network sees.
+        sensor: the pixel array of the events.
+        camera: the lens of the sensor, if known.
+
+    Returns:
+        (sensor.height, sensor.width) of row * width + column, or OUTSIDE.
+
+    Raises:
+        InvalidField: the camera info describes a sensor of another size.
+    """
+    if camera is None:
+        columns = np.arange(sensor.width) * canonical.width // sensor.width
+        rows = np.arange(sensor.height) * canonical.height // sensor.height
+        return (rows[:, None] * canonical.width + columns).astype(np.int32)
+    if camera.sensor != sensor:
+        raise InvalidField("camera info", "width x height", str(camera.sensor), f"the events' sensor is {sensor}")
+    u, v = np.meshgrid(np.arange(sensor.width, dtype=np.float64), np.arange(sensor.height, dtype=np.float64))
+    x, y = undistort((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, camera)
+    focal = focal_px(canonical)
+    with np.errstate(invalid="ignore"):  # a pixel without a ray is nan, and nan is outside
+        column = np.floor(x * focal + canonical.width / 2)
+        row = np.floor(y * focal + canonical.height / 2)
+        inside = (column >= 0) & (column < canonical.width) & (row >= 0) & (row < canonical.height)
+        cells = np.where(inside, row * canonical.width + column, OUTSIDE)
+    return cells.astype(np.int32)
+
+
+def undistort(
+    xd: NDArray[np.float64], yd: NDArray[np.float64], camera: CameraInfo
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Remove the lens distortion from image points: the rays through them.
+
+    Equidistant lenses use Newton's method on the angle, pinhole lenses a fixed-point iteration.
+
+    Args:
+        xd: (u - cx) / fx of any shape.
+        yd: (v - cy) / fy of the same shape.
+        camera: defines the lens model and its distortion.
+
+    Returns:
+        x/z and y/z of the rays; nan where the lens model has no ray in front of the camera for the point.
+    """
+    if camera.lens == "equidistant":
+        return _undistort_equidistant(xd, yd, camera.distortion)
+    return _undistort_pinhole(xd, yd, camera.distortion)
+
+
+def distort(
+    x: NDArray[np.float64], y: NDArray[np.float64], camera: CameraInfo
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Apply the lens distortion to the rays (x, y, 1): the inverse of undistort, in the same units."""
+    if camera.lens == "equidistant":
+        r = np.hypot(x, y)
+        theta = np.arctan(r)
+        scale = np.divide(_angle_polynomial(theta, camera.distortion), r, out=np.ones_like(r), where=r > 0)
+        return x * scale, y * scale
+    radial, dx, dy = _radial_tangential(x, y, camera.distortion)
+    return x * radial + dx, y * radial + dy
+
+
+def _radial_tangential(
+    x: NDArray[np.float64], y: NDArray[np.float64], distortion: tuple[float, ...]
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    k1, k2, p1, p2, k3 = (*distortion, *(0.0,) * (5 - len(distortion)))
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return radial, 2 * p1 * x * y + p2 * (r2 + 2 * x * x), p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+
+
+def _undistort_pinhole(
+    xd: NDArray[np.float64], yd: NDArray[np.float64], distortion: tuple[float, ...]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    x, y = xd.copy(), yd.copy()
+    if not any(distortion):
+        return x, y
+    error = np.zeros_like(x)
+    with np.errstate(all="ignore"):  # far outside the model's range the iteration may overflow; see `lost`
+        for _ in range(_ITERATIONS):
+            radial, dx, dy = _radial_tangential(x, y, distortion)
+            error = np.hypot(x * radial + dx - xd, y * radial + dy - yd)
+            if not (error >= _TOLERANCE).any():
+                break
+            x, y = (xd - dx) / radial, (yd - dy) / radial
+        lost = ~(error < 1e-3) | (radial <= 0)  # radial < 0: the ray is on the opposite side of the axis
+    x[lost] = y[lost] = np.nan
+    return x, y
+
+
+def _angle_polynomial(theta: NDArray[np.float64], distortion: tuple[float, ...]) -> NDArray[np.float64]:
+    k1, k2, k3, k4 = distortion or (0.0,) * 4
+    t2 = theta * theta
+    return theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+
+
+def _undistort_equidistant(
+    xd: NDArray[np.float64], yd: NDArray[np.float64], distortion: tuple[float, ...]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    k1, k2, k3, k4 = distortion or (0.0,) * 4
+    rd = np.hypot(xd, yd)
+    theta = rd.copy()
+    with np.errstate(all="ignore"):  # as above
+        for _ in range(_ITERATIONS):
+            t2 = theta * theta
+            slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
+            step = (_angle_polynomial(theta, distortion) - rd) / slope
+            theta = theta - step
+            if not (np.abs(step) >= _TOLERANCE).any():
+                break
+        lost = ~(np.abs(_angle_polynomial(theta, distortion) - rd) < 1e-3) | (theta >= math.pi / 2) | (theta < 0)
+        scale = np.where(rd > 0, np.tan(theta) / rd, 1.0)
+    scale[lost] = np.nan
+    return xd * scale, yd * scale

@@ -1,0 +1,1 @@
+"""A packet's bytes to complete windows of event counts."""

@@ -1,0 +1,1 @@
+"""iniVation's AEDAT 2.0 and AEDAT 4."""

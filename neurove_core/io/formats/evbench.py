@@ -1,0 +1,130 @@
+"""Recordings of eventVision-evbench (Barranco 2016): .mat files of four columns, and truth in a text beside them."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurove_core.geometry.motion import Twists
+from neurove_core.io.errors import BrokenRecording, UnknownSource
+from neurove_core.io.format import Format
+from neurove_core.io.formats.mat5 import MatFault, read_columns
+from neurove_core.io.recording import EventsOnly, in_chunks, refuse_topic, whole
+from neurove_protocol.errors import EventOutsideSensor, TimeBackwards
+from neurove_protocol.events import Events, Sensor, check_events
+
+DAVIS240B = Sensor(240, 180)
+"""What they were recorded with; of its columns 190 are used."""
+
+COLUMNS: Final = ("ts", "x", "y", "pol")
+MAX_COLUMN_BYTES: Final = 16 << 20
+"""A packed column can not be read in parts, so a longer one is refused; theirs have some 300,000 events of 7 bytes."""
+
+TRUTH: Final = "ground-truth_3Dcam.txt"
+FRAME_S: Final = 0.05
+"""What the truth counts rotation per: "approx. 50 ms"."""
+
+
+@dataclass(frozen=True, slots=True)
+class EvbenchRecording(EventsOnly):
+    """A .mat file of the columns ts [us], x, y, pol; see `Recording`.
+
+    Its y counts upwards, as jAER's does, and is turned over to be the image's. That it runs against the truth's axes
+    shows in the events: once turned over, their vertical flow has the sign of the truth's rotation about x.
+    """
+
+    path: Path
+    sensor: Sensor
+    streams: tuple[str, ...]
+    endless: bool = False
+
+    @classmethod
+    def open(cls, path: Path, sensor: Sensor | None = None) -> Self:
+        """The recording in this file.
+
+        Args:
+            path: the .mat file.
+            sensor: the pixel array; by default a DAVIS240b's.
+
+        Raises:
+            UnknownSource: the file is no MATLAB 5 file with these four columns, or a too long one.
+        """
+        columns = _columns(path)
+        if len({column.size for column in columns.values()}) != 1 or set(columns) != set(COLUMNS):
+            raise UnknownSource(path, f"it has not the columns {', '.join(COLUMNS)} of one length")
+        truth = ("twists",) if _rotation(path) is not None else ()
+        return cls(path, sensor or DAVIS240B, ("events", *truth))
+
+    @property
+    def name(self) -> str:
+        """The file's name."""
+        return self.path.name
+
+    def chunks(self) -> Iterator[Events]:
+        """All events from the beginning; see `Recording`. The whole file is read at once.
+
+        Raises:
+            BrokenRecording: an event is outside the sensor or earlier than the one before.
+        """
+        events = self._events()
+        try:
+            check_events(events, self.sensor)
+        except (EventOutsideSensor, TimeBackwards) as error:
+            good = whole(events, self.sensor, None)
+            yield from in_chunks(good)
+            raise BrokenRecording(self.path, f"event {good.n}", error.message) from None
+        yield from in_chunks(events)
+
+    def twists(self) -> Twists | None:
+        """The truth of ground-truth_3Dcam.txt beside the file, at the first event and the last; None without one.
+
+        Only the rotation about x is there; the rest is nan: the other rotations are at odds with the events and with
+        the log of the pan-tilt unit, and the unit of the translation is not told.
+        """
+        rotation = _rotation(self.path)
+        if rotation is None:
+            return None
+        t = self._events().t
+        twist = np.full((2, 6), np.nan)
+        twist[:, 3] = rotation / FRAME_S
+        return Twists(t[[0, -1]], twist) if t.size else None
+
+    def _events(self) -> Events:
+        columns = _columns(self.path)
+        t, x, y, p = (columns[name].astype(np.int64) for name in COLUMNS)
+        bad = (x < 0) | (y < 0) | (y >= self.sensor.height) | ((p != 0) & (p != 1))
+        if bad.any():  # told as an event outside: turned over, a y would else be a large one, and a polarity be lost
+            x = np.where(bad, np.iinfo(np.uint16).max, x)
+        return Events.from_columns(t, x.astype(np.uint16), np.maximum(self.sensor.height - 1 - y, 0), p & 1)
+
+
+def _columns(path: Path) -> dict[str, NDArray[Any]]:
+    try:
+        return read_columns(path, COLUMNS, MAX_COLUMN_BYTES)
+    except MatFault as fault:
+        raise UnknownSource(path, f"it can not be read as a MATLAB 5 file: {fault}") from None
+
+
+def _rotation(path: Path) -> float | None:
+    """The rotation about x per frame [rad] that the truth beside this file tells of it."""
+    truth = path.parent / TRUTH
+    if not truth.is_file():
+        return None
+    text = truth.read_bytes()[: 64 << 10].decode("ascii", "replace")
+    rotations = re.findall(r"rvec *= *(-?\d+\.\d+)", text)
+    known = dict(zip(re.findall(r"seq_\d+", text), rotations, strict=False))
+    sequence = re.match(r"seq_\d+", path.name)
+    found = known.get(sequence.group()) if sequence else None
+    return None if found is None else float(found)
+
+
+def _open(path: Path, sensor: Sensor | None, topic: str | None) -> EvbenchRecording:
+    refuse_topic(path, topic)
+    return EvbenchRecording.open(path, sensor)
+
+
+FORMAT = Format("FILE.mat (eventVision-evbench)", _open, (".mat",))

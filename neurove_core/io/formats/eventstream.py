@@ -1,0 +1,176 @@
+"""Event Stream files (.es, version 2): a header, then events of five bytes and bytes that only move the clock."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurove_core.compiled import compiled
+from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
+from neurove_core.io.format import Format
+from neurove_core.io.recording import BLOCK_BYTES, CHUNK_EVENTS, EventsOnly, empty_events, refuse_topic
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import Events, Sensor
+
+_MAGIC = b"Event Stream"
+_HEADER_BYTES = 20
+_TYPES = {0: "generic", 1: "DVS", 2: "ATIS", 3: "display", 4: "color"}
+DVS, ATIS = 1, 2
+EVENT_BYTES: Final = 5
+
+
+@dataclass(frozen=True, slots=True)
+class EventStreamRecording(EventsOnly):
+    """An .es file of DVS events, or of ATIS events, whose measurements of exposure are left out; see `Recording`.
+
+    The format's y counts upwards: its own converters turn over the y of a Prophesee camera, which counts downwards. So
+    it is turned over here too, to be the image's.
+
+    Source: github.com/neuromorphic-paris/event_stream, version 2.0.
+    """
+
+    path: Path
+    sensor: Sensor
+    kind: int
+    endless: bool = False
+
+    @classmethod
+    def open(cls, path: Path, sensor: Sensor | None = None) -> Self:
+        """The recording in this file.
+
+        Args:
+            path: the .es file.
+            sensor: its pixel array; overrides the header.
+
+        Raises:
+            UnknownSource: the file is not of version 2, or holds events of another type.
+            MissingGeometry: the header has no size that a sensor could have.
+            BrokenRecording: the file ends within its header.
+        """
+        with path.open("rb") as file:
+            header = file.read(_HEADER_BYTES)
+        if not header.startswith(_MAGIC[: len(header)]):
+            raise UnknownSource(path, "the file does not begin as Event Stream does")
+        if len(header) < _HEADER_BYTES:
+            raise BrokenRecording(path, f"byte {len(header)}", "the file ends within its header")
+        major, minor, _, kind = header[12:16]
+        if major != 2:
+            raise UnknownSource(path, f"it is Event Stream {major}.{minor}, version 2 can be read")
+        if kind not in (DVS, ATIS):
+            raise UnknownSource(path, f"its events are of type {kind} ({_TYPES.get(kind, 'unknown')})")
+        try:
+            width, height = np.frombuffer(header, "<u2", 2, 16).tolist()
+            return cls(path, sensor or Sensor(width, height), kind)
+        except InvalidField:
+            raise MissingGeometry(path) from None
+
+    @property
+    def name(self) -> str:
+        """The file's name."""
+        return self.path.name
+
+    def chunks(self) -> Iterator[Events]:
+        """All events from the beginning; see `Recording`. Times are counted from the start of the recording.
+
+        Raises:
+            BrokenRecording: an event is cut or outside the sensor; it names the byte.
+        """
+        at, t_us, rest = _HEADER_BYTES, 0, b""
+        with self.path.open("rb") as file:
+            file.seek(at)
+            while block := file.read(BLOCK_BYTES):
+                data = np.frombuffer(rest + block, np.uint8)
+                while True:
+                    out = empty_events(CHUNK_EVENTS)
+                    t_us, read, n, inside = es_decode(data, t_us, self.kind, self.sensor.width, self.sensor.height, out)
+                    if n:
+                        yield out.span(0, n)
+                    at, data = at + read, data[read:]
+                    if not inside:
+                        x, y = (int(number) for number in data[1:EVENT_BYTES].copy().view("<u2"))
+                        why = f"an event at x={x} y={y} (y upwards) lies outside the sensor {self.sensor}"
+                        raise BrokenRecording(self.path, f"byte {at}", why)
+                    if n < CHUNK_EVENTS:
+                        break
+                rest = data.tobytes()
+        if rest:
+            raise BrokenRecording(self.path, f"byte {at}", "the file ends within an event")
+
+
+@compiled
+def es_decode(
+    data: NDArray[np.uint8], t_us: int, kind: int, width: int, height: int, out: Events
+) -> tuple[int, int, int, bool]:  # pragma: no cover (machine code)
+    """Decode bytes until an event is cut, `out` is full, or an event is not on the sensor.
+
+    Args:
+        data: (N,) bytes from the first of an event on.
+        t_us: time of what was before them [us].
+        kind: DVS or ATIS.
+        width: of the sensor [px].
+        height: of the sensor [px].
+        out: columns of one length to write events into, y turned to count downwards.
+
+    Returns:
+        The time after the bytes read, how many were read, how many events lie in `out`, and whether the next event is
+        on the sensor as far as one knows.
+    """
+    t_out, x_out, y_out, p_out = out
+    shift, longest = (1, 127) if kind == DVS else (2, 63)  # a time that fits no event: as much of it as one byte tells
+    n, i = 0, 0
+    while i < data.size and n < t_out.size:
+        first = np.int64(data[i])
+        if first >> shift == longest:
+            t_us += longest * int(first & 1 if kind == DVS else first & 3)  # 0: a reset, which moves nothing
+            i += 1
+            continue
+        if i + EVENT_BYTES > data.size:
+            break
+        x = np.int64(data[i + 1]) | np.int64(data[i + 2]) << 8
+        y = np.int64(data[i + 3]) | np.int64(data[i + 4]) << 8
+        if kind == DVS or not first & 1:
+            if x >= width or y >= height:
+                return t_us, i, n, False
+            t_out[n], x_out[n], y_out[n] = t_us + (first >> shift), x, height - 1 - y
+            p_out[n] = first & 1 if kind == DVS else (first >> 1) & 1
+            n += 1
+        t_us += int(first >> shift)
+        i += EVENT_BYTES
+    return t_us, i, n, True
+
+
+def es_reference(
+    data: NDArray[np.uint8], t_us: int, kind: int, width: int, height: int
+) -> tuple[int, int, Events, bool]:
+    """The plain twin of `es_decode`, with room for any number of events: time, bytes read, events, verdict."""
+    rows: list[tuple[int, int, int, int]] = []
+    at, inside = 0, True
+    left = data.tobytes()
+    while left:
+        first = left[0]
+        overflow = {254: 0, 255: 127} if kind == DVS else {252: 0, 253: 63, 254: 126, 255: 189}
+        if first in overflow:
+            t_us, at, left = t_us + overflow[first], at + 1, left[1:]
+            continue
+        if len(left) < EVENT_BYTES:
+            break
+        x, y = int.from_bytes(left[1:3], "little"), int.from_bytes(left[3:5], "little")
+        step, change, p = (first >> 1, True, first & 1) if kind == DVS else (first >> 2, not first & 1, first >> 1 & 1)
+        if change and (x >= width or y >= height):
+            inside = False
+            break
+        t_us, at, left = t_us + step, at + EVENT_BYTES, left[EVENT_BYTES:]
+        if change:
+            rows.append((t_us, x, height - 1 - y, p))
+    return t_us, at, Events.from_columns(*(zip(*rows, strict=True) if rows else [()] * 4)), inside
+
+
+def _open(path: Path, sensor: Sensor | None, topic: str | None) -> EventStreamRecording:
+    refuse_topic(path, topic)
+    return EventStreamRecording.open(path, sensor)
+
+
+FORMAT = Format("FILE.es (Event Stream)", _open, (".es",))

@@ -1,0 +1,1 @@
+"""Recordings in HDF5: MVSEC, DSEC, M3ED."""

@@ -1,0 +1,144 @@
+"""HDF5 files: opened with the filters that event data sets use, their data sets checked, read in rows."""
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurove_core.extras import MissingExtra
+from neurove_core.io.errors import BrokenRecording, UnknownSource
+
+MAX_CHUNK_BYTES: Final = 64 << 20
+"""Largest chunk that a data set may be stored in: HDF5 unpacks a chunk as a whole, so this bounds the memory."""
+
+_MAGIC = b"\x89HDF\r\n\x1a\n"
+_CACHE_BYTES = 16 << 20  # per data set; the default of 1 MiB unpacks larger chunks again for every block read
+FAULTS = (OSError, RuntimeError, KeyError, ValueError, TypeError, MemoryError, OverflowError)
+"""What h5py raises over the bytes of a file; it has no class of its own for that."""
+
+Column = NDArray[Any]
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """The file for reading, as an h5py.File; the filters of hdf5plugin (Blosc, Zstd and others) are known to it.
+
+    Raises:
+        MissingExtra: h5py or hdf5plugin is not installed.
+        UnknownSource: it is no HDF5 file.
+        BrokenRecording: it is one, but cut or garbled.
+    """
+    h5py = library()
+    with path.open("rb") as file:
+        head = file.read(len(_MAGIC))
+    if not head or not _MAGIC.startswith(head):
+        raise UnknownSource(path, "the file does not begin as HDF5 does")
+    try:
+        opened_file = h5py.File(path, "r", rdcc_nbytes=_CACHE_BYTES, locking="best-effort")
+    except FAULTS as error:
+        cut = re.search(r"eof = (\d+),.*stored_eof = (\d+)", str(error))
+        where, why = (cut[1], f"the file ends here, and should at byte {cut[2]}") if cut else ("0", str(error))
+        raise BrokenRecording(path, f"byte {where}", why) from None
+    with opened_file as file:
+        yield file
+
+
+def library() -> Any:
+    """The h5py module.
+
+    Raises:
+        MissingExtra: it or hdf5plugin is not installed.
+    """
+    for name in ("hdf5plugin", "h5py"):
+        try:
+            module = import_module(name)
+        except ImportError:
+            raise MissingExtra(name, "recordings") from None
+    return module
+
+
+def has(file: Any, *names: str) -> bool:
+    """Whether all of these are in the file; of what is too broken to tell, no."""
+    try:
+        return all(name in file for name in names)
+    except FAULTS:
+        return False
+
+
+def dataset(path: Path, file: Any, name: str, *tail: int) -> Any:
+    """A table of numbers: the h5py.Dataset of shape (N, *tail), its rows not yet read.
+
+    Raises:
+        BrokenRecording: it is not there, is no such table, or is stored in chunks above MAX_CHUNK_BYTES.
+    """
+    try:
+        found = file[name]
+        shape, kind, width = tuple(found.shape), found.dtype.kind, found.dtype.itemsize
+        missing = found.size and not found.is_virtual and not found.id.get_storage_size()
+        chunk_bytes = int(np.prod(found.chunks or (0,), dtype=np.float64)) * width
+    except (*FAULTS, AttributeError) as error:
+        raise BrokenRecording(path, name, f"it can not be read: {error}") from None
+    numbers = kind in "biu" or (kind == "f" and width in (4, 8))  # numpy's linear algebra knows no other floats
+    if len(shape) != 1 + len(tail) or shape[1:] != tail or not numbers:
+        want = ", ".join(["N", *map(str, tail)])
+        raise BrokenRecording(path, name, f"numbers of shape ({want}) are expected, not {found.dtype} of {shape}")
+    if chunk_bytes > MAX_CHUNK_BYTES:
+        why = f"it is stored in chunks of {chunk_bytes} bytes; at most {MAX_CHUNK_BYTES} are read at once"
+        raise BrokenRecording(path, name, why)
+    if missing:  # HDF5 would hand out zeros for as many rows as the header claims
+        raise BrokenRecording(path, name, f"its {shape[0]} rows were never written")
+    return found
+
+
+def value(path: Path, file: Any, name: str) -> Any:
+    """A small thing as a whole: a number, an array, or a text as str.
+
+    Raises:
+        BrokenRecording: it is not there, can not be read, or is not small.
+    """
+    try:
+        found = file[name]
+        if found.size > 1000:
+            raise ValueError(f"it has {found.size} entries")
+        got = found[()]
+    except (*FAULTS, AttributeError) as error:
+        raise BrokenRecording(path, name, f"it can not be read: {error}") from None
+    return got.decode("utf-8", "backslashreplace") if isinstance(got, bytes) else got
+
+
+def read_rows(columns: Sequence[Any], first: int, stop: int) -> tuple[list[Column], str]:
+    """Rows [first, stop) of all columns, or those before the first that can not be read, and why it can not.
+
+    By halves: h5py tells neither which row failed nor what it had read by then.
+    """
+    try:
+        return [column[first:stop] for column in columns], ""
+    except FAULTS as error:
+        if stop - first <= 1:
+            return [np.empty((0, *column.shape[1:]), column.dtype) for column in columns], str(error)
+    middle = (first + stop) // 2
+    head, why = read_rows(columns, first, middle)
+    if why:
+        return head, why
+    tail, why = read_rows(columns, middle, stop)
+    return [np.concatenate(parts) for parts in zip(head, tail, strict=True)], why
+
+
+def all_rows(path: Path, name: str, columns: Sequence[Any]) -> list[Column]:
+    """All rows of columns that are one table of a known small size.
+
+    Raises:
+        BrokenRecording: a row can not be read, or the columns are not of one length.
+    """
+    lengths = [int(column.shape[0]) for column in columns]
+    rows, why = read_rows(columns, 0, min(lengths))
+    if why:
+        raise BrokenRecording(path, f"row {len(rows[0])} of {name}", why)
+    if max(lengths) > min(lengths):
+        raise BrokenRecording(path, f"row {min(lengths)} of {name}", f"its columns are of unequal length: {lengths}")
+    return rows

@@ -1,0 +1,136 @@
+"""Our own recordings: MCAP with the profile `neurove`, which every MCAP tool can list and cut.
+
+A stream has up to seven channels, named `<stream>/<kind>`, message encoding `msgpack`:
+
+| kind | schema | a message |
+| --- | --- | --- |
+| events | neurove.events.1 | an EventPacket, bit for bit as it was published |
+| camera | neurove.camera.1 | a CameraInfo, bit for bit as it was published |
+| imu | neurove.imu.1 | up to 4096 samples: columns `t`, `accel_m_s2`, `gyro_rad_s` |
+| triggers | neurove.triggers.1 | edges: `t`, `channel`, `level` |
+| poses | neurove.poses.1 | `t`, `position_m`, `orientation` |
+| twists | neurove.twists.1 | `t`, `twist` |
+| frames | neurove.frames.1 | one image: `t_us`, `height`, `width`, `channels`, `image` (bytes, row by row) |
+
+Columns are those of the types of the same names in `recording` and `geometry`, units and all: a msgpack map of `v` (1),
+`n` (rows) and, for each column, its numbers as bytes, little-endian, row by row. The log time of what was recorded live
+is when it was received [unix ns]; of what was converted it is the sensor's own time [ns]. Metadata `neurove` tells what
+was recorded and from where.
+"""
+
+from collections.abc import Mapping
+from typing import Any, Final, NamedTuple
+
+import msgpack
+import numpy as np
+
+from neurove_core.geometry.motion import Poses, Twists
+from neurove_core.io.recording import Frame, Imu, Triggers
+from neurove_protocol import camera, events
+
+PROFILE: Final = "neurove"
+VERSION: Final = 1
+ROWS: Final = 4096
+"""Most rows of columns in one message."""
+
+
+class Column(NamedTuple):
+    """How one column is stored."""
+
+    name: str
+    dtype: str
+    width: int  # numbers in a row
+
+
+_T = Column("t", "<i8", 1)
+COLUMNS: Final[dict[str, tuple[Column, ...]]] = {
+    "imu": (_T, Column("accel_m_s2", "<f8", 3), Column("gyro_rad_s", "<f8", 3)),
+    "triggers": (_T, Column("channel", "u1", 1), Column("level", "u1", 1)),
+    "poses": (_T, Column("position_m", "<f8", 3), Column("orientation", "<f8", 4)),
+    "twists": (_T, Column("twist", "<f8", 6)),
+}
+TYPES: Final[dict[str, type[Imu] | type[Triggers] | type[Poses] | type[Twists]]] = {
+    "imu": Imu,
+    "triggers": Triggers,
+    "poses": Poses,
+    "twists": Twists,
+}
+
+
+class BadColumns(Exception):
+    """A message does not hold the columns that it should."""
+
+
+def schema_of(kind: str) -> tuple[str, str]:
+    """Name and message encoding of a kind's channel: for packets those of the wire.
+
+    >>> schema_of("events")
+    ('neurove.events.1', 'msgpack')
+    """
+    wire = {"events": events.SCHEMA, "camera": camera.SCHEMA}.get(kind, f"application/msgpack;neurove.{kind}.{VERSION}")
+    encoding, _, name = wire.partition(";")
+    return name, encoding.removeprefix("application/")
+
+
+def pack_columns(kind: str, table: Imu | Triggers | Poses | Twists) -> bytes:
+    """One message of a table's rows."""
+    fields: dict[str, Any] = {"v": VERSION, "n": int(table.t.size)}
+    for column in COLUMNS[kind]:
+        fields[column.name] = np.ascontiguousarray(getattr(table, column.name), column.dtype).tobytes()
+    return bytes(msgpack.packb(fields))
+
+
+def unpack_columns(kind: str, data: bytes) -> Any:
+    """The table that a message holds.
+
+    Raises:
+        BadColumns: it does not.
+    """
+    fields = _fields(data)
+    n = fields.get("n")
+    if type(n) is not int or n < 0:
+        raise BadColumns(f"n={n!r} is no number of rows")
+    columns = []
+    for name, dtype, width in COLUMNS[kind]:
+        blob = fields.get(name)
+        if not isinstance(blob, bytes) or len(blob) != n * width * np.dtype(dtype).itemsize:
+            raise BadColumns(f"column {name} does not have {n} rows")
+        column = np.frombuffer(blob, dtype)
+        columns.append(column.reshape(n, width) if width > 1 else column)
+    return TYPES[kind](*columns)
+
+
+def pack_frame(frame: Frame) -> bytes:
+    """One message of an image."""
+    height, width, *channels = frame.image.shape
+    image = np.ascontiguousarray(frame.image, np.uint8).tobytes()
+    shape = {"height": height, "width": width, "channels": channels[0] if channels else 1}
+    return bytes(msgpack.packb({"v": VERSION, "t_us": int(frame.t_us), **shape, "image": image}))
+
+
+def unpack_frame(data: bytes) -> Frame:
+    """The image that a message holds.
+
+    Raises:
+        BadColumns: it does not.
+    """
+    fields = _fields(data)
+    numbers = [fields.get(name) for name in ("t_us", "height", "width", "channels")]
+    image = fields.get("image")
+    if not all(type(number) is int for number in numbers) or not isinstance(image, bytes):
+        raise BadColumns("it is no image")
+    t_us, height, width, channels = (int(number or 0) for number in numbers)
+    if channels not in (1, 3) or min(height, width) < 0 or len(image) != height * width * channels:
+        raise BadColumns(f"its {len(image)} bytes are no image of {width}x{height}x{channels}")
+    shape = (height, width) if channels == 1 else (height, width, channels)
+    return Frame(t_us, np.frombuffer(image, np.uint8).reshape(shape))
+
+
+def _fields(data: bytes) -> Mapping[str, Any]:
+    try:
+        fields = msgpack.unpackb(data)
+    except (ValueError, TypeError, msgpack.UnpackException) as error:
+        raise BadColumns(str(error) or type(error).__name__) from None
+    if not isinstance(fields, dict) or fields.get("v") != VERSION:
+        raise BadColumns("it is no table of version 1")
+    return fields

@@ -1,0 +1,198 @@
+"""Writing our own recordings: packets as they were published, or any recording cut into packets."""
+
+import contextlib
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, Self
+
+import numpy as np
+
+from neurove_core.extras import MissingExtra
+from neurove_core.io.formats.packet_log import layout
+from neurove_core.io.packets import slices
+from neurove_core.io.recording import Recording
+from neurove_protocol.camera import CameraInfo
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import EventPacket, encode_packet
+from neurove_protocol.keys import check_name
+
+CHUNK_BYTES: Final = 1 << 20
+"""So much is compressed at once, and lost at most where the machine fails."""
+
+PART: Final = ".part"
+"""What a file's name ends in until it is whole."""
+
+Progress = Callable[[int, int], None]
+"""Events written so far, and the sensor time that was reached [us]."""
+
+
+class PacketWriter:
+    """Writes one recording; it appears under its name when it is closed, whole, and not before.
+
+    Use it in a `with` block: an error inside leaves nothing behind. Memory holds one chunk, and of each chunk written
+    its place in the index, some 100 bytes.
+
+    Args:
+        path: the file, ending in .mcap; one of the same name is replaced.
+
+    Raises:
+        InvalidField: here or while writing: the file can not be written. MissingExtra: the mcap package is not here.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            from mcap.writer import CompressionType, Writer
+        except ModuleNotFoundError:
+            raise MissingExtra("mcap", "recordings") from None
+        if path.suffix != ".mcap":
+            raise InvalidField("recording", "FILE", str(path), "its name must end in .mcap")
+        self.path, self._part = path, path.with_name(path.name + PART)
+        with self._told():
+            try:
+                self._file = self._part.open("xb")
+            except FileExistsError:
+                why = "a recording that was cut short lies there, or is being written: rename or remove it"
+                raise InvalidField("recording", "FILE", str(self._part), why) from None
+        self._writer: Any = Writer(self._file, CHUNK_BYTES, CompressionType.ZSTD)
+        self._writer.start(layout.PROFILE, "neurove")
+        self._channels: dict[str, int] = {}
+        self._schemas: dict[str, int] = {}
+        self._count: dict[int, int] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is None:
+            self.close()
+        else:
+            self.abandon()
+
+    def write(self, stream: str, payload: bytes, received_ns: int) -> None:
+        """Add an event packet as it was published.
+
+        Args:
+            stream: whose it is.
+            payload: its bytes, not looked at.
+            received_ns: when it came [unix ns].
+        """
+        self.add(stream, "events", payload, received_ns)
+
+    def camera(self, payload: bytes, received_ns: int = 0) -> None:
+        """Add a CameraInfo as it was published; it names its own stream.
+
+        Raises:
+            NeuroVEError: it is none.
+        """
+        self.add(CameraInfo.decode(payload).stream, "camera", payload, received_ns)
+
+    def add(self, stream: str, kind: str, payload: bytes, log_ns: int) -> None:
+        """Add a message of any kind of `mcap_layout`."""
+        with self._told():
+            topic = f"{check_name('stream', stream)}/{kind}"
+            if topic not in self._channels:
+                self._channels[topic] = self._registered(topic, kind)
+            channel = self._channels[topic]
+            number = self._count[channel] = self._count.get(channel, 0) + 1
+            log_ns = max(0, log_ns)
+            self._writer.add_message(channel, log_ns, payload, log_ns, number & 0xFFFFFFFF)
+
+    def _registered(self, topic: str, kind: str) -> int:
+        name, encoding = layout.schema_of(kind)
+        if name not in self._schemas:
+            self._schemas[name] = self._writer.register_schema(name, "", b"")
+        return int(self._writer.register_channel(topic, encoding, self._schemas[name]))
+
+    def about(self, **told: object) -> None:
+        """Note what was recorded, and from where, as text."""
+        with self._told():
+            self._writer.add_metadata(layout.PROFILE, {name: str(value) for name, value in told.items()})
+
+    @property
+    def bytes_written(self) -> int:
+        """How long the file is by now."""
+        return self._file.tell()
+
+    def close(self) -> None:
+        """Finish the file and give it its name."""
+        try:
+            with self._told():
+                self._writer.finish()
+                self._file.flush()
+                os.fsync(self._file.fileno())
+                self._file.close()
+                self._part.replace(self.path)
+        except BaseException:
+            self.abandon()
+            raise
+
+    def abandon(self) -> None:
+        """Leave nothing behind."""
+        with contextlib.suppress(OSError):
+            self._file.close()
+        self._part.unlink(missing_ok=True)
+
+    @contextlib.contextmanager
+    def _told(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise InvalidField("recording", "FILE", str(self.path), error.strerror or str(error)) from None
+
+
+def write_mcap(recording: Recording, path: Path, stream: str = "cam0", progress: Progress | None = None) -> int:
+    """Write a recording as ours: packets as the driver would send them, and all that lies beside the events.
+
+    Args:
+        recording: what to write; it must have an end.
+        path: the file, ending in .mcap.
+        stream: what to call it.
+        progress: told after each packet.
+
+    Returns:
+        how many events were written.
+
+    Raises:
+        InvalidField: the recording is endless, or the file can not be written.
+        BrokenRecording: the recording is broken; nothing is left under the path.
+    """
+    if recording.endless:
+        raise InvalidField("recording", "source", recording.name, "it has no end")
+    events = 0
+    with PacketWriter(path) as writer:
+        camera = recording.camera(stream)
+        if camera is not None:
+            writer.camera(camera.encode())
+        for seq, piece in enumerate(slices(recording.chunks())):
+            packet = EventPacket(stream, seq, recording.sensor, piece.t0_us, piece.events)
+            writer.write(stream, encode_packet(packet), piece.end_us * 1000)
+            events += piece.events.n
+            if progress:
+                progress(events, piece.end_us)
+        _write_beside(recording, stream, writer)
+        writer.about(source=recording.name, stream=stream, events=events)
+    return events
+
+
+def _write_beside(recording: Recording, stream: str, writer: PacketWriter) -> None:
+    for imu in recording.imu():
+        _write_rows(writer, stream, "imu", imu)
+    for triggers in recording.triggers():
+        _write_rows(writer, stream, "triggers", triggers)
+    poses, twists = recording.poses(), recording.twists()
+    if poses is not None:
+        _write_rows(writer, stream, "poses", poses)
+    if twists is not None:
+        _write_rows(writer, stream, "twists", twists)
+    for frame in recording.frames():
+        writer.add(stream, "frames", layout.pack_frame(frame), frame.t_us * 1000)
+
+
+def _write_rows(writer: PacketWriter, stream: str, kind: str, table: Any) -> None:
+    for first in range(0, table.t.size, layout.ROWS):
+        rows = type(table)(*(np.asarray(column)[first : first + layout.ROWS] for column in table))
+        writer.add(stream, kind, layout.pack_columns(kind, rows), int(rows.t[0]) * 1000)

@@ -1,0 +1,145 @@
+"""Prophesee .dat files: a text header, two bytes that tell what follows, then records of 8 bytes."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurove_core.io.clock import count_on
+from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
+from neurove_core.io.format import Format
+from neurove_core.io.formats.prophesee.raw import HEADER_BYTES, parse_header
+from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Triggers, in_chunks, later, refuse_topic, whole
+from neurove_protocol.errors import EventOutsideSensor, TimeBackwards
+from neurove_protocol.events import Events, Sensor, check_events
+
+RECORD = np.dtype([("t", "<u4"), ("bits", "<u4")])
+_EVENTS, _TRIGGERS = (0x00, 0x0C), (0x0E,)
+SEEK_RECORDS = 4096
+"""Distance of the records whose time is looked at to find a time in the file."""
+
+
+@dataclass(frozen=True, slots=True)
+class DatRecording(EventsOnly):
+    """A .dat file of events, or one of triggers, which has no events; see `Recording`."""
+
+    path: Path
+    sensor: Sensor
+    kind: int  # of its records
+    start: int  # byte of the first record
+    endless: bool = False
+
+    @classmethod
+    def open(cls, path: Path, sensor: Sensor | None = None) -> Self:
+        """The recording in this file.
+
+        Args:
+            path: the .dat file.
+            sensor: its pixel array; overrides the header.
+
+        Raises:
+            UnknownSource: its records are neither events nor triggers of 8 bytes.
+            MissingGeometry: the header does not tell the sensor's size and `sensor` does not either.
+            BrokenRecording: the file ends within its header.
+        """
+        with path.open("rb") as file:
+            head = file.read(HEADER_BYTES)
+        header = parse_header(path, head)
+        kind_and_size = head[header.size : header.size + 2]
+        if len(kind_and_size) < 2:
+            raise BrokenRecording(path, f"byte {len(head)}", "the file ends within its header")
+        kind, size = kind_and_size
+        if kind not in _EVENTS + _TRIGGERS or size != RECORD.itemsize:
+            raise UnknownSource(path, f"its records are of type 0x{kind:02x} and {size} bytes")
+        sensor = sensor or header.sensor
+        if sensor is None:
+            raise MissingGeometry(path)
+        return cls(path, sensor, kind, header.size + 2)
+
+    @property
+    def name(self) -> str:
+        """The file's name."""
+        return self.path.name
+
+    @property
+    def streams(self) -> tuple[str, ...]:
+        """Events or triggers: a file holds one of them."""
+        return ("triggers",) if self.kind in _TRIGGERS else ("events",)
+
+    def chunks(self) -> Iterator[Events]:
+        """All events from the beginning; see `Recording`. The 32-bit clock wraps every 71.6 min and is counted on.
+
+        Raises:
+            BrokenRecording: a record is cut, outside the sensor, or earlier than the one before; it names the byte.
+        """
+        return self._events(0, 0)
+
+    def since(self, t_us: int) -> Iterator[Events]:
+        """As `chunks`, from this time on, by bisection.
+
+        Looks at the time of every SEEK_RECORDS-th record; where so many events took longer than the 71.6 min of a wrap
+        of the clock, the wrap goes unseen.
+        """
+        n = (self.path.stat().st_size - self.start) // RECORD.itemsize
+        if n <= 0:
+            return self.chunks()
+        records = np.memmap(self.path, RECORD, "r", self.start, (n,))
+        times, _ = count_on(np.array(records["t"][::SEEK_RECORDS]), 0)
+        sample = max(int(times.searchsorted(t_us)) - 1, 0)
+        return later(self._events(sample * SEEK_RECORDS, int(times[sample])), t_us)
+
+    def triggers(self) -> Iterator[Triggers]:
+        """The trigger edges of a file of triggers; see `Recording`.
+
+        Raises:
+            BrokenRecording: a record is cut, or earlier than the one before.
+        """
+        if self.kind not in _TRIGGERS:
+            return
+        for at, t, bits in self._blocks(0, 0):
+            back = np.flatnonzero(t[1:] < t[:-1])
+            n = int(back[0]) + 1 if back.size else t.size
+            if n:
+                yield Triggers(t[:n], (bits[:n] >> 8 & 0x1F).astype(np.uint8), (bits[:n] & 1).astype(np.uint8))
+            if back.size:
+                raise BrokenRecording(self.path, f"byte {at + n * RECORD.itemsize}", "time runs backwards")
+
+    def _events(self, first: int, before_us: int) -> Iterator[Events]:
+        """The events from record number `first` on, given the time of it or of an earlier one."""
+        if self.kind not in _EVENTS:
+            return
+        not_before_us = None
+        for at, t, bits in self._blocks(first, before_us):
+            events = Events.from_columns(t, bits & 0x3FFF, bits >> 14 & 0x3FFF, bits >> 28 & 1)
+            try:
+                check_events(events, self.sensor, not_before_us)
+            except (EventOutsideSensor, TimeBackwards) as error:
+                good = whole(events, self.sensor, not_before_us)
+                yield from in_chunks(good)
+                raise BrokenRecording(self.path, f"byte {at + good.n * RECORD.itemsize}", error.message) from None
+            yield from in_chunks(events)
+            not_before_us = int(t[-1]) if t.size else not_before_us
+
+    def _blocks(self, first: int, before_us: int) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.uint32]]]:
+        """Some BLOCK_BYTES of records at a time: the byte where they begin, their times [us] and their other word."""
+        at = self.start + first * RECORD.itemsize
+        with self.path.open("rb") as file:
+            file.seek(at)
+            while block := file.read(BLOCK_BYTES):
+                records = np.frombuffer(block, RECORD, len(block) // RECORD.itemsize)
+                t, before_us = count_on(records["t"], before_us)
+                yield at, t, records["bits"]
+                at += records.nbytes
+                if len(block) % RECORD.itemsize:
+                    raise BrokenRecording(self.path, f"byte {at}", "the file ends within a record")
+
+
+def _open(path: Path, sensor: Sensor | None, topic: str | None) -> DatRecording:
+    refuse_topic(path, topic)
+    return DatRecording.open(path, sensor)
+
+
+FORMAT = Format("FILE.dat (Prophesee DAT)", _open, (".dat",))

@@ -1,0 +1,1 @@
+"""Event cameras in ROS 1 and ROS 2 bags."""

@@ -1,0 +1,345 @@
+"""Model bundle: one safetensors file. Its header holds configuration, units and provenance; its sha256 is its digest.
+
+Nothing is unpickled. A file is checked before it is used: its size, its header, the names, shapes and types of all
+tensors for the architecture that the header declares, and that all values are finite.
+"""
+
+import hashlib
+import json
+import struct
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final, Literal, Self
+
+import safetensors.torch
+import torch
+from pydantic import Field, ValidationError, ValidationInfo, field_validator
+from safetensors import SafetensorError
+from torch import Tensor, nn
+
+from neurove_core.config import Config, ModelConfig
+from neurove_core.files import write_atomically
+from neurove_core.models import golden
+from neurove_core.models.golden import Golden
+from neurove_core.models.metadata import BundleLimits, Metadata
+from neurove_core.models.uncertainty import Uncertainty, why_no_correlation
+from neurove_core.networks import kinds
+from neurove_core.networks.kinds import Network
+from neurove_core.networks.neurove import NeuroVE
+from neurove_protocol.control import ModelInfo
+from neurove_protocol.errors import BadModel, shown
+from neurove_protocol.fields import WrongField
+
+BUNDLE_VERSION: Final = 1
+SUFFIX = ".safetensors"
+MAX_BYTES = 256 << 20
+MAX_HEADER_BYTES = 1 << 20
+MAX_TENSORS = 4096
+
+LinearUnit = Literal["m/s", "1/s per m of height"]
+METRIC: Final[LinearUnit] = "m/s"
+PER_HEIGHT: Final[LinearUnit] = "1/s per m of height"
+
+_KEY = "neurove"
+_OFFSET, _SCALE, _CORRELATION = "output.offset", "output.scale", "output.correlation"
+
+
+class UncertaintyHeader(Config):
+    """Present if a bundle has a spread (tensors spread.weight, spread.bias, output.correlation): its calibration."""
+
+    uncertain_above: float = Field(gt=0, description="An estimate is uncertain above this linear sigma / speed.")
+    provenance: str = Field(max_length=1000, description="One line: how the model was calibrated.")
+
+
+class Header(Metadata):
+    """The header of a bundle: JSON in the metadata of the safetensors file."""
+
+    bundle_version: int = BUNDLE_VERSION
+    name: str = Field(min_length=1, max_length=64, pattern="^[A-Za-z0-9_][A-Za-z0-9_.-]*$")
+    trained: bool
+    provenance: str = Field(max_length=1000, description="One line: how the model was made.")
+    config: ModelConfig
+    linear_unit: LinearUnit = Field(
+        METRIC, description="Unit of the linear part: m/s, or per metre of the camera's height above the ground."
+    )
+    golden_tolerance: float | None = Field(
+        None, gt=0, le=1, description="Tolerance of the golden test, if there is one."
+    )
+    uncertainty: UncertaintyHeader | None = Field(None, description="Calibration of the uncertainty, if there is one.")
+
+    @field_validator("uncertainty")
+    @classmethod
+    def _of_a_neurove(cls, value: UncertaintyHeader | None, info: ValidationInfo) -> UncertaintyHeader | None:
+        config = info.data.get("config")
+        if value is not None and config is not None and config.kind != "neurove":
+            raise ValueError(f"a network of kind={config.kind!r} has no uncertainty")
+        return value
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A model in memory."""
+
+    name: str
+    trained: bool
+    provenance: str
+    config: ModelConfig
+    network: Network
+    offset: Tensor  # (6): twist = network output * scale + offset, in linear_unit and rad/s
+    scale: Tensor  # (6)
+    linear_unit: LinearUnit = METRIC
+    metadata: Metadata = field(default_factory=Metadata)
+    golden: Golden | None = None  # None: the self-test has nothing to compare and passes
+    uncertainty: Uncertainty | None = None  # if present, the network has a spread
+    digest: str = ""  # sha256 of the bundle's bytes, hex
+
+    @property
+    def info(self) -> ModelInfo:
+        """What a node reports about this model."""
+        parameters = sum(parameter.numel() for parameter in self.network.parameters())
+        return ModelInfo(
+            name=self.name,
+            digest=self.digest,
+            trained=self.trained,
+            provenance=self.provenance,
+            parameters=parameters,
+            release=self.release,
+            figures=self.metadata.figures,
+        )
+
+    @property
+    def release(self) -> int:
+        """Release counter of this model."""
+        return self.metadata.release
+
+    @property
+    def prime_windows(self) -> int:
+        """Number of recent windows that a stream replays until the estimates of this model are settled."""
+        windows = self.metadata.prime_windows
+        return self.config.settle_windows if windows is None else windows
+
+    @property
+    def limits(self) -> BundleLimits:
+        """Largest allowed differences from the model it replaces."""
+        return self.metadata.limits or BundleLimits()
+
+    def to_bytes(self) -> bytes:
+        """The bundle as the bytes of its file."""
+        header = Header(
+            name=self.name,
+            trained=self.trained,
+            provenance=self.provenance,
+            config=self.config,
+            linear_unit=self.linear_unit,
+            golden_tolerance=self.golden.tolerance if self.golden else None,
+            uncertainty=self.uncertainty
+            and UncertaintyHeader(
+                uncertain_above=self.uncertainty.uncertain_above, provenance=self.uncertainty.provenance
+            ),
+            **dict(self.metadata),
+        )
+        omitted = Metadata.model_fields.keys() - self.metadata.non_default_fields()
+        if self.golden is None:
+            omitted |= {"golden_tolerance"}
+        if self.uncertainty is None:
+            omitted |= {"uncertainty"}
+        tensors = {**_stored(self.network), _OFFSET: self.offset, _SCALE: self.scale}
+        if self.golden:
+            tensors |= golden.to_tensors(self.golden)
+        if self.uncertainty is not None:
+            tensors[_CORRELATION] = self.uncertainty.correlation
+        return safetensors.torch.save(tensors, {_KEY: header.model_dump_json(exclude=omitted)})
+
+    def with_digest(self) -> Self:
+        """This bundle with its digest computed."""
+        return replace(self, digest=hashlib.sha256(self.to_bytes()).hexdigest())
+
+
+def save(bundle: Bundle, path: Path) -> None:
+    """Write a bundle's file atomically: an existing file stays until the new one is complete."""
+    write_atomically(path, bundle.to_bytes())
+
+
+def load(path: Path) -> Bundle:
+    """Read and check a bundle's file.
+
+    Raises:
+        BadModel: the file is missing, damaged, of another format, or does not match its header; the message says why.
+    """
+    try:
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise BadModel(path.name, f"size={size}: a bundle has at most {MAX_BYTES} bytes")
+        data = path.read_bytes()
+    except OSError as error:
+        raise BadModel(path.name, error.strerror or str(error)) from None
+    return from_bytes(data, path.name)
+
+
+def from_bytes(data: bytes, name: str) -> Bundle:
+    """Check and load a bundle from its bytes.
+
+    Args:
+        data: the bytes of the file.
+        name: of the file, for errors.
+
+    Raises:
+        BadModel: as `load`.
+    """
+    header = read_header(data, name)
+    try:
+        tensors = safetensors.torch.load(data)
+    except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:
+        # the last two types: a tensor without elements may declare sizes that exceed torch's integers
+        raise BadModel(name, f"not a complete safetensors file: {error}") from None
+    test = golden.from_tensors(tensors, header.config, header.golden_tolerance, name)
+    with torch.device("meta"):  # shapes without memory: a small header may declare terabytes of weights
+        wanted = {**_stored(_network(header)), _OFFSET: torch.zeros(6), _SCALE: torch.ones(6)}
+        if header.uncertainty is not None:
+            wanted[_CORRELATION] = torch.eye(6)
+    _check_tensors(tensors, wanted, name)
+    network = _network(header)
+    offset, scale = tensors.pop(_OFFSET), tensors.pop(_SCALE)
+    uncertainty = _uncertainty(header.uncertainty, tensors.pop(_CORRELATION, None), name)
+    network.load_state_dict(tensors, strict=False)  # names are checked; only the norms' batch counters are not stored
+    return Bundle(
+        name=header.name,
+        trained=header.trained,
+        provenance=header.provenance,
+        config=header.config,
+        network=network.eval(),
+        offset=offset,
+        scale=scale,
+        linear_unit=header.linear_unit,
+        metadata=Metadata(**{name: getattr(header, name) for name in Metadata.model_fields}),
+        golden=test,
+        uncertainty=uncertainty,
+        digest=hashlib.sha256(data).hexdigest(),
+    )
+
+
+def read_header(data: bytes, name: str) -> Header:
+    """Read and check the header in a bundle's bytes.
+
+    Args:
+        data: the bytes of the file.
+        name: of the file, for errors.
+
+    Raises:
+        BadModel: as `load`.
+    """
+    if len(data) < 8:
+        raise BadModel(name, f"size={len(data)}: not a safetensors file")
+    (length,) = struct.unpack("<Q", data[:8])
+    if length > min(MAX_HEADER_BYTES, len(data) - 8):
+        raise BadModel(
+            name, f"header length {length}: not a safetensors file, or a header over {MAX_HEADER_BYTES} bytes"
+        )
+    try:
+        entries = json.loads(data[8 : 8 + length], object_pairs_hook=object_without_duplicates)
+        own = entries["__metadata__"][_KEY]
+        fields = json.loads(own, object_pairs_hook=object_without_duplicates)
+    except (KeyError, TypeError):
+        raise BadModel(
+            name, "a safetensors file, but not a NeuroVE bundle: its header has no 'neurove' entry"
+        ) from None
+    except (ValueError, RecursionError) as error:
+        raise BadModel(name, f"its header cannot be read: {error}") from None
+    if len(entries) > MAX_TENSORS + 1:
+        raise BadModel(name, f"{len(entries) - 1} tensors: at most {MAX_TENSORS}")
+    version = fields.get("bundle_version") if isinstance(fields, dict) else None
+    if version != BUNDLE_VERSION:
+        raise BadModel(name, f"bundle_version={shown(version)}: this program reads version {BUNDLE_VERSION}")
+    try:
+        return Header.model_validate(fields)
+    except ValidationError as error:
+        wrong = WrongField.of(error)
+        raise BadModel(name, f"header{' field' if wrong.path else ':'} {wrong.sentence}") from None
+
+
+def untrained(seed: int = 0, config: ModelConfig | None = None, name: str = "untrained") -> Bundle:
+    """A model with random weights: it runs like a trained one, but its estimates mean nothing.
+
+    The norms have the statistics of random input, so that neurons fire. The same seed gives the same model on one
+    machine and torch version.
+
+    Args:
+        seed: of the weights.
+        config: of the model; the default is ModelConfig().
+        name: of the model.
+    """
+    config = config or ModelConfig()
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        network = kinds.make(config)
+        shape = (8, 4, 2 * config.window.bins, config.canonical.height, config.canonical.width)
+        _take_statistics(network, torch.poisson(torch.full(shape, 0.3)).log1p())
+    return Bundle(
+        name=name,
+        trained=False,
+        provenance=f"random weights, neurove_core.models.bundle.untrained(seed={seed}), torch {torch.__version__}",
+        config=config,
+        network=network.eval(),
+        offset=torch.zeros(6),
+        scale=torch.ones(6),
+    ).with_digest()
+
+
+def _take_statistics(network: Network, spikes: Tensor) -> None:
+    momenta = {
+        layer: layer.momentum for layer in network.modules() if isinstance(layer, nn.BatchNorm1d | nn.BatchNorm2d)
+    }
+    for norm in momenta:
+        norm.momentum = 1.0  # with less, few batches hardly move the running mean, and nothing fires
+    with torch.no_grad():
+        network.train()(spikes, network.initial_state(spikes.shape[1]))
+    for norm, momentum in momenta.items():
+        norm.momentum = momentum
+
+
+def _network(header: Header) -> Network:
+    network = kinds.make(header.config)
+    if header.uncertainty is not None and isinstance(network, NeuroVE):
+        network.add_spread()
+    return network
+
+
+def _uncertainty(header: UncertaintyHeader | None, correlation: Tensor | None, name: str) -> Uncertainty | None:
+    if header is None or correlation is None:
+        return None
+    why = why_no_correlation(correlation)
+    if why:
+        raise BadModel(name, f"tensor {_CORRELATION!r} {why}")
+    return Uncertainty(correlation, header.uncertain_above, header.provenance)
+
+
+def _stored(network: Network) -> dict[str, Tensor]:
+    return {
+        name: tensor.contiguous()
+        for name, tensor in network.state_dict().items()
+        if not name.endswith("num_batches_tracked")
+    }
+
+
+def _check_tensors(tensors: dict[str, Tensor], wanted: dict[str, Tensor], name: str) -> None:
+    for key in sorted(wanted.keys() ^ tensors.keys()):
+        raise BadModel(name, f"tensor {key!r} is {'missing' if key in wanted else 'not one of this architecture'}")
+    for key, tensor in tensors.items():
+        want = wanted[key]
+        if tensor.shape != want.shape or tensor.dtype != want.dtype:
+            got, needs = f"{tensor.dtype} {tuple(tensor.shape)}", f"{want.dtype} {tuple(want.shape)}"
+            raise BadModel(name, f"tensor {key!r} is {got}, its header's architecture needs {needs}")
+        if not bool(torch.isfinite(tensor).all()):
+            raise BadModel(name, f"tensor {key!r} holds values that are not finite")
+
+
+def object_without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Hook of `json.loads` that refuses duplicate keys, because JSON readers differ on which one counts.
+
+    Raises:
+        ValueError: a key occurs twice in one object.
+    """
+    fields = dict(pairs)
+    if len(fields) != len(pairs):
+        raise ValueError("a key occurs twice in one object")
+    return fields

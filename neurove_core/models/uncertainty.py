@@ -1,0 +1,83 @@
+"""Uncertainty of an estimate: from the network's log sigma to the covariance of a twist, and its measured coverage.
+
+Here sigma is the width of the interval that holds 90 % of the errors, divided by 2 * 1.645. A normal distribution with
+this sigma has the same 90 % interval. The true errors have heavier tails and a sharper peak than a normal distribution.
+"""
+
+from dataclasses import dataclass
+from statistics import NormalDist
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+LEVEL: Final = 0.9
+"""The share of errors that the calibration places within their intervals."""
+
+LEVELS: Final = (0.5, 0.68, 0.8, LEVEL, 0.95, 0.99)
+"""Nominal coverages that are compared with measured coverages."""
+
+MIN_SPEED_M_S: Final = 0.5
+"""Lower bound of the speed that sigma is divided by: for a stationary camera the ratio would be infinite."""
+
+_MAX_LOG: Final = 20.0  # bound of |log sigma|: far beyond realistic values, and exp stays finite
+_LEAST_EIGENVALUE: Final = 1e-4
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """The calibrated error model of a bundle; it complements the network's log sigma.
+
+    Args:
+        correlation: (6, 6) float32, between the errors of the axes of a twist.
+        uncertain_above: an estimate is flagged `uncertain` if its linear sigma / speed is larger.
+        provenance: one line: how the model was calibrated.
+    """
+
+    correlation: Tensor
+    uncertain_above: float
+    provenance: str
+
+    def covariance(self, log_sigma: Array, scale: Array) -> Array:
+        """D R D (6, 6) for log sigma (6) in units of the scale (6), in the scale's units squared."""
+        sigma = np.exp(np.clip(log_sigma, -_MAX_LOG, _MAX_LOG)) * scale
+        covariance: Array = self.correlation.double().numpy() * np.outer(sigma, sigma)
+        return (covariance + covariance.T) / 2  # symmetric to the last bit, as the wire format requires
+
+    def is_uncertain(self, twists: Array, covariance: Array) -> bool:
+        """Whether the linear part of a window's twists (n, 6) [m/s] is too uncertain.
+
+        The linear sigma is the root of the sum of the three variances. The speed is that of the mean twist, at least
+        MIN_SPEED_M_S.
+        """
+        speed = max(float(np.linalg.norm(twists[:, :3].mean(0))), MIN_SPEED_M_S)
+        return float(np.sqrt(np.trace(covariance[:3, :3]))) > self.uncertain_above * speed
+
+
+def why_no_correlation(matrix: Tensor) -> str | None:
+    """Why a finite matrix (6, 6) is not a correlation matrix; None if it is one."""
+    if not torch.equal(matrix, matrix.T):
+        return "is not symmetric"
+    if not torch.equal(torch.diagonal(matrix), torch.ones(len(matrix))):
+        return "has a diagonal that is not 1"
+    least = float(torch.linalg.eigvalsh(matrix.double())[0])
+    return None if least >= _LEAST_EIGENVALUE else f"is not positive definite: its least eigenvalue is {least:.3g}"
+
+
+def half_width(level: float) -> float:
+    """Half width [sigma] of the central interval that holds this share of a normal distribution.
+
+    >>> round(half_width(0.9), 3)
+    1.645
+    """
+    return NormalDist().inv_cdf((1 + level) / 2)
+
+
+def coverage(error: Array, sigma: Array, level: float) -> Array:
+    """The share by axis (6) of the errors (N, 6) within the interval of this level; sigma is (N, 6) > 0."""
+    covered: Array = (np.abs(error) <= half_width(level) * sigma).mean(0)
+    return covered

@@ -1,0 +1,77 @@
+"""Self-test of a model: run its golden windows through the estimator on this machine and compare the estimates."""
+
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurove_core.config import ModelConfig
+from neurove_core.estimator import Estimator
+from neurove_core.models.golden import TOLERANCE, Golden
+from neurove_protocol import Events, Sensor
+from neurove_protocol.errors import BadModel
+
+_INT8_GREW: Final = "; an int8 model made before the projection was in int8 too may give other estimates (decision 38)"
+
+_AXES: Final = ("vx", "vy", "vz", "wx", "wy", "wz")
+
+
+def check(estimator: Estimator) -> None:
+    """Run the golden windows of a model and compare the estimates; a model without golden windows passes.
+
+    The windows are processed like a camera's events: by windowing, encoding and engine.
+
+    Args:
+        estimator: estimator of the model; none of its streams is affected.
+
+    Raises:
+        BadModel: an estimate differs by more than the tolerance, or is not finite; window, bin and axis are named.
+    """
+    golden = estimator.bundle.golden
+    if golden is None:
+        return
+    got, want = answers(estimator, golden.counts), golden.twists.astype(np.float64)
+    allowed = golden.tolerance * np.abs(estimator.bundle.scale.double().numpy())
+    off = np.abs(got - want) / np.maximum(allowed, np.finfo(np.float64).tiny)
+    off[~np.isfinite(got)] = np.inf
+    window, bin_, axis = (int(at) for at in np.unravel_index(int(np.argmax(off)), off.shape))
+    if off[window, bin_, axis] > 1:
+        raise BadModel(
+            estimator.bundle.name,
+            f"golden test: window {window}, bin {bin_}: {_AXES[axis]}={got[window, bin_, axis]:.6g}, expected "
+            f"{want[window, bin_, axis]:.6g}; the tolerance is {allowed[axis]:.2g}"
+            + (_INT8_GREW if estimator.config.network.precision == "int8" else ""),
+        )
+
+
+def record(estimator: Estimator, counts: NDArray[np.uint8], tolerance: float = TOLERANCE) -> Golden:
+    """The golden test of a model with these windows.
+
+    Args:
+        estimator: estimator of the model as it will be saved.
+        counts: (T, 2n, H, W) consecutive windows.
+        tolerance: see `Golden`.
+    """
+    return Golden(counts, answers(estimator, counts).astype(np.float32), tolerance)
+
+
+def answers(estimator: Estimator, counts: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Twists (T, n, 6) of a model for windows (T, 2n, H, W), from the zero state."""
+    config = estimator.config
+    sensor = Sensor(config.canonical.width, config.canonical.height)  # each pixel is one cell of the grid
+    state = estimator.push(Events.empty(), estimator.initial_state(sensor), 0).state  # windows begin at time 0
+    twists = []
+    for index, window in enumerate(counts):
+        events = _events(window, index * config.window.duration_us, config)
+        answer = estimator.push(events, state, (index + 1) * config.window.duration_us)
+        state = answer.state
+        twists += [estimate.twists for estimate in answer.estimates]
+    return np.stack(twists)
+
+
+def _events(counts: NDArray[np.uint8], start_us: int, config: ModelConfig) -> Events:
+    """Events that give these counts (2n, H, W), all at the beginning of their bins."""
+    channel, y, x = np.nonzero(counts)
+    times = counts[channel, y, x]
+    columns: list[NDArray[Any]] = [start_us + channel // 2 * config.window.bin_us, x, y, channel % 2]
+    return Events.from_columns(*(np.repeat(column, times) for column in columns))

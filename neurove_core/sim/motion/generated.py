@@ -1,0 +1,134 @@
+"""Paths that are made up from a seed: a drive through streets, and a camera waved about in a room."""
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurove_core.geometry import rotations
+from neurove_core.sim.motion.curves import SplineTrajectory
+
+Array = NDArray[np.float64]
+
+_DRIVE_STEP_S: Final = 0.1
+_HAND_STEP_S: Final = 0.02
+_TAIL_S: Final = 10.0  # made and cut off, so that a longer drive of the same seed begins as the shorter one does
+
+TOP_M_S: Final = 12.0
+"""No drive is faster."""
+
+MAX_HEADING: Final = 1.6
+"""No drive turns further than this away from its first direction [rad], but for its springs."""
+
+LEVER_M: Final = 1.5
+"""How far the camera is ahead of the axle that does not steer, and so slips sideways."""
+
+
+def driving(seed: int, seconds: float = 600.0) -> SplineTrajectory:
+    """A car's path on level ground: 0 to 12 m/s, stops, bends and corners, a little pitch, roll and heave.
+
+    Accelerations are those of calm driving (1.6 m/s2 on, 2.2 m/s2 off, 2.5 m/s2 sideways). It always gets on along z:
+    its heading stays within MAX_HEADING of it, so that the path does not cross itself. The body leans and dives with
+    its acceleration and shakes with its speed; at rest it is still. Meant to be like MVSEC's outdoor_day: forward speed
+    5 (3) m/s, yaw rate 0.12 to 0.16 rad/s in the root mean square, at most some 0.6.
+    """
+    rng, shaking = np.random.default_rng((seed, 1)), np.random.default_rng((seed, 2))
+    n = math.ceil(seconds / _DRIVE_STEP_S) + 1
+    tail = round(_TAIL_S / _DRIVE_STEP_S)
+    speed, yaw_rate = (_eased(values) for values in _manoeuvres(rng, n + tail))
+    yaw = np.cumsum(yaw_rate) * _DRIVE_STEP_S
+    # 0.006 rad per m/s2: nose up under power, down under the brakes, and over to the outside of a bend
+    lean = 0.006 * np.stack([_rate(speed), 0 * speed, -yaw_rate * speed], axis=1)
+    shake = noise(shaking, n + tail, 3, 0.4, 1.5, _DRIVE_STEP_S) * np.minimum(speed / 5, 1)[:, None]
+    tilt = lean + shake * np.array([0.0025, 0.0, 0.0025])
+    heading = rotations.exp(np.stack([0 * yaw, yaw, 0 * yaw], axis=1))
+    step = np.stack([np.sin(yaw) * speed, 0 * yaw, np.cos(yaw) * speed], axis=1) * _DRIVE_STEP_S
+    position = np.concatenate([np.zeros((1, 3)), np.cumsum((step[1:] + step[:-1]) / 2, axis=0)])
+    position += LEVER_M * rotations.turn(heading, np.array([0.0, 0.0, 1.0]))  # which swings out in corners
+    position = position - position[:1]
+    position[:, 1] = 0.01 * shake[:, 1]
+    orientation = rotations.product(heading, rotations.exp(tilt))
+    return SplineTrajectory.through(f"driving {seed}", _DRIVE_STEP_S, position[:n], orientation[:n], seconds)
+
+
+def _manoeuvres(rng: np.random.Generator, n: int) -> tuple[Array, Array]:
+    """Speed (n,) [m/s] within the accelerations, and yaw rate (n,) [rad/s], to the right above 0; still with kinks."""
+    speed, yaw_rate = np.zeros(n), np.zeros(n)
+    v, heading, i = float(rng.uniform(3, 9)), 0.0, 0
+    while i < n:
+        kind = rng.choice(["straight", "bend", "corner", "stop"], p=[0.35, 0.3, 0.2, 0.15])
+        kind = kind if i else "straight"  # the first second is eased in from nowhere
+        side = -math.copysign(1.0, heading) if abs(heading) > 0.3 else float(rng.choice([-1.0, 1.0]))
+        target, curvature, angle = float(rng.uniform(4, TOP_M_S)), 0.0, 0.0
+        duration_s = float(rng.uniform(4, 12))
+        if kind == "bend":
+            curvature, angle = 1 / rng.uniform(30, 120), rng.uniform(0.1, 0.5)
+        elif kind == "corner":
+            target, duration_s = float(rng.uniform(3.5, 6)), 30.0
+            curvature, angle = 1 / rng.uniform(8, 14), min(rng.uniform(1.2, 1.6), MAX_HEADING - side * heading)
+        elif kind == "stop":
+            target, duration_s = 0.0, float(rng.uniform(2, 7)) + v / 2.2
+        turned = 0.0
+        for _ in range(round(duration_s / _DRIVE_STEP_S)):
+            if i == n or (kind == "corner" and turned >= angle - 1e-9):
+                break
+            v += float(np.clip(target - v, -0.22, 0.16))
+            # corners wait until the car is slow enough for them
+            ready = turned < angle and (kind != "corner" or v <= target + 0.5)
+            rate = min(curvature * v, 2.5 / max(v, 1.0), (angle - turned) / _DRIVE_STEP_S) if ready else 0.0
+            turned += rate * _DRIVE_STEP_S
+            speed[i], yaw_rate[i] = v, side * rate
+            i += 1
+        heading += side * turned
+    return speed, yaw_rate
+
+
+def _eased(values: Array) -> Array:
+    """Each value's weighted mean over the 1.2 s that follow it; no overshoot, and rest stays rest."""
+    kernel = np.hanning(15)[1:-1]
+    padded = np.concatenate([values, np.full(kernel.size - 1, values[-1])])
+    return np.convolve(padded, kernel / kernel.sum(), mode="valid")
+
+
+def _rate(values: Array) -> Array:
+    return np.asarray(np.gradient(values, _DRIVE_STEP_S))
+
+
+def hand_held(seed: int, seconds: float = 60.0, moved: float = 1.0, turned: float = 1.0) -> SplineTrajectory:
+    """A camera waved about in front of a scene: six degrees of freedom, calm and wild by turns.
+
+    Within half a metre or so of where it starts and looking along z within some 40 degrees. Its spectra and speeds are
+    modelled on poster_6dof of the Event Camera Dataset: speed 0.9 m/s in the median and 2.4 at 99 %, turning 1.2 rad/s
+    in the median and 12 at 99 %.
+
+    Args:
+        seed: of the path; the same one for any `moved` and `turned`.
+        seconds: how long it lasts.
+        moved: factor of how far it moves; 0 leaves a camera that turns in place.
+        turned: factor of how far it turns; 0 leaves one that moves without turning.
+    """
+    n = math.ceil(seconds / _HAND_STEP_S) + 1
+    rng = [np.random.default_rng((seed, 3, k)) for k in range(4)]
+    # how wild it is comes and goes over some seconds
+    wild = np.exp(np.clip(0.35 * noise(rng[0], n, 1, 0.02, 0.06, _HAND_STEP_S) - 0.1, -1.0, 0.5))
+    wild_turns = np.exp(np.clip(1.0 * noise(rng[1], n, 1, 0.02, 0.06, _HAND_STEP_S) - 0.5, -2.0, 1.2))
+    position = moved * 0.12 * wild * noise(rng[2], n, 3, 0.3, 0.9, _HAND_STEP_S)
+    turns = turned * 0.14 * wild_turns * noise(rng[3], n, 3, 0.8, 2.0, _HAND_STEP_S)
+    position = position - position[:1]
+    return SplineTrajectory.through(f"handheld {seed}", _HAND_STEP_S, position, rotations.exp(turns), seconds)
+
+
+def noise(rng: np.random.Generator, n: int, channels: int, low_hz: float, high_hz: float, step_s: float) -> Array:
+    """Smooth random numbers (n, channels) of variance 1, with most of their power between two frequencies.
+
+    White noise through the difference of two Gaussians; more numbers of the same generator begin with the same ones.
+    """
+    narrow, wide = 1 / (2 * np.pi * high_hz * step_s), 1 / (2 * np.pi * low_hz * step_s)  # standard deviations [steps]
+    reach = math.ceil(3.5 * wide)
+    at = np.arange(-reach, reach + 1)
+    bells = [np.exp(-0.5 * (at / sigma) ** 2) for sigma in (narrow, wide)]
+    kernel = bells[0] / bells[0].sum() - bells[1] / bells[1].sum()
+    kernel /= np.linalg.norm(kernel)
+    white = rng.standard_normal((n + kernel.size - 1, channels))
+    return np.stack([np.convolve(white[:, c], kernel, mode="valid") for c in range(channels)], axis=1)

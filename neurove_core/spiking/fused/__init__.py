@@ -1,0 +1,1 @@
+"""Compiled forms of the neurons and cells in the folder above."""

@@ -1,0 +1,135 @@
+"""Arguments that several commands share: their types, their flags, and the settings that they give."""
+
+import argparse
+import math
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from neurove_protocol import Sensor
+from neurove_protocol.errors import NeuroVEError
+from neurove_service import logs
+from neurove_service.config import ClientConfig, ServiceConfig, load
+
+Run = Callable[[argparse.Namespace], int]
+"""Runs one command and returns its exit code."""
+
+
+def command(parser: argparse.ArgumentParser, run: Run, *, as_json: bool = True) -> argparse.ArgumentParser:
+    """Let a parser run a command, and add `--json` if the command prints JSON too."""
+    parser.set_defaults(run=run)
+    if as_json:
+        parser.add_argument("--json", action="store_true", help="print JSON instead of text")
+    return parser
+
+
+def subcommand(commands: Any, name: str, run: Run, *, as_json: bool = True) -> argparse.ArgumentParser:
+    """Add a command to a group; the first line of its function's docstring is its help."""
+    about = (run.__doc__ or "").splitlines()[0]
+    return command(commands.add_parser(name, help=about, description=about), run, as_json=as_json)
+
+
+def add_source(parser: argparse.ArgumentParser, **source: Any) -> None:
+    """Add the source of events and how to read it."""
+    default = f"; default {source['default']}" if source else ""
+    about = f"recording, pattern:// or sim:// (the built-in simulator){default}"
+    parser.add_argument("source", metavar="SOURCE", help=about, **source)
+    add_recording_flags(parser)
+    parser.add_argument("--loop", action="store_true", help="start again at the end")
+
+
+def add_recording_flags(parser: argparse.ArgumentParser) -> None:
+    """Add what a recording may not say itself: the sensor's size, and which of its event streams to read."""
+    parser.add_argument("--sensor", type=sensor_size, metavar="WxH", help="sensor size, if the recording lacks it")
+    parser.add_argument("--topic", metavar="T", help="event stream to read; default: the recording's first")
+
+
+def add_playback_flags(parser: argparse.ArgumentParser, seconds_help: str) -> None:
+    """Add how fast and how long a source is played."""
+    parser.add_argument(
+        "--speed", type=speed, default=1.0, metavar="R", help="sensor seconds per second, or max; default 1.0"
+    )
+    parser.add_argument("--seconds", type=seconds, metavar="S", help=seconds_help)
+
+
+def add_client_flags(parser: argparse.ArgumentParser) -> None:
+    """Add where the service is."""
+    _add_settings(parser, ClientConfig, ("connect", "prefix", "zenoh_config"))
+
+
+def add_service_flags(parser: argparse.ArgumentParser) -> None:
+    """Add every setting of the service."""
+    parser.add_argument("--config", type=Path, metavar="FILE", help="settings as TOML")
+    _add_settings(parser, ServiceConfig, tuple(ServiceConfig.model_fields))
+
+
+def _add_settings(
+    parser: argparse.ArgumentParser, kind: type[ServiceConfig] | type[ClientConfig], names: tuple[str, ...]
+) -> None:
+    for name in names:
+        field = kind.model_fields[name]
+        about = f"{field.description} Default: {_default_text(field.default)}.".replace("%", "%%")
+        parser.add_argument("--" + name.replace("_", "-"), metavar=name.upper(), help=about)
+
+
+def _default_text(value: object) -> str:
+    """A default as people write it."""
+    if value is None or value == ():
+        return "none"
+    return ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+
+
+def client_config(args: argparse.Namespace) -> ClientConfig:
+    """The settings of a client; configures its log."""
+    config, _ = load(ClientConfig, flags(args, ClientConfig))
+    logs.configure(config.log_level if "NEUROVE_LOG_LEVEL" in os.environ else "warning")
+    return config
+
+
+def flags(args: argparse.Namespace, kind: type[ServiceConfig] | type[ClientConfig]) -> dict[str, Any]:
+    """The settings that the command line gives; None for each that it does not give."""
+    return {name: getattr(args, name, None) for name in kind.model_fields}
+
+
+def sensor_size(text: str) -> Sensor:
+    """A sensor size from the text WIDTHxHEIGHT."""
+    width, _, height = text.partition("x")
+    try:
+        return Sensor(int(width), int(height))
+    except (ValueError, NeuroVEError):
+        raise argparse.ArgumentTypeError(f"{text!r}: give WIDTHxHEIGHT in pixels, such as 640x480") from None
+
+
+def speed(text: str) -> float:
+    """A factor above 0, or infinity for the text max."""
+    try:
+        factor = math.inf if text in ("max", "inf") else float(text)
+    except ValueError:
+        factor = math.nan
+    if not factor > 0:
+        raise argparse.ArgumentTypeError(f"{text!r}: give a factor above 0, such as 1.0, or max")
+    return factor
+
+
+def seconds(text: str) -> float:
+    """A number of seconds above 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not value > 0:
+        raise argparse.ArgumentTypeError(f"{text!r}: give seconds above 0")
+    return value
+
+
+def commit() -> str:
+    """The commit of the running code, with a + after local changes; outside a git checkout the package's version."""
+    import importlib.metadata
+    import subprocess
+
+    git = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--abbrev=12", "--dirty=+", "--exclude=*"]
+    try:
+        return subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return importlib.metadata.version("neurove")

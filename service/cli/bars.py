@@ -1,0 +1,41 @@
+"""Progress of a long command: bars on a terminal, else lines at intervals."""
+
+import contextlib
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any
+
+_EACH_STEP = ("simulated", "split into windows")
+"""Tasks whose steps take so long that each one is a line."""
+
+
+@contextlib.contextmanager
+def progress() -> Iterator[Callable[[str, int, int, str], None]]:
+    """Yield a function that shows the progress of a task: (task, steps done, of how many, detail)."""
+    if not sys.stderr.isatty():
+        yield _print_line
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[detail]}"),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as bars:
+        tasks: dict[str, Any] = {}
+
+        def show(task: str, done: int, of: int, detail: str) -> None:
+            if task not in tasks:
+                tasks[task] = bars.add_task(task, total=of, detail="")
+            bars.update(tasks[task], completed=done, detail=detail)
+
+        yield show
+
+
+def _print_line(task: str, done: int, of: int, detail: str) -> None:
+    if task.startswith(_EACH_STEP) or done % 100 < 4 or done == of:
+        sys.stderr.write(f"{task} {done}/{of}: {detail}\n")
+        sys.stderr.flush()

@@ -1,0 +1,70 @@
+"""The table of all commands. A command's module is imported only if the user chose the command."""
+
+import argparse
+import importlib
+import platform
+from collections.abc import Container
+from typing import Any, NamedTuple
+
+from neurove_service.cli.parser import Parser
+
+
+class Command(NamedTuple):
+    """One command; its module has a function `add_NAME` that adds the arguments and sets `run`."""
+
+    name: str
+    help: str
+    module: str  # in this package
+    extra: str = ""  # that it needs; empty if the base install is enough
+
+
+COMMANDS = (
+    Command("demo", "Run driver, service and consumer on any source, then print a summary.", "running", "serve"),
+    Command("serve", "Run the service until SIGINT or SIGTERM.", "running", "serve"),
+    Command("drive", "Publish a recording or a synthetic source as event packets.", "running", "recordings"),
+    Command("watch", "Show live estimates of all streams.", "asking"),
+    Command("health", "Show the health of every node.", "asking"),
+    Command("doctor", "Check connection, streams, compiled kernels, processor and installed extras.", "doctor"),
+    Command("models", "List the models of every node.", "asking"),
+    Command("push", "Send a bundle to a running node.", "changing"),
+    Command("activate", "Change the model of a running node.", "changing"),
+    Command("rollback", "Activate the previous model of a running node again.", "changing"),
+    Command("bundle", "Make, inspect, sign and verify bundles: files that hold a model.", "bundles", "serve"),
+    Command("record", "Record the packets that drivers publish, until Ctrl-C.", "recordings", "recordings"),
+    Command("info", "Show what a recording holds: sensor, counts, rates, IMU and truth.", "recordings", "recordings"),
+    Command(
+        "convert", "Convert a recording to a packet log (.mcap) or to DSEC's layout (.h5).", "recordings", "recordings"
+    ),
+    Command("simulate", "Record a simulated event camera with its exact motion.", "recordings", "recordings"),
+    Command("train", "Train a model on simulated sequences and recordings.", "training", "train"),
+    Command("calibrate", "Fit the uncertainty of a trained model on new simulated sequences.", "training", "train"),
+    Command("evaluate", "Compare a model's estimates with the truth, as RMSE and RE.", "training", "serve"),
+    Command("reproduce", "Repeat the experiments of the paper.", "experiments", "experiments"),
+    Command("bench", "Measure the speed of this machine, as ratios within one run.", "bench", "bench"),
+    Command("config", "Show the settings of the service.", "running"),
+    Command("completion", "Print a completion script for a shell.", "completion"),
+)
+
+
+class _Version(argparse.Action):
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> None:
+        import importlib.metadata
+
+        print(f"neurove {importlib.metadata.version('neurove')}, Python {platform.python_version()}")
+        parser.exit()
+
+
+def build_parser(chosen: Container[str]) -> Parser:
+    """The parser of all commands; only the commands in `chosen` have arguments, the others just their help line."""
+    parser = Parser(
+        prog="neurove",
+        description="Ego-velocity from event cameras, as a service on Zenoh.",
+        epilog="Settings come from defaults, then --config FILE (TOML), then NEUROVE_* variables, then flags.",
+    )
+    parser.add_argument("--version", action=_Version, nargs=0, help="show the versions of neurove and Python and exit")
+    commands = parser.add_commands()
+    for name, about, module, _ in COMMANDS:
+        one = commands.add_parser(name, help=about, description=about)
+        if name in chosen:
+            getattr(importlib.import_module(f"neurove_service.cli.{module}"), f"add_{name}")(one)
+    return parser

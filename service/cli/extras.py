@@ -1,0 +1,52 @@
+"""The extras of the package, and the libraries that only they install."""
+
+import importlib.util
+from typing import Final
+
+from neurove_core.extras import MissingExtra
+
+EXTRAS: Final[dict[str, tuple[str, ...]]] = {
+    "serve": ("cryptography", "numba", "safetensors", "torch"),
+    "recordings": ("aedat", "h5py", "hdf5plugin", "mcap", "numba", "PIL", "rosbags", "scipy"),
+    "train": ("matplotlib", "tensorboard"),
+    "experiments": ("matplotlib", "scipy"),
+    "bench": ("dv_processing", "faery", "loguru", "snntorch", "tonic"),
+    "carla": ("carla",),
+}
+"""Modules that an extra installs itself; some extras also include others, see `_DEPENDS` and pyproject.toml."""
+
+_DEPENDS: Final[dict[str, tuple[str, ...]]] = {
+    "train": ("serve", "recordings"),
+    "experiments": ("serve", "recordings"),
+    "bench": ("serve",),
+    "carla": ("recordings",),
+}
+
+
+def missing_extra(error: ModuleNotFoundError, usual: str) -> MissingExtra | None:
+    """The extra that installs a missing module; None if no extra does.
+
+    Args:
+        error: of an import.
+        usual: the extra that the running command needs; it is named if it installs the module.
+    """
+    module = str(error.name).partition(".")[0]
+    having = [extra for extra, modules in EXTRAS.items() if module in modules]
+    if not having:
+        return None
+    if usual in having or any(extra in having for extra in _DEPENDS.get(usual, ())):
+        return MissingExtra(module, usual)
+    return MissingExtra(module, having[0])
+
+
+def absent(extra: str) -> list[str]:
+    """Modules of an extra, and of the extras that it includes, that are not installed."""
+    modules = [module for name in (*_DEPENDS.get(extra, ()), extra) for module in EXTRAS[name]]
+    return [module for module in dict.fromkeys(modules) if not _installed(module)]
+
+
+def _installed(module: str) -> bool:
+    try:
+        return importlib.util.find_spec(module) is not None
+    except (ImportError, ValueError):  # hidden from import, as tests do
+        return False

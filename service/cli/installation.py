@@ -1,0 +1,107 @@
+"""Checks of this machine: compiled kernels, processor, the engine's fast path, installed extras."""
+
+import importlib.util
+import os
+import platform
+from pathlib import Path
+from typing import Final, Literal, NamedTuple
+
+from neurove_service.cli.extras import EXTRAS, absent
+
+CPU_FLAGS: Final = {
+    "avx2": "AVX2",
+    "avx512f": "AVX-512",
+    "avx512_vnni": "VNNI",
+    "avx_vnni": "AVX-VNNI",
+    "asimd": "NEON",
+    "neon": "NEON",
+}
+"""Names of /proc/cpuinfo, and what people call them."""
+
+
+class Check(NamedTuple):
+    """The result of one check."""
+
+    what: str
+    state: str
+    level: Literal["ok", "bad", "info"]  # bad: needs an action; info: optional or unknown
+    advice: str = ""  # what to do
+
+
+def check_kernels() -> Check:
+    """Whether numba has cached the compiled kernels of neurove_core, and whether it can."""
+    folder = _cache_root()
+    count = sum(1 for _ in folder.rglob("*.nbi")) if folder.is_dir() else 0
+    if not _writable(folder):
+        state = f"{count} cached; {folder} is not writable"
+        return Check("compiled kernels", state, "bad", "set NUMBA_CACHE_DIR to a folder that the service may write")
+    if not count:
+        advice = "nothing: the first start compiles them and is slow"
+        return Check("compiled kernels", f"none cached in {folder}", "info", advice)
+    return Check("compiled kernels", f"{count} cached in {folder}", "ok")
+
+
+def _cache_root() -> Path:
+    """The folder below which numba keeps the kernels: NUMBA_CACHE_DIR, or next to the sources."""
+    configured = os.environ.get("NUMBA_CACHE_DIR")
+    if configured:
+        return Path(configured)
+    spec = importlib.util.find_spec("neurove_core")
+    return Path(str(spec.origin)).parent if spec else Path()
+
+
+def _writable(folder: Path) -> bool:
+    """Whether files can be written in a folder, or the folder can be made."""
+    nearest = next(one for one in (folder, *folder.absolute().parents) if one.exists())
+    return os.access(nearest, os.W_OK)
+
+
+def check_processor() -> Check:
+    """The vector instructions of this processor that the engine can use."""
+    names = cpu_features()
+    state = f"{platform.machine()} with {', '.join(names)}" if names else f"{platform.machine()}, features unknown"
+    return Check("processor", state, "info")
+
+
+def cpu_features(cpuinfo: Path = Path("/proc/cpuinfo")) -> list[str]:
+    """Those of AVX2, AVX-512, VNNI, AVX-VNNI and NEON that this processor has; empty if the file does not exist."""
+    try:
+        lines = cpuinfo.read_text(errors="replace").splitlines()
+    except OSError:
+        return []
+    flags = next((line.split(":", 1)[1].split() for line in lines if line.startswith(("flags", "Features"))), [])
+    return list(dict.fromkeys(name for flag, name in CPU_FLAGS.items() if flag in flags))
+
+
+def check_engine() -> Check:
+    """Which form of the engine serves the built-in model on this machine."""
+    if missing := absent("serve"):
+        return Check("fast path", f"unknown: {', '.join(missing)} not installed", "info")
+    from neurove_core import models
+    from neurove_core.engine.engine import Engine
+    from neurove_core.engine.vectors import has_byte_products
+    from neurove_core.networks.neurove import NeuroVE
+
+    network = models.find(models.DEFAULT).network
+    if not isinstance(network, NeuroVE):
+        return Check("fast path", "none: the built-in model is no NeuroVE network", "info")
+    precision = network.config.network.precision
+    int8 = f"int8 models {'with' if has_byte_products() else 'without'} VNNI"
+    if precision == "int8":
+        return Check("fast path", int8, "ok")
+    if Engine(network).reads_counts:
+        return Check("fast path", f"sparse {precision}; {int8}", "ok")
+    return Check("fast path", f"dense {precision}: the sparse form does not work here", "bad", "see the warning above")
+
+
+def check_extras() -> list[Check]:
+    """Which extras of the package are installed."""
+    return [_check_extra(extra) for extra in EXTRAS]
+
+
+def _check_extra(extra: str) -> Check:
+    missing = absent(extra)
+    if not missing:
+        return Check(f"extra {extra}", "installed", "ok")
+    advice = f"if you need it: pip install 'neurove[{extra}]'"
+    return Check(f"extra {extra}", f"not installed: {', '.join(missing)}", "info", advice)

@@ -1,0 +1,259 @@
+"""The commands for recordings: info, record, convert, simulate."""
+
+import argparse
+import contextlib
+import json
+import math
+import sys
+import time
+import urllib.parse
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+from neurove_protocol.errors import EXIT_FAILURE, InvalidField, NeuroVEError
+from neurove_protocol.keys import check_name
+from neurove_service.cli.arguments import add_client_flags, add_recording_flags, client_config, command, seconds
+from neurove_service.lifecycle import stop_on_signals
+
+Progress = Callable[[int], None]
+"""Receives the number of events so far."""
+
+
+class NothingRecorded(NeuroVEError):
+    """No packet arrived during the recording."""
+
+    code = "nothing_recorded"
+    exit_code = EXIT_FAILURE
+
+
+def record(args: argparse.Namespace) -> int:
+    """Record the packets that drivers publish, until Ctrl-C."""
+    from neurove_core.io.formats.packet_log.writer import PacketWriter
+    from neurove_service.clients import ask
+    from neurove_service.clients.recorder import Recorder, as_json
+
+    stop = stop_on_signals(with_parent=args.with_parent)
+    config = client_config(args)
+    streams = None if args.stream == "all" else tuple(check_name("stream", one) for one in args.stream.split(","))
+    path: Path = args.out
+    if path.exists():
+        raise InvalidField("record", "--out", str(path), "the file exists, and a recording is never overwritten")
+    began = time.time()
+    with ask.connect(config, stop=stop) as transport, PacketWriter(path) as writer:
+        recorder = Recorder(writer, transport, config.keys, streams)
+        with _status_line(path) as show:
+            duration_s = math.inf if args.seconds is None else args.seconds
+            recorded = recorder.run(stop, duration_s, show)
+        if not any(one.packets for one in recorded.values()):
+            raise NothingRecorded(f"no packet of {_named(streams)} under {config.prefix}: nothing was recorded")
+        summary = as_json(recorded)
+        writer.about(streams=json.dumps(summary), began_unix_s=f"{began:.3f}", prefix=config.prefix)
+    if args.json:
+        print(json.dumps({"file": str(path), "bytes": path.stat().st_size, "streams": summary}))
+    else:
+        print("\n".join(f"{name}: {_line(one)}" for name, one in summary.items()))
+        print(f"wrote {path}, {path.stat().st_size:,} bytes", file=sys.stderr)
+    return EXIT_FAILURE if any(one["missing"] or one["dropped"] or one["refused"] for one in summary.values()) else 0
+
+
+def _named(streams: tuple[str, ...] | None) -> str:
+    return "any stream" if streams is None else f"stream {', '.join(streams)}"
+
+
+def _line(stream: dict[str, Any]) -> str:
+    lost = [f"{stream[name]:,} {name}" for name in ("missing", "dropped", "refused", "restarts") if stream[name]]
+    return ", ".join([f"{stream['packets']:,} packets, {stream['events']:,} events", *(lost or ["nothing lost"])])
+
+
+@contextlib.contextmanager
+def _status_line(path: Path) -> Iterator[Callable[[Any], None] | None]:
+    """Show the progress of the recording on a terminal."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+
+    from neurove_service.clients.recorder import as_json
+
+    with Console(stderr=True).status(f"recording {path}: waiting for packets") as status:
+
+        def show(recorded: Any) -> None:
+            lines = [f"{name}: {_line(one)}" for name, one in as_json(recorded).items()]
+            status.update(f"recording {path}" + "".join(f"\n  {line}" for line in lines))
+
+        yield show
+
+
+def _write_mcap(recording: Any, path: Path, progress: Progress) -> None:
+    from neurove_core.io.formats.packet_log.writer import write_mcap
+
+    write_mcap(recording, path, progress=lambda events, _: progress(events))
+
+
+def _write_dsec(recording: Any, path: Path, progress: Progress) -> None:
+    from neurove_core.io.formats.hdf5.dsec_write import write_dsec
+
+    try:
+        write_dsec(recording, path, progress)
+    except OSError as error:
+        raise InvalidField("recording", "FILE", str(path), error.strerror or str(error)) from None
+
+
+WRITERS: Final[dict[str, Callable[[Any, Path, Progress], None]]] = {".mcap": _write_mcap, ".h5": _write_dsec}
+"""The writer for each suffix: (recording, path, progress)."""
+
+_ENDLESS_S: Final = 5.0  # that `info` reads of a source without end
+
+
+def convert(args: argparse.Namespace) -> int:
+    """Convert a recording to a packet log (.mcap) or to DSEC's layout (.h5)."""
+    from neurove_core.sources import open_source
+
+    path: Path = args.out
+    if path.suffix not in WRITERS:
+        raise InvalidField("convert", "OUT", str(path), f"its name must end in {' or '.join(WRITERS)}")
+    recording = open_source(args.source, args.sensor, args.topic)
+    if path.exists() and Path(args.source).exists() and path.samefile(args.source):
+        raise InvalidField("convert", "OUT", str(path), "it is the input recording")
+    return _write(recording, path, as_json=args.json)
+
+
+def _write(recording: Any, path: Path, *, as_json: bool) -> int:
+    counted = {"events": 0}
+    with _bar(recording.name) as show:
+
+        def progress(events: int) -> None:
+            counted["events"] = events
+            show(events)
+
+        WRITERS[path.suffix](recording, path, progress)
+    size = path.stat().st_size
+    summary = {"file": str(path), "bytes": size, "events": counted["events"], "streams": recording.streams}
+    if as_json:
+        print(json.dumps(summary))
+    else:
+        print(f"{path}: {counted['events']:,} events of {recording.name}, {size:,} bytes")
+    return 0
+
+
+def info(args: argparse.Namespace) -> int:
+    """Show what a recording holds: sensor, counts, rates, IMU and truth."""
+    from rich.console import Console
+
+    from neurove_core.io import summary
+    from neurove_core.sources import open_source
+    from neurove_service.cli.views import survey_table
+
+    recording = open_source(args.source, args.sensor, args.topic)
+    duration_s = args.seconds if args.seconds is not None else (_ENDLESS_S if recording.endless else None)
+    surveyed = summary.survey(recording, duration_s)
+    if args.plot:
+        from neurove_core.io import summary_plot
+
+        summary_plot.draw(surveyed, args.plot)
+    found = surveyed.summary
+    if args.json:
+        print(json.dumps(found.as_json()))
+    else:
+        Console().print(survey_table(found))
+    if args.plot:
+        print(f"wrote {args.plot}", file=sys.stderr)
+    if found.broken:
+        print(f"neurove: {found.broken}", file=sys.stderr)
+    return EXIT_FAILURE if found.broken else 0
+
+
+def simulate(args: argparse.Namespace) -> int:
+    """Record a simulated event camera with its exact motion."""
+    from neurove_core.sources import open_source
+
+    if args.scene == "carla":
+        return _simulate_carla(args)
+    path: Path = args.out
+    if path.suffix not in WRITERS:
+        raise InvalidField("simulate", "--out", str(path), f"its name must end in {' or '.join(WRITERS)}")
+    query = {name: getattr(args, name) for name in ("trajectory", "camera", "height", "pitch", "seed", "seconds")}
+    given = {name: value for name, value in query.items() if value is not None}
+    recording = open_source(f"sim://{args.scene}?{urllib.parse.urlencode(given)}")
+    return _write(recording, path, as_json=args.json)
+
+
+def _simulate_carla(args: argparse.Namespace) -> int:
+    """Record an event camera on a car of a running CARLA server, with its poses."""
+    from neurove_core.io.formats.carla_server import record as record_carla
+
+    host, _, port = args.server.rpartition(":")
+    if not (host and port.isdecimal()):
+        raise InvalidField("simulate carla", "--server", args.server, "give HOST:PORT, such as 127.0.0.1:2000")
+    events = record_carla(args.out, args.seconds, host=host, port=int(port), seed=args.seed)
+    summary = {"file": str(args.out), "events": events}
+    print(json.dumps(summary) if args.json else f"{args.out}: {events:,} events")
+    return 0
+
+
+@contextlib.contextmanager
+def _bar(name: str) -> Iterator[Progress]:
+    """Show the events converted so far on a terminal; the length of a recording is unknown before its end."""
+    from rich.console import Console
+    from rich.progress import Progress as Bar
+    from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Bar(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
+        task = bar.add_task(name, total=None)
+
+        def show(events: int) -> None:
+            bar.update(task, description=f"{name}: {events:,} events")
+
+        yield show
+
+
+def add_record(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `neurove record`."""
+    command(parser, record)
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="packet log to write, ending in .mcap")
+    parser.add_argument("--stream", default="all", metavar="NAME,...", help="names of streams; default all")
+    parser.add_argument("--seconds", type=seconds, metavar="S", help="length of the recording; default: until Ctrl-C")
+    parser.add_argument("--with-parent", action="store_true", help="end when the parent process ends")
+    add_client_flags(parser)
+
+
+def add_convert(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `neurove convert`."""
+    command(parser, convert)
+    parser.add_argument("source", metavar="IN", help="recording of any format")
+    parser.add_argument(
+        "out", type=Path, metavar="OUT", help="file to write, ending in .mcap (packet log) or .h5 (DSEC)"
+    )
+    add_recording_flags(parser)
+
+
+def add_info(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `neurove info`."""
+    command(parser, info)
+    parser.add_argument("source", metavar="SOURCE", help="recording of any format, pattern:// or sim://")
+    add_recording_flags(parser)
+    most = f"default: all, of an endless source {_ENDLESS_S:.0f} s"
+    parser.add_argument("--seconds", type=seconds, metavar="S", help=f"seconds of the source to read; {most}")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw events, rate and truth (.png or .svg)")
+
+
+def add_simulate(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `neurove simulate`."""
+    command(parser, simulate)
+    scenes = "street, bare-street, corridor, room, plain-room or wall; carla: record from a CARLA server"
+    parser.add_argument("scene", metavar="SCENE", help=scenes)
+    about = "file to write: .mcap (packet log) or .h5 (DSEC); .npz for carla"
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE", help=about)
+    parser.add_argument("--seconds", type=seconds, default=10.0, metavar="S", help="seconds to simulate; default 10 s")
+    about = "seed of scene, trajectory and pixels; default 0"
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help=about)
+    about = "driving, handheld, still, rotation?wy=1, a file of poses, ...; default: that of the scene"
+    parser.add_argument("--trajectory", metavar="T", help=about)
+    about = "davis346-half, davis346, davis240c, prophesee, ...; default davis346-half"
+    parser.add_argument("--camera", metavar="C", help=about)
+    parser.add_argument("--height", metavar="M", help="height of the camera above the ground [m]; default 1.5")
+    parser.add_argument("--pitch", metavar="DEG", help="angle of the camera below the horizon [deg]; default 5")
+    about = "the CARLA server; default 127.0.0.1:2000"
+    parser.add_argument("--server", default="127.0.0.1:2000", metavar="HOST:PORT", help=about)

@@ -1,0 +1,194 @@
+"""The commands that run something: demo, serve, drive; and config, which shows the settings of serve."""
+
+import argparse
+import gc
+import json
+import math
+import sys
+from typing import Any
+
+from neurove_protocol.errors import EXIT_FAILURE, InvalidField
+from neurove_service import logs
+from neurove_service.cli.arguments import (
+    add_client_flags,
+    add_playback_flags,
+    add_service_flags,
+    add_source,
+    client_config,
+    command,
+    flags,
+    seconds,
+    subcommand,
+)
+from neurove_service.cli.parser import Parser
+from neurove_service.config import ServiceConfig, load
+from neurove_service.lifecycle import stop_on_signals
+
+DEFAULT_SOURCE = "sim://"
+_DEFAULT_DEMO_S = 20.0
+_STREAM = "cam0"
+
+
+def serve(args: argparse.Namespace) -> int:
+    """Run the service until SIGINT or SIGTERM."""
+    stop = stop_on_signals(with_parent=args.with_parent)
+    config, _ = load(ServiceConfig, flags(args, ServiceConfig), args.config)
+    logs.configure(config.log_level)
+
+    import torch
+
+    from neurove_service.node.app import Service
+
+    torch.set_num_threads(1)
+    sys.setswitchinterval(0.0005)  # Zenoh's threads wait for ours: the default of 5 ms is a packet's period
+    service = Service(config, stop)
+    gc.collect()
+    gc.freeze()  # the collector would traverse all of torch at each run, with all threads stopped
+    service.run()
+    gc.freeze()  # again before the exit, which otherwise takes up to 2 s on a busy machine
+    return 0
+
+
+def drive(args: argparse.Namespace) -> int:
+    """Publish a recording or a synthetic source as one stream; publish a packet log as it was recorded."""
+    from neurove_core.sources import open_source
+    from neurove_service.clients import ask
+
+    stop = stop_on_signals(with_parent=args.with_parent)
+    config = client_config(args)
+    recording = open_source(args.source, args.sensor, args.topic)
+    with ask.connect(config, patience_s=max(ask.CONNECT_S, args.wait), stop=stop) as transport:
+        player = _player(args, recording, transport, config.keys)
+        if args.wait and not player.wait_for_listener(args.wait, stop) and not stop.is_set():
+            hint = "; if one runs, does it accept this certificate?" if config.zenoh_config else ""
+            raise ask.NoService(f"no service subscribed to stream {player.label} within {args.wait:g} s{hint}")
+        duration_s = math.inf if args.seconds is None else args.seconds
+        sent = player.play(stop, speed=args.speed, loop=args.loop, duration_s=duration_s)
+    broken = sent.broken.message if sent.broken else None
+    if args.json:
+        sensor = {"width": recording.sensor.width, "height": recording.sensor.height}
+        print(json.dumps({"sensor": sensor, "packets": sent.packets, "events": sent.events, "broken": broken}))
+    else:
+        about = f"{recording.name} ({recording.sensor})"
+        print(f"{player.label}: {sent.packets:,} packets, {sent.events:,} events of {about}")
+    if broken:
+        print(f"neurove: {broken}", file=sys.stderr)
+    return EXIT_FAILURE if broken else 0
+
+
+def _player(args: argparse.Namespace, recording: Any, transport: Any, keys: Any) -> Any:
+    """A replay for a packet log, a driver for any other recording; both have the same methods."""
+    from neurove_core.io.formats.packet_log.reader import McapRecording
+    from neurove_service.clients.driver import Driver
+    from neurove_service.clients.replay import Replay
+
+    if (
+        not isinstance(recording, McapRecording) or args.stream
+    ):  # the name is in every packet, so another name means new packets
+        return Driver(recording, args.stream or _STREAM, transport, keys)
+    if args.loop:
+        why = "a replay would repeat sequence numbers and times; give --stream NAME to encode the events again"
+        raise InvalidField("drive", "--loop", True, why)
+    return Replay(recording, recording.stream if args.topic else None, transport, keys)
+
+
+def demo(args: argparse.Namespace) -> int:
+    """Run driver, service and consumer on any source, then print a summary."""
+    from rich.console import Console
+
+    from neurove_core.sources import open_source
+    from neurove_service.cli.demo import run
+
+    stop = stop_on_signals()
+    logs.configure("warning")
+    endless = open_source(args.source, args.sensor, args.topic).endless
+    console = Console(stderr=args.json)
+    duration_s = args.seconds
+    if duration_s is None:
+        duration_s = _DEFAULT_DEMO_S if endless and not console.is_terminal else math.inf
+    summary = run(
+        args.source,
+        sensor=str(args.sensor) if args.sensor else None,
+        topic=args.topic,
+        speed="max" if math.isinf(args.speed) else str(args.speed),
+        loop=args.loop,
+        duration_s=duration_s,
+        model=args.model,
+        stop=stop,
+        console=console,
+        screenshot=args.screenshot,
+    )
+    print(json.dumps(summary) if args.json else _summary_text(summary))
+    return EXIT_FAILURE if summary["broken"] else 0
+
+
+def _summary_text(summary: dict[str, Any]) -> str:
+    sensor, numbers = summary["sensor"], summary["latency_ms"]
+    if sensor is None:
+        return "stopped before the driver had started"
+    lost = ", ".join(f"{name} {count}" for name, count in summary["lost"].items()) or "nothing"
+    latency = f"p50 {numbers['p50']:.1f} ms, p99 {numbers['p99']:.1f} ms" if numbers else "no estimate"
+    model = summary["model"] if summary["trained"] else f"{summary['model']}, UNTRAINED: the estimates have no meaning"
+    lines = (
+        f"source     {summary['source']} ({sensor['width']}x{sensor['height']})",
+        f"packets    {summary['packets_received']:,} of {summary['packets_sent']:,}",
+        f"events     {summary['events_received']:,} of {summary['events_sent']:,}",
+        f"estimates  {summary['estimates']:,} of {summary['windows']:,} windows, {summary['rate_hz']:.1f} per second",
+        f"latency    {latency}",
+        f"lost       {lost}",
+        f"model      {model}",
+        *([f"broken     {summary['broken']}"] if summary["broken"] else []),
+    )
+    return "\n".join(lines)
+
+
+def show_config(args: argparse.Namespace) -> int:
+    """Print the settings that `neurove serve` would use, as TOML."""
+    config, origin = load(ServiceConfig, flags(args, ServiceConfig), args.config)
+    values = config.model_dump(mode="json")
+    if args.json:
+        print(json.dumps({name: {"value": value, "origin": origin[name]} for name, value in values.items()}))
+        return 0
+    for name, value in values.items():
+        comment = f"  # {origin[name]}" if args.origin else ""
+        print(f"{'# ' if value is None else ''}{name} = {json.dumps(value)}{comment}")
+    return 0
+
+
+def add_demo(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `neurove demo`."""
+    add_source(command(parser, demo), nargs="?", default=DEFAULT_SOURCE)
+    most = f"{_DEFAULT_DEMO_S:.0f} s of an endless source that no terminal shows"
+    add_playback_flags(parser, f"seconds of the source to play; default: until its end or Ctrl-C, {most}")
+    about = "bundle to serve, or the name of a built-in model; default `default`"
+    parser.add_argument("--model", metavar="BUNDLE", help=about)
+    parser.add_argument("--screenshot", metavar="FILE", help="write the last table as SVG")
+
+
+def add_serve(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `neurove serve`."""
+    add_service_flags(command(parser, serve, as_json=False))
+    _add_with_parent(parser)
+
+
+def add_drive(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `neurove drive`."""
+    add_source(command(parser, drive))
+    add_client_flags(parser)
+    about = f"name of the stream, one key chunk; default {_STREAM}, and for a packet log the names in it"
+    parser.add_argument("--stream", metavar="NAME", help=about)
+    add_playback_flags(parser, "seconds of the source to play; default: until its end")
+    about = "longest wait for a service that subscribes; default: no wait"
+    parser.add_argument("--wait", type=seconds, default=0.0, metavar="S", help=about)
+    _add_with_parent(parser)
+
+
+def _add_with_parent(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--with-parent", action="store_true", help="end when the parent process ends")
+
+
+def add_config(parser: Parser) -> None:
+    """Add the commands of `neurove config`."""
+    show = subcommand(parser.add_commands(), "show", show_config)
+    show.add_argument("--origin", action="store_true", help="add where each value comes from")
+    add_service_flags(show)

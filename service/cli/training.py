@@ -1,0 +1,204 @@
+"""The commands that make and evaluate models: train, calibrate, evaluate."""
+
+import argparse
+import json
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from neurove_service.cli.arguments import add_recording_flags, command
+from neurove_service.cli.bars import progress
+
+_CALIBRATION_SEQUENCES = 96
+
+
+def train(args: argparse.Namespace) -> int:
+    """Train a model on simulated sequences and recordings."""
+    import torch
+
+    from neurove_core import models
+    from neurove_core.training import config as configs
+    from neurove_core.training import loop, pipeline
+
+    torch.set_num_threads(args.threads)
+    config = configs.load(args.config)
+    out: Path = args.out or Path("runs") / config.name
+    with progress() as show:
+        path = pipeline.train(
+            config,
+            out,
+            data=args.data,
+            start=models.find(args.start) if args.start else None,
+            resume=args.resume,
+            devices=args.devices,
+            device=args.device,
+            workers=args.workers,
+            calibration_sequences=args.calibration_sequences,
+            on_progress=show,
+        )
+    size = path.stat().st_size
+    summary = {"bundle": str(path), "bytes": size, "run": str(out / loop.RUN_JSON)}
+    print(json.dumps(summary) if args.json else f"wrote {path}, {size:,} bytes")
+    return 0
+
+
+def calibrate(args: argparse.Namespace) -> int:
+    """Fit the uncertainty of a trained model on new simulated sequences; its estimates stay the same."""
+    import torch
+
+    from neurove_core import models
+    from neurove_core.models import bundle
+    from neurove_core.training import config as configs
+    from neurove_core.training import pipeline
+
+    torch.set_num_threads(1)
+    config, model = configs.load(args.config), models.find(args.model)
+    out: Path = args.out or Path(f"{model.name}{bundle.SUFFIX}")
+    data: Path = args.data or Path("runs") / config.name / "data"
+    with progress() as show:
+        report = pipeline.calibrate(model, config, data, out, args.calibration_sequences, args.workers, show)
+    if args.json:
+        print(json.dumps({"bundle": str(out), **report}))
+        return 0
+    print(f"wrote {out}")
+    print(f"share of the truth in the {report['level']:.0%} interval, for sequences that the fit did not use:")
+    for name, axes in report["groups"].items():
+        print(f"{name:26}", *(f"{axis} {row[str(report['level'])]:.2f}" for axis, row in axes.items()))
+    return 0
+
+
+def evaluate(args: argparse.Namespace) -> int:
+    """Compare a model's estimates with the truth: RMSE and RE as in the paper, per axis and per recording."""
+    import torch
+
+    from neurove_core import models
+    from neurove_core.estimator import Estimator
+    from neurove_core.evaluation import evaluate as evaluation
+    from neurove_core.geometry import motion
+    from neurove_core.io.formats.pose_files import read_poses
+    from neurove_core.sources import open_source
+
+    torch.set_num_threads(1)
+    estimator = Estimator(models.find(args.model))
+    estimator.warm_up()
+    given = motion.twists(read_poses(args.truth)) if args.truth else None
+    evaluated = []
+    for source in args.recordings:
+        recording = open_source(source, args.sensor, args.topic)
+        truth = given or (None if recording.endless else recording.twists())
+        if truth is None:
+            why = "it never ends: add ?seconds=S" if recording.endless else "it holds no truth: give --truth FILE"
+            raise evaluation.NoTruth(f"{source}: {why}", source=source)
+        evaluated.append(evaluation.evaluate(evaluation.estimate_recording(estimator, recording), truth))
+    report = {"model": estimator.bundle.info.model_dump(), **evaluation.report(evaluated)}
+    print(json.dumps(report) if args.json else "\n".join(_table(report)))
+    if args.plot:
+        from neurove_core.evaluation.plots import plot, plot_reliability
+
+        files = [file for one in evaluated for file in plot(one, args.plot)]
+        if report["uncertainty"]:
+            files += plot_reliability(report["uncertainty"], args.plot)
+        for file in files:
+            print(f"wrote {file}", file=sys.stderr)
+    return 0
+
+
+def _table(report: dict[str, Any]) -> Iterator[str]:
+    """The lines of the report for people."""
+    yield f"{report['model']['name']} ({report['model']['digest'][:12]}), {report['windows']} windows"
+    yield f"{'':24} {'v_l RE':>7} {'RMSE m/s':>9} {'v_a RE':>7} {'RMSE deg/s':>10}  R2 v_l, v_a"
+    rows = [(report["model"]["name"], report), ("zero velocity", report["zero"]), ("mean of the truth", report["mean"])]
+    each = [(one["name"], one) for one in report["recordings"]] if len(report["recordings"]) > 1 else []
+    for name, row in [*rows, *each]:
+        errors = f"{_number(row['re_v_l'], 7)} {row['rmse_v_l_m_s']:9.3f} {_number(row['re_v_a'], 7)}"
+        explained = f"{_number(row['r2_v_l'], 6)} {_number(row['r2_v_a'], 6)}"
+        yield f"{name[:24]:24} {errors} {row['rmse_v_a_deg_s']:10.2f}  {explained}"
+    floors, without = report["re_floors"], (report["re_v_l_unfloored"], report["re_v_a_unfloored"])
+    yield f"RE counts truths above {floors['v_l_m_s']} m/s and {floors['v_a_rad_s']} rad/s"
+    yield f"without these floors it is {_number(without[0], 0)} and {_number(without[1], 0)}"
+    yield ""
+    yield f"{'axis':6} {'RMSE':>8} {'median':>8} {'bias':>8} {'spread':>8} {'correlation':>11}"
+    for axis, row in report["per_axis"].items():
+        unit = "deg_s" if axis[0] == "w" else "m_s"
+        numbers = [_number(row[f"{name}_{unit}"], 8) for name in ("rmse", "median_error", "bias", "spread")]
+        yield f"{axis:6} {' '.join(numbers)} {_number(row['correlation'], 11)}  {unit.replace('_s', '/s')}"
+    yield from _uncertainty_table(report["uncertainty"])
+    latency = report["latency_ms"]
+    rate = report["firing_rate"]
+    fires = "no spikes" if rate is None else f"firing rate {rate:.3f}"
+    yield f"{fires}; a window takes {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"
+    if not report["scaled"]:
+        yield "linear part: assumes a camera 1 m above the ground, because the recording does not give its height"
+
+
+def _uncertainty_table(report: dict[str, Any] | None) -> Iterator[str]:
+    if report is None:
+        yield "the model has no uncertainty: `neurove calibrate` adds it"
+        return
+    yield ""
+    inside = f"in {report['level']:.0%}"
+    yield f"{'axis':6} {'sigma':>8} {inside:>8}  median sigma; share of the truth in its interval"
+    for axis, row in report["per_axis"].items():
+        name, unit = ("median_sigma_rad_s", "rad/s") if axis[0] == "w" else ("median_sigma_m_s", "m/s")
+        yield f"{axis:6} {row[name]:8.3f} {row['coverage']:8.1%}   {unit}"
+    yield f"{report['uncertain_share']:.1%} of the estimates are flagged uncertain"
+
+
+def _number(value: float | None, width: int) -> str:
+    return f"{'-' if value is None else format(value, '.3f'):>{width}}"
+
+
+def add_train(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `neurove train`."""
+    command(parser, train)
+    about = "TOML file, or the name of a configuration: `default` is that of the built-in model"
+    parser.add_argument("config", metavar="CONFIG", help=about)
+    about = "folder for bundle, checkpoint, run.json and curve; default runs/NAME"
+    parser.add_argument("--out", type=Path, metavar="DIR", help=about)
+    parser.add_argument("--data", type=Path, metavar="DIR", help="folder for the sequences; default OUT/data")
+    parser.add_argument("--resume", action="store_true", help="continue from the checkpoint in OUT, if it exists")
+    about = "initialise weights from BUNDLE, a file or `default`, instead of randomly"
+    parser.add_argument("--start", metavar="BUNDLE", help=about)
+    about = "number of devices that share each batch; default 1"
+    parser.add_argument("--devices", type=int, default=1, metavar="N", help=about)
+    about = "auto, cpu or cuda; default auto: GPUs if there are any"
+    parser.add_argument("--device", default="auto", metavar="KIND", help=about)
+    _add_workers(parser)
+    about = "threads of each device's process; default 1"
+    parser.add_argument("--threads", type=int, default=1, metavar="N", help=about)
+    _add_calibration(parser, "; 0: no uncertainty")
+
+
+def add_calibrate(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `neurove calibrate`."""
+    command(parser, calibrate)
+    parser.add_argument("model", metavar="BUNDLE", help="file of a bundle, or `default`")
+    about = "configuration that trained the model; default `default`"
+    parser.add_argument("--config", default="default", metavar="CONFIG", help=about)
+    parser.add_argument("--data", type=Path, metavar="DIR", help="folder for the sequences; default runs/CONFIG/data")
+    _add_calibration(parser, "")
+    _add_workers(parser)
+    parser.add_argument("--out", type=Path, metavar="FILE", help="bundle to write; default NAME.safetensors")
+
+
+def add_evaluate(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `neurove evaluate`."""
+    command(parser, evaluate)
+    parser.add_argument("model", metavar="BUNDLE", help="file of a bundle, `default` or `untrained`")
+    about = "recordings with truth, such as sim://street?seconds=8"
+    parser.add_argument("recordings", nargs="+", metavar="RECORDING", help=about)
+    about = "poses of the camera, on the recording's clock; default: the truth in the recording"
+    parser.add_argument("--truth", type=Path, metavar="FILE", help=about)
+    add_recording_flags(parser)
+    parser.add_argument("--plot", type=Path, metavar="DIR", help="draw truth and estimate over time into this folder")
+
+
+def _add_workers(parser: argparse.ArgumentParser) -> None:
+    about = "number of processes that simulate; default 1"
+    parser.add_argument("--workers", type=int, default=1, metavar="N", help=about)
+
+
+def _add_calibration(parser: argparse.ArgumentParser, none: str) -> None:
+    about = f"number of simulated sequences to fit the uncertainty on; default {_CALIBRATION_SEQUENCES}{none}"
+    parser.add_argument("--calibration-sequences", type=int, default=_CALIBRATION_SEQUENCES, metavar="N", help=about)

@@ -1,0 +1,125 @@
+"""A camera driver: publish a recording or a synthetic source as event packets, paced by its sensor clock."""
+
+import math
+import threading
+import time
+from collections.abc import Iterator
+from typing import NamedTuple
+
+from neurove_core.io import BrokenRecording, Recording
+from neurove_core.io.packets import Slice, slices
+from neurove_protocol import EventPacket, Events
+from neurove_protocol.camera import SCHEMA as CAMERA_SCHEMA
+from neurove_protocol.events import SCHEMA as EVENTS_SCHEMA
+from neurove_protocol.events import encode_packet
+from neurove_protocol.keys import Keys
+from neurove_service.transport import Transport
+
+POLL_S = 0.02
+
+
+class PlaySummary(NamedTuple):
+    """The packets and events that a driver or a replay has published."""
+
+    packets: int
+    events: int
+    first_us: int | None  # sensor clock; None before the first packet
+    last_us: int | None  # of the newest event
+    broken: BrokenRecording | None  # where and why the recording ended early; None if it did not
+
+
+def repeated(recording: Recording) -> Iterator[Events]:
+    """The recording in an endless loop; the times of each turn continue those of the turn before."""
+    shift_us, end_us, first_us = 0, 0, None
+    while True:
+        for chunk in recording.chunks():
+            first_us = int(chunk.t[0]) if first_us is None else first_us
+            end_us = int(chunk.t[-1]) + shift_us
+            yield chunk._replace(t=chunk.t + shift_us)
+        if first_us is None:
+            return
+        shift_us = end_us + 1 - first_us
+
+
+class Driver:
+    """Publishes one stream.
+
+    Args:
+        recording: the source of events.
+        stream: name of the stream.
+        transport: an open session.
+        keys: keys of the deployment.
+    """
+
+    def __init__(self, recording: Recording, stream: str, transport: Transport, keys: Keys) -> None:
+        self._recording, self._stream = recording, stream
+        self._transport, self._keys = transport, keys
+        self._publisher = transport.publisher(keys.events(stream), EVENTS_SCHEMA)
+        self._announce_camera()
+
+    def _announce_camera(self) -> None:
+        camera = self._recording.camera(self._stream)
+        if camera is not None:
+            payload = camera.encode()
+            self._transport.answer(self._keys.camera(self._stream), lambda _: payload)
+            self._transport.put(self._keys.camera(self._stream), payload, CAMERA_SCHEMA)
+
+    @property
+    def label(self) -> str:
+        """Name of the stream, for messages."""
+        return self._stream
+
+    def wait_for_listener(self, timeout_s: float, stop: threading.Event) -> bool:
+        """Wait until a service subscribes to the stream.
+
+        Returns:
+            whether one did before the timeout and the stop event.
+        """
+        deadline = time.monotonic() + timeout_s
+        while not self._publisher.matching:
+            if time.monotonic() >= deadline or stop.wait(POLL_S):
+                return False
+        return True
+
+    def play(
+        self,
+        stop: threading.Event,
+        *,
+        speed: float = 1.0,
+        loop: bool = False,
+        duration_s: float = math.inf,
+    ) -> PlaySummary:
+        """Publish the recording until its end, the duration, or the stop event.
+
+        Args:
+            stop: ends the playback early.
+            speed: sensor seconds per second; infinity publishes as fast as the recording is read.
+            loop: start again at the end.
+            duration_s: sensor time to play [s].
+        """
+        chunks = repeated(self._recording) if loop and not self._recording.endless else self._recording.chunks()
+        sent = PlaySummary(0, 0, None, None, None)
+        began = 0.0
+        try:
+            for piece in slices(chunks):
+                if sent.first_us is None:
+                    began = time.monotonic()  # not earlier: opening and decoding take time
+                first_us = piece.t0_us if sent.first_us is None else sent.first_us
+                elapsed_s = (piece.end_us - first_us) / 1e6
+                if elapsed_s > duration_s or _stopped(stop, began + elapsed_s / speed):
+                    break
+                self._send(sent.packets, piece)
+                last_us = int(piece.events.t[-1]) if piece.events.n else sent.last_us
+                sent = PlaySummary(sent.packets + 1, sent.events + piece.events.n, first_us, last_us, None)
+        except BrokenRecording as error:
+            return sent._replace(broken=error)
+        return sent
+
+    def _send(self, seq: int, piece: Slice) -> None:
+        packet = EventPacket(self._stream, seq, self._recording.sensor, piece.t0_us, piece.events)
+        self._publisher.put(encode_packet(packet))
+
+
+def _stopped(stop: threading.Event, due: float) -> bool:
+    """Wait until `due` on the monotonic clock; return whether the stop event came first."""
+    return stop.wait(max(0.0, due - time.monotonic()))

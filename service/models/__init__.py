@@ -1,0 +1,1 @@
+"""The models of a node: which one serves, and how it changes."""

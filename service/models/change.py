@@ -1,0 +1,249 @@
+"""Change: one change of the active model, step by step.
+
+Verify, load, warm up, run the self-test, prime, optionally compare in shadow, switch, watch on probation; or roll back.
+The previous model serves until the switch. A change that is refused leaves no trace.
+"""
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+from neurove_core import self_test
+from neurove_core.estimator import Estimator
+from neurove_core.models.bundle import Bundle
+from neurove_protocol.errors import Conflict, InvalidField, NeuroVEError, NothingBefore
+from neurove_service import logs
+from neurove_service.models import admission, swap
+from neurove_service.models.library import MIN_DIGEST, Library
+from neurove_service.models.plan import Plan, SharedPlan
+from neurove_service.models.probation import Probation
+from neurove_service.models.progress import OnProgress, Progress, Step
+from neurove_service.streams.comparison import TrialLimits
+from neurove_service.streams.model_source import StreamView
+from neurove_service.streams.roles import Serving
+
+log = logs.get(__name__)
+
+
+class Rules(NamedTuple):
+    """The limits and times of a model change."""
+
+    probation_s: float = 10.0
+    shadow: TrialLimits = TrialLimits()
+    probation: TrialLimits = TrialLimits(divergence=3.0)  # wide, because the node rolls back without an operator
+    prime_s: float = 15.0  # maximum wait for windows that a bundle needs beyond those that are kept [s]
+    warm_up_share: float = 1.0  # bound of the 99th percentile of the time for a window, as a share of its duration
+
+
+class Context(NamedTuple):
+    """What every change of one node works with."""
+
+    plan: SharedPlan
+    library: Library
+    rules: Rules
+    on_changed: Callable[[Bundle], None]
+    free_bytes: Callable[[], int | None]
+
+
+class Change:
+    """One change; make a new one for each. The caller holds `SharedPlan.one_change`.
+
+    Args:
+        context: of the node.
+        on_progress: called at each step.
+    """
+
+    def __init__(self, context: Context, on_progress: OnProgress) -> None:
+        self._plan, self._library, self._rules, self._on_changed, self._free_bytes = context
+        self._on_progress = on_progress
+
+    def activate(
+        self, model: str, expect: str | None, shadow_s: float, canary: frozenset[str]
+    ) -> tuple[Bundle, Serving]:
+        """Make a model the active one, see `ModelSlot.activate`."""
+        with self._reporting(model):
+            _check_expected(self._plan.current, expect)
+            found = self._library.find(model)
+            candidate = _running_canary(self._plan.current, found, canary)
+            try:
+                if candidate is not None:
+                    self._prime(candidate, canary)
+                else:
+                    candidate = self._prepare(found, canary, shadow_s)
+                before = self._switch(candidate, canary)
+            except BaseException:
+                self._end_trial()
+                raise
+            limits = self._rules.probation.and_of(candidate.estimator.bundle)
+            probation_s = self._rules.probation_s
+            Probation(self._plan, candidate, probation_s, limits, self._on_changed, self._on_progress).start()
+            return before.estimator.bundle, candidate
+
+    def rollback(self, expect: str | None) -> tuple[Bundle, Serving]:
+        """Activate the previous model again, see `ModelSlot.rollback`."""
+        plan = self._plan.current
+        _check_expected(plan, expect)
+        if plan.tried is not None:
+            with self._plan.condition:
+                removed = (self._plan.current.tried or plan.tried).estimator.bundle
+                if self._plan.current.tried is not None:  # a fault may have rolled it back in the meantime
+                    self._plan.roll_back(f"{removed.name} was rolled back")
+            active = self._plan.current.active
+            self._on_progress(Progress("rolled_back", f"to {active.estimator.bundle.name}"))
+            return removed, active
+        previous = self._plan.previous
+        if previous is None:
+            raise NothingBefore
+        removed = plan.active.estimator.bundle
+        with self._reporting(previous.name):
+            estimator = self._load(previous)
+            self._plan.epoch += 1
+            serving = Serving(estimator, self._plan.epoch)
+            try:
+                self._prime(serving, frozenset())
+            except BaseException:
+                self._end_trial()
+                raise
+            self._plan.set(Plan(serving), f"{removed.name} was rolled back")
+            self._plan.previous = None
+            self._report("rolled_back", f"to {previous.name}; it was primed, because it did not run in standby")
+        self._on_changed(estimator.bundle)
+        return removed, serving
+
+    def _report(self, step: Step, text: str) -> None:
+        log.info("model change", step=step, text=text)
+        self._on_progress(Progress(step, text))
+
+    @contextlib.contextmanager
+    def _reporting(self, model: str) -> Iterator[None]:
+        """Report an error as the last step."""
+        try:
+            yield
+        except NeuroVEError as error:
+            self._plan.last_change = f"{model} was refused: {error.message}"
+            self._report("refused", error.message)
+            raise
+
+    def _prepare(self, found: Bundle, canary: frozenset[str], shadow_s: float) -> Serving:
+        """A model that is ready to serve: loaded, fast enough, primed, and compared in shadow if requested."""
+        self._report("verified", f"{found.name} {found.digest[:12]}")
+        estimator = self._load(found)
+        self._accept_trial()
+        candidate = Serving(estimator, self._plan.epoch + 1)
+        self._prime(candidate, canary)
+        if shadow_s > 0:
+            self._compare_in_shadow(candidate, canary, shadow_s)
+        return candidate
+
+    def _load(self, found: Bundle) -> Estimator:
+        """Load a model, warm it up, and check its memory, its golden test and its speed."""
+        admission.check_memory(found.name, admission.weight_bytes(found), self._free_bytes())
+        estimator = Estimator(found)
+        self._report("loaded", f"{found.info.parameters:,} parameters")
+        estimator.warm_up()
+        self_test.check(estimator)
+        p99_ms = admission.check_speed(estimator, self._rules.warm_up_share)
+        window_ms = estimator.config.window.duration_us / 1e3
+        self._report("warmed", f"p99 {p99_ms:.1f} ms for a window of {window_ms:g} ms")
+        return estimator
+
+    def _accept_trial(self) -> None:
+        """End a probation: its model passes."""
+        with self._plan.condition:
+            if self._plan.current.phase == "probation":
+                self._plan.set(Plan(self._plan.current.active))
+
+    def _end_trial(self) -> None:
+        """Stop the standby model of a refused change; a canary continues as before."""
+        with self._plan.condition:
+            plan = self._plan.current
+            if plan.phase in ("priming", "shadow"):
+                self._plan.set(Plan(plan.active))
+            elif plan.promoting:
+                self._plan.set(plan._replace(promoting=False))
+
+    def _prime(self, candidate: Serving, canary: frozenset[str]) -> None:
+        """Run a model over the newest windows of its streams; a promoted canary over those of all other streams."""
+        self._report("priming", f"{len(self._plan.streams(canary))} streams")
+        plan = self._plan.current
+        promoted = plan.phase == "canary"
+        if not plan.active.estimator.has_same_windows(candidate.estimator):
+            if not promoted:
+                self._start_cold(candidate, canary)
+            return
+        served = plan.only if promoted else frozenset[str]()
+        standby = plan._replace(promoting=True) if promoted else Plan(plan.active, candidate, canary, "priming")
+        self._plan.set(standby)
+
+        def streams() -> list[StreamView]:
+            return [one for one in self._plan.streams(canary) if one.name not in served]
+
+        primed, left = swap.prime(candidate, streams, self._rules.prime_s, self._plan.closing.wait)
+        self._report("priming", f"{primed} streams replayed their newest windows, {left} streams had none")
+
+    def _start_cold(self, candidate: Serving, canary: frozenset[str]) -> None:
+        """Run a model with other windows in standby, from the zero state, until it has settled."""
+        self._report("priming", "its windows or its grid differ from the active model's: it starts cold in standby")
+        active = self._plan.current.active
+        self._plan.set(Plan(active, candidate, canary, "shadow"))
+        deadline = time.monotonic() + swap.max_settling_s(candidate)
+        while not swap.settled(candidate, self._plan.streams(canary)) and time.monotonic() < deadline:
+            if self._plan.closing.wait(swap.POLL_S):
+                break
+
+    def _compare_in_shadow(self, candidate: Serving, canary: frozenset[str], seconds: float) -> None:
+        active = self._plan.current.active
+        self._report("shadow", f"for {seconds:g} s in parallel with {active.estimator.bundle.name}")
+        self._plan.set(Plan(self._plan.current.active, candidate, canary, "shadow"))
+        limits = self._rules.shadow.and_of(candidate.estimator.bundle)
+        wait = self._plan.closing.wait
+        found = swap.compare_in_shadow(candidate, lambda: self._plan.streams(canary), seconds, limits, wait)
+        self._report("shadow", "; ".join(f"{name}: {figures}" for name, figures in found.items()))
+
+    def _switch(self, candidate: Serving, canary: frozenset[str]) -> Serving:
+        """Let a model serve, on the canary's streams or on all; return the model that was active."""
+        with self._plan.condition:
+            old, new = self._plan.current.active, candidate.estimator.bundle
+            self._plan.epoch = max(self._plan.epoch, candidate.epoch)
+            if canary:
+                self._plan.set(Plan(old, candidate, canary, "canary"), f"{new.name} is a canary")
+            else:
+                self._plan.previous = old.estimator.bundle
+                self._plan.set(Plan(candidate, old, phase="probation"), f"{new.name} is active")
+        log.info("model changed", model=new.name, digest=new.digest[:12], canary=sorted(canary))
+        missing = sorted(canary - {stream.name for stream in self._plan.streams(canary)})
+        where = f"on {', '.join(sorted(canary))}" if canary else "on all streams"
+        self._report("active", f"{where}{f'; these streams do not exist yet: {missing}' if missing else ''}")
+        probation = f"for {self._rules.probation_s:g} s"
+        self._report("probation", "until it is promoted or rolled back" if canary else probation)
+        return old
+
+
+def _check_expected(plan: Plan, expect: str | None) -> None:
+    """Check that the expected model is the tried one, or the active one if none is tried.
+
+    Raises:
+        Conflict: another model is.
+    """
+    if expect is None:
+        return
+    if len(expect) < MIN_DIGEST:
+        raise InvalidField("model change", "expect", expect, f"at least {MIN_DIGEST} digits of a digest")
+    active = (plan.tried or plan.active).estimator.bundle
+    if not active.digest.startswith(expect):
+        raise Conflict(f"expected {expect} to be active, but {active.name} {active.digest} is active")
+
+
+def _running_canary(plan: Plan, found: Bundle, canary: frozenset[str]) -> Serving | None:
+    """The canary of this model, which serves all streams without being loaded again.
+
+    Raises:
+        Conflict: there is a canary, and this change does not promote it.
+    """
+    if plan.phase != "canary" or plan.other is None:
+        return None
+    running = plan.other.estimator.bundle
+    if canary or running.digest != found.digest:
+        raise Conflict(f"a canary of {running.name} {running.digest} is running: promote it or roll it back first")
+    return plan.other

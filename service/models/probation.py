@@ -1,0 +1,87 @@
+"""Probation: watch a new model on the streams that it serves; roll it back if it breaks a limit."""
+
+import threading
+import time
+from collections.abc import Callable
+
+from neurove_core.models.bundle import Bundle
+from neurove_service import logs
+from neurove_service.models import swap
+from neurove_service.models.plan import Plan, SharedPlan
+from neurove_service.models.progress import OnProgress, Progress
+from neurove_service.streams.comparison import TrialLimits
+from neurove_service.streams.roles import Serving
+
+log = logs.get(__name__)
+
+
+class Probation:
+    """Watches one model on a thread of its own until its probation or its canary has ended.
+
+    Args:
+        plan: in which the model is tried.
+        candidate: the model.
+        probation_s: duration of the probation [s]; a canary has no end of its own.
+        limits: the limits of the model.
+        on_changed: called with the model to save: the candidate after its probation, or the model after a rollback.
+        on_progress: called with the last step.
+    """
+
+    def __init__(
+        self,
+        plan: SharedPlan,
+        candidate: Serving,
+        probation_s: float,
+        limits: TrialLimits,
+        on_changed: Callable[[Bundle], None],
+        on_progress: OnProgress,
+    ) -> None:
+        self._plan, self._candidate = plan, candidate
+        self._phase, self._deadline = plan.current.phase, time.monotonic() + probation_s
+        self._limits = limits
+        self._on_changed, self._on_progress = on_changed, on_progress
+
+    def start(self) -> None:
+        """Start the thread."""
+        threading.Thread(target=self._run, name="probation", daemon=True).start()
+
+    def _run(self) -> None:
+        while (plan := self._still_tried()) is not None:
+            figures = swap.figures(self._candidate, self._plan.streams(plan.only), serving_is_tried=True)
+            wrong = swap.first_violation(figures, self._limits, swap.PROBATION_WINDOWS)
+            if wrong is not None:
+                self._plan.fault(self._candidate, f"stream {wrong[0]}: {wrong[1]}")
+                continue
+            with self._plan.condition:
+                if self._plan.current is plan:
+                    self._plan.condition.wait(min(swap.POLL_S, max(0.001, self._deadline - time.monotonic())))
+        if not self._plan.closing.is_set():
+            self._end()
+
+    def _still_tried(self) -> Plan | None:
+        """The plan, if the model is still tried in the same phase; at the end of its probation it passes."""
+        with self._plan.condition:
+            plan = self._plan.current
+            if plan.tried is not self._candidate or plan.phase != self._phase or self._plan.closing.is_set():
+                return None
+            if self._phase == "probation" and time.monotonic() >= self._deadline:
+                name = self._candidate.estimator.bundle.name
+                self._plan.set(Plan(self._candidate), f"{name} is active: it passed its probation")
+                return None
+            return plan
+
+    def _end(self) -> None:
+        with self._plan.condition:
+            plan, summary = self._plan.current, self._plan.last_change
+        model = self._candidate.estimator.bundle
+        if plan.active is self._candidate:
+            if plan.phase == "steady":
+                log.info("probation passed", model=model.name)
+                self._on_changed(model)
+                self._on_progress(Progress("done", summary))
+            return  # otherwise the canary was promoted, and its probation has its own thread
+        if self._plan.rolled_back is self._candidate:
+            self._on_changed(plan.active.estimator.bundle)
+            self._on_progress(Progress("rolled_back", summary))
+        else:
+            self._on_progress(Progress("done", f"{model.name}: a later change ended its probation"))

@@ -1,0 +1,174 @@
+"""ModelSlot: which models serve the streams of a node, and the entry to a model change while they run."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from neurove_core.estimator import Estimator
+from neurove_core.models.bundle import Bundle
+from neurove_protocol.errors import BadModel, UnknownModel
+from neurove_service import logs
+from neurove_service.models import admission
+from neurove_service.models.change import Change, Context, Rules
+from neurove_service.models.library import Available, Files, Library, nothing_pushed
+from neurove_service.models.plan import Plan, SharedPlan
+from neurove_service.models.progress import OnProgress, silent
+from neurove_service.streams.model_source import StreamView
+from neurove_service.streams.roles import Roles, Serving
+
+log = logs.get(__name__)
+
+
+class ModelSlot:
+    """Holds the active model. A change replaces it as a whole, after the new model is loaded, checked and warm.
+
+    Args:
+        model: name of a built-in model or of one in the folder, or path of a bundle file.
+        models_dir: folder of bundles that may be activated.
+        rules: limits and times of a change.
+        on_changed: called with the model to save, after it passed its probation or after a rollback; on a thread of
+            the slot or of the caller, never on a stream's.
+        free_bytes: free memory [bytes].
+        pushed: files of the bundles that were pushed to this node, by digest.
+        kept: digests of the last active model and the one before; if they can be loaded, they take precedence over
+            `model`.
+
+    Raises:
+        BadModel, UnknownModel: the first model cannot be loaded.
+    """
+
+    def __init__(
+        self,
+        model: str,
+        models_dir: Path | None = None,
+        rules: Rules = Rules(),  # noqa: B008  # immutable
+        on_changed: Callable[[Bundle], None] = lambda _: None,
+        free_bytes: Callable[[], int | None] = admission.free_bytes,
+        *,
+        pushed: Files = nothing_pushed,
+        kept: tuple[str | None, str | None] = (None, None),
+    ) -> None:
+        library = Library(models_dir, pushed)
+        active, previous = (_kept(library, digest) if digest else None for digest in kept)
+        estimator = Estimator(_first(library, model, active))
+        estimator.warm_up()
+        self._shared = SharedPlan(Serving(estimator, 0), previous)
+        self.closing = self._shared.closing  # set when the node stops; a probation then ends without a last step
+        self._context = Context(self._shared, library, rules, on_changed, free_bytes)
+
+    @property
+    def active(self) -> Serving:
+        """The active model; during a canary it serves all other streams."""
+        return self._shared.current.active
+
+    @property
+    def previous(self) -> Bundle | None:
+        """The model that a rollback activates."""
+        return self._shared.previous
+
+    @property
+    def plan(self) -> Plan:
+        """Which models are at work."""
+        return self._shared.current
+
+    @property
+    def last_change(self) -> str:
+        """One sentence about the newest change; empty before the first one."""
+        return self._shared.last_change
+
+    @property
+    def rollbacks(self) -> int:
+        """Number of automatic rollbacks since the start."""
+        return self._shared.rollbacks
+
+    def roles(self, stream: str) -> Roles:
+        """Which models work on a stream from its next packet on."""
+        return self._shared.current.roles(stream)
+
+    def join(self, stream: StreamView) -> None:
+        """Include a stream in every change from now on, for as long as the stream lives."""
+        self._shared.join(stream)
+
+    def fault(self, serving: Serving, why: str) -> None:
+        """Roll back a model on probation at once, on all streams; does nothing if it is not on probation any more."""
+        self._shared.fault(serving, why)
+
+    def available(self) -> Available:
+        """Every model that can be activated, and the files that are no models."""
+        return self._context.library.available()
+
+    def activate(
+        self,
+        model: str,
+        *,
+        expect: str | None = None,
+        shadow_s: float = 0.0,
+        canary: frozenset[str] = frozenset(),
+        on_progress: OnProgress = silent,
+    ) -> tuple[Bundle, Serving]:
+        """Make a model the active one. The previous model serves until the new one is ready; it stays after a refusal.
+
+        The call returns when streams answer with the new model. Its probation goes on; its end is the last step that
+        `on_progress` gets. A change during a probation ends it: the model on probation passes.
+
+        Args:
+            model: its name, or at least the first 8 digits of its digest.
+            expect: the first 8 or more digits of the digest of the active model; another active model is a conflict.
+            shadow_s: time in shadow before activation, in which the model is compared with the active one [s].
+            canary: change only these streams; a second call without it changes the other streams too.
+            on_progress: called at each step, on this thread; after the return on a thread of the slot.
+
+        Returns:
+            the previous model, and the model that now serves the streams concerned.
+
+        Raises:
+            UnknownModel, BadModel, Conflict, NoMemory, TooSlow, Diverged: nothing changed.
+        """
+        with self._shared.one_change(on_progress):
+            return Change(self._context, on_progress).activate(model, expect, shadow_s, canary)
+
+    def rollback(self, *, expect: str | None = None, on_progress: OnProgress = silent) -> tuple[Bundle, Serving]:
+        """Activate the previous model again.
+
+        During probation and a canary it runs in standby, so its estimates are those of a run without the change.
+
+        Args:
+            expect: as in activate; refers to the tried model, if there is one.
+            on_progress: called at each step.
+
+        Returns:
+            the model that was rolled back, and the model that serves now.
+
+        Raises:
+            Conflict: another change is in progress, or another model is active.
+            NothingBefore: there is no previous model.
+        """
+        with self._shared.one_change(on_progress):
+            return Change(self._context, on_progress).rollback(expect)
+
+    def await_probation(self, timeout_s: float) -> bool:
+        """Wait until no model is on probation; return False after the timeout."""
+        return self._shared.await_probation(timeout_s)
+
+    def close(self) -> None:
+        """Stop waiting in a change or a probation; no probation passes after this."""
+        self._shared.close()
+
+
+def _first(library: Library, model: str, kept: Bundle | None) -> Bundle:
+    """The model that a node starts with."""
+    try:
+        configured = library.open(model)
+    except (BadModel, UnknownModel) as error:
+        if kept is None:
+            raise
+        log.warning("configured model not loaded", model=model, why=error.message, serving=kept.name)
+        return kept
+    return kept or configured
+
+
+def _kept(library: Library, digest: str) -> Bundle | None:
+    try:
+        return library.find(digest)
+    except (BadModel, UnknownModel) as error:
+        log.warning("cannot restore the last active model", digest=digest, why=error.message)
+        return None

@@ -1,0 +1,1 @@
+"""The service process: build, start, answer queries, watch, stop."""

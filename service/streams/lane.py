@@ -1,0 +1,126 @@
+"""Lane: one model's state on one stream."""
+
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from neurove_core.estimator import Estimator, StreamState, WindowEstimate
+from neurove_core.ingest.windows import Window
+from neurove_core.networks.neurove import NetworkState
+from neurove_service.streams.comparison import WindowResult
+from neurove_service.streams.ring import PackedWindow
+from neurove_service.streams.roles import Serving
+
+PRIME_WINDOWS = 64
+"""Windows that are replayed if the bundle does not say how many. More windows leave less of the change visible; no
+measured number leaves none of it (decision 29)."""
+
+Pace = Callable[[float], object]
+
+
+class NotFinite(ArithmeticError):
+    """A model computed values that are not finite."""
+
+
+class TimedEstimate(NamedTuple):
+    """An estimate and its cost."""
+
+    estimate: WindowEstimate
+    rate: float  # share of the estimator's cells that fired
+    took_ms: float  # processor time
+
+    @property
+    def result(self) -> WindowResult:
+        """The part of the estimate that is compared."""
+        return WindowResult(self.estimate.end_us, self.estimate.twists.mean(axis=0), self.rate)
+
+
+class Lane:
+    """One model's state on one stream.
+
+    Args:
+        serving: the model.
+        state: its initial state.
+        complete_from_us: windows that begin earlier are incomplete, because this lane did not get their first events.
+    """
+
+    def __init__(self, serving: Serving, state: StreamState, complete_from_us: int | None = None) -> None:
+        self.serving, self.state = serving, state
+        self._complete_from_us = complete_from_us
+        self._answers_from_us: int | None = None
+
+    @property
+    def estimator(self) -> Estimator:
+        """The estimator of the model."""
+        return self.serving.estimator
+
+    @property
+    def next_us(self) -> int | None:
+        """Start of the next window [us]; None before the first packet."""
+        return self.state.windows.start_us
+
+    def has_all_events(self, window: Window) -> bool:
+        """Whether this lane got all events of a window."""
+        return self._complete_from_us is None or window.start_us >= self._complete_from_us
+
+    def answer_from(self, start_us: int | None) -> None:
+        """Do not answer windows that begin earlier: the previous lane answered them."""
+        self._answers_from_us = start_us
+
+    def may_answer(self, start_us: int) -> bool:
+        """Whether this lane answers a window that begins here."""
+        return self._answers_from_us is None or start_us >= self._answers_from_us
+
+    def follow(self, windows: list[Window], *, checked: bool = False) -> list[TimedEstimate]:
+        """Answer windows in order; if an error is raised, the state stays as before the call.
+
+        Args:
+            windows: with the duration and the grid of this model.
+            checked: whether to check the answers and the state for values that are not finite.
+
+        Raises:
+            NotFinite: a value is not finite.
+        """
+        state, answers = self.state, []
+        for window in windows:
+            if not self.has_all_events(window):
+                continue
+            began = time.thread_time()  # as in admission: time spent waiting for other work is not the model's
+            (estimate,), state = self.estimator.follow((window,), state)
+            took_ms = 1e3 * (time.thread_time() - began)
+            if checked and not (np.isfinite(estimate.twists).all() and state.network.finite()):
+                raise NotFinite(f"not finite in the window at {window.start_us} us")
+            answers.append(TimedEstimate(estimate, _rate(state), took_ms))
+        self.state = state
+        return answers
+
+
+def _rate(state: StreamState) -> float:
+    """Share of the estimator's cells that fired; 0 in a network without spiking cells."""
+    if not isinstance(state.network, NetworkState):
+        return 0.0
+    return float(torch.stack([cell.s.mean() for cell in state.network.cells]).mean())
+
+
+def windows_to_prime(estimator: Estimator) -> int:
+    """Number of windows that a model should see before it answers a stream: the bundle's value if it has one."""
+    wanted = estimator.bundle.metadata.prime_windows
+    return max(estimator.config.settle_windows, PRIME_WINDOWS) if wanted is None else wanted
+
+
+def replay(lane: Lane, entries: list[PackedWindow], pace: Pace | None = None) -> Lane:
+    """Run a lane over past windows.
+
+    Args:
+        lane: its model has the duration and the grid of these windows.
+        entries: oldest first.
+        pace: called after each window with the time that it took [s], to leave processor time to other work.
+    """
+    for entry in entries:
+        for answer in lane.follow([entry.window()]):
+            if pace is not None:
+                pace(answer.took_ms / 1e3)
+    return lane

@@ -1,0 +1,146 @@
+"""StreamRegistry: the streams that a node serves, each with its worker; refused streams; eviction of idle streams."""
+
+import os
+import threading
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+from neurove_protocol.events import PacketLimits
+from neurove_service import logs
+from neurove_service.streams.history import RingSize
+from neurove_service.streams.model_source import ModelSource
+from neurove_service.streams.stream import Stream
+from neurove_service.streams.worker import Inbox, Outlet, StreamWorker
+
+log = logs.get(__name__)
+
+MAX_REFUSED = 1024
+"""Names of refused streams that are remembered."""
+
+STALLED_LOOP_S = 10.0
+"""A worker whose loop has not turned for this time is stuck."""
+
+_JOIN_S = 1.0
+
+
+class StreamSettings(NamedTuple):
+    """Bounds of every stream of a node."""
+
+    max_streams: int
+    idle_evict_s: float
+    queue_s: float
+    queue_bytes: int
+    ring: RingSize
+    limits: PacketLimits
+
+
+class StreamRegistry:
+    """Starts a worker for each stream at its first packet or CameraInfo; thread-safe.
+
+    Args:
+        models: gives streams their models.
+        settings: bounds of every stream.
+        open_outlet: opens the outlet of a stream, by its name; called on the thread of the worker.
+    """
+
+    def __init__(self, models: ModelSource, settings: StreamSettings, open_outlet: Callable[[str], Outlet]) -> None:
+        self._models, self._settings, self._open_outlet = models, settings, open_outlet
+        self._workers: dict[str, StreamWorker] = {}
+        self._standby_slots = threading.Semaphore(max(1, (os.cpu_count() or 1) // 2))  # the rest is for serving models
+        self._refused: dict[str, float] = {}  # stream -> time of its newest message
+        self._lock = threading.Lock()  # of both dicts; only its worker changes a stream
+        self._closed = False
+
+    def put_packet(self, stream: str, payload: bytes, received_ns: int) -> None:
+        """Queue an event packet, on Zenoh's thread: this finds or starts a worker and appends, nothing else."""
+        with self._lock:
+            worker = self._worker_of(stream)
+            if worker is not None:
+                worker.put_packet(payload, received_ns)
+
+    def put_camera(self, stream: str, payload: bytes, received_ns: int) -> None:
+        """Queue a CameraInfo, as put_packet."""
+        with self._lock:
+            worker = self._worker_of(stream)
+            if worker is not None:
+                worker.put_camera(payload, received_ns)
+
+    def refuse(self, name: str) -> None:
+        """Count a stream whose name is not valid."""
+        with self._lock:
+            self._refuse(name)
+
+    @property
+    def refused(self) -> int:
+        """Number of streams that were refused and are still sending."""
+        return len(self._refused)
+
+    def streams(self) -> list[Stream]:
+        """The streams that are served now."""
+        with self._lock:
+            return [worker.stream for worker in self._workers.values()]
+
+    def evict_idle(self) -> list[str]:
+        """End the workers of idle streams; return their names."""
+        idle_ns = self._settings.idle_evict_s * 1e9
+        now_ns = time.monotonic_ns()
+        with self._lock:
+            idle = [
+                name
+                for name, worker in self._workers.items()
+                if now_ns - worker.stream.activity.last_packet_ns > idle_ns
+            ]
+            for name in [name for name, heard in self._refused.items() if (now_ns - heard * 1e9) > idle_ns]:
+                del self._refused[name]
+        self._end(idle)
+        for name in idle:
+            log.info("stream evicted", stream=name, idle_s=self._settings.idle_evict_s)
+        return idle
+
+    def close(self) -> None:
+        """End all workers and start no new ones."""
+        with self._lock:
+            self._closed = True
+            names = list(self._workers)
+        self._end(names)
+
+    def alive(self) -> bool:
+        """Whether the loop of every worker has turned recently."""
+        with self._lock:
+            beats = [worker.beat_ns for worker in self._workers.values()]
+        return all((time.monotonic_ns() - beat) / 1e9 < STALLED_LOOP_S for beat in beats)
+
+    def _worker_of(self, name: str) -> StreamWorker | None:
+        worker = self._workers.get(name)
+        if worker is not None or self._closed:
+            return worker
+        if len(self._workers) >= self._settings.max_streams:
+            self._refuse(name)
+            return None
+        settings = self._settings
+        worker = StreamWorker(
+            Stream(name, self._models, ring=settings.ring),
+            lambda: self._open_outlet(name),
+            Inbox(settings.queue_s, settings.queue_bytes),
+            settings.limits,
+            self._standby_slots,
+        )
+        self._workers[name] = worker
+        return worker
+
+    def _refuse(self, name: str) -> None:
+        known = name in self._refused
+        if not known and len(self._refused) < MAX_REFUSED:
+            serving, most = len(self._workers), self._settings.max_streams
+            log.warning("stream refused", stream=name, serving=serving, max_streams=most)
+        if known or len(self._refused) < MAX_REFUSED:
+            self._refused[name] = time.monotonic()
+
+    def _end(self, names: list[str]) -> None:
+        with self._lock:
+            ending = [self._workers.pop(name) for name in names]
+        for worker in ending:
+            worker.stop()
+        for worker in ending:
+            worker.join(timeout_s=_JOIN_S)

@@ -1,0 +1,196 @@
+"""The queue and the thread of one stream: bytes in from Zenoh's thread, estimates out."""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import NamedTuple
+
+from neurove_core.ingest.wire import read_packet
+from neurove_protocol import CameraInfo
+from neurove_protocol.errors import NeuroVEError
+from neurove_protocol.events import PacketLimits
+from neurove_protocol.velocity import TwistEstimate
+from neurove_service import logs
+from neurove_service.streams.stream import Arrival, Stream
+
+log = logs.get(__name__)
+
+_IDLE_BEAT_S = 0.5
+_RETRY_STANDBY_S = 0.002
+_MAX_PAUSE_S = 0.02
+_SAMPLE_BYTES = 256
+
+
+class Sample(NamedTuple):
+    """One message from the network."""
+
+    payload: bytes
+    received_ns: int
+    is_camera: bool
+
+    @property
+    def size(self) -> int:
+        """Memory of the message, with its overhead [bytes]."""
+        return len(self.payload) + _SAMPLE_BYTES
+
+
+class Inbox:
+    """A queue between Zenoh's thread and a worker, bounded in age and bytes; it drops and counts the oldest samples.
+
+    The age bound matters most. A worker that falls behind for a moment catches up in a fraction of it, because a window
+    costs a tenth of its own duration. A worker that stays behind answers with data no older than this (decision 6).
+
+    Args:
+        max_age_s: a sample that is older than this is dropped when the next one arrives [s].
+        max_bytes: maximum memory of all samples [bytes].
+    """
+
+    def __init__(self, max_age_s: float, max_bytes: int) -> None:
+        self._samples: deque[Sample] = deque()
+        self._max_age_ns, self._max_bytes = max_age_s * 1e9, max_bytes
+        self._bytes = self._dropped = 0
+        self._changed = threading.Condition()
+
+    def put(self, sample: Sample) -> None:
+        """Append a sample; does not wait for the worker."""
+        with self._changed:
+            self._samples.append(sample)
+            self._bytes += sample.size
+            oldest_ns = sample.received_ns - self._max_age_ns
+            while self._bytes > self._max_bytes or self._samples[0].received_ns < oldest_ns:
+                self._bytes -= self._samples.popleft().size
+                self._dropped += 1
+                if not self._samples:
+                    break
+            self._changed.notify()
+
+    def wake(self) -> None:
+        """Let a waiting `take` return."""
+        with self._changed:
+            self._changed.notify_all()
+
+    def take(self, timeout_s: float) -> tuple[Sample | None, int]:
+        """The oldest sample, or None after the timeout; and the number of samples dropped since the last call."""
+        with self._changed:
+            if not self._samples:
+                self._changed.wait(timeout_s)
+            dropped, self._dropped = self._dropped, 0
+            sample = self._samples.popleft() if self._samples else None
+            self._bytes -= sample.size if sample else 0
+            return sample, dropped
+
+
+class Outlet(NamedTuple):
+    """What a worker needs from the network; opened and used on the worker's own thread."""
+
+    ask_camera: Callable[[], CameraInfo | None]
+    publish: Callable[[bytes], None]
+    close: Callable[[], None]
+
+
+class StreamWorker:
+    """Runs one Stream on its own thread.
+
+    Args:
+        stream: only this thread changes its state.
+        open_outlet: called first on the thread.
+        inbox: the queue.
+        limits: limits of packets.
+        standby_slots: limits how many workers of the node run a standby model at once; None: no limit.
+    """
+
+    def __init__(
+        self,
+        stream: Stream,
+        open_outlet: Callable[[], Outlet],
+        inbox: Inbox,
+        limits: PacketLimits,
+        standby_slots: threading.Semaphore | None = None,
+    ) -> None:
+        self.stream = stream
+        self.beat_ns = time.monotonic_ns()
+        self._inbox = inbox
+        self._open_outlet, self._limits = open_outlet, limits
+        self._standby_slots = standby_slots or threading.Semaphore()
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"stream {stream.name}", daemon=True)
+        self._thread.start()
+
+    def put_packet(self, payload: bytes, received_ns: int) -> None:
+        """Queue an event packet."""
+        self._inbox.put(Sample(payload, received_ns, is_camera=False))
+
+    def put_camera(self, payload: bytes, received_ns: int) -> None:
+        """Queue a CameraInfo."""
+        self._inbox.put(Sample(payload, received_ns, is_camera=True))
+
+    def stop(self) -> None:
+        """Ask the thread to end; queued samples are not processed."""
+        self._stopping.set()
+        self._inbox.wake()
+
+    def join(self, timeout_s: float) -> None:
+        """Wait for the end of the thread."""
+        self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        outlet = self._open_outlet()
+        try:
+            self._set_camera(outlet.ask_camera)
+            pause_until = 0.0  # a time, not a duration: packets that arrive in a pause must not extend it
+            while not self._stopping.is_set():
+                self.beat_ns = time.monotonic_ns()
+                pause_s = max(0.0, pause_until - time.monotonic())
+                sample, dropped = self._inbox.take(pause_s if self.stream.lanes.has_backlog else _IDLE_BEAT_S)
+                if dropped:
+                    self.stream.overloaded(dropped)
+                if sample is not None:
+                    self._work(sample, outlet)
+                elif self.stream.lanes.has_backlog:
+                    pause_until = time.monotonic() + self._run_standby()
+        finally:
+            outlet.close()
+
+    def _run_standby(self) -> float:
+        """Run one step of the standby model; return the pause after it [s], which leaves the processor to others."""
+        if not self._standby_slots.acquire(blocking=False):
+            return _RETRY_STANDBY_S
+        began = time.monotonic()
+        try:
+            self.stream.lanes.run_standby()
+        finally:
+            self._standby_slots.release()
+        return min(_MAX_PAUSE_S, time.monotonic() - began)  # as long as the step: half of the time
+
+    def _work(self, sample: Sample, outlet: Outlet) -> None:
+        if sample.is_camera:
+            self._set_camera(lambda: CameraInfo.decode(sample.payload))
+            return
+        try:
+            arrival = Arrival(sample.received_ns, time.monotonic_ns())
+            packet = read_packet(sample.payload, self._limits)
+            for estimate in self.stream.accept(packet, arrival):
+                self._publish(estimate, outlet)
+        except NeuroVEError as error:
+            total = self.stream.refused(sample.received_ns)
+            if total & (total - 1) == 0:  # log the 1st, 2nd, 4th, 8th, ...: packets are only counted
+                log.warning("packet refused", stream=self.stream.name, why=error.message, total=total)
+        except Exception:  # an internal error on one packet must not end the stream
+            self.stream.failed()
+            log.exception("packet failed", stream=self.stream.name)
+
+    def _publish(self, estimate: TwistEstimate, outlet: Outlet) -> None:
+        trace = estimate.trace.model_copy(update={"published_ns": time.monotonic_ns()})
+        stamped = estimate.model_copy(update={"trace": trace})
+        outlet.publish(stamped.encode())
+        self.stream.activity.published(stamped)
+
+    def _set_camera(self, get: Callable[[], CameraInfo | None]) -> None:
+        try:
+            camera = get()
+        except NeuroVEError as error:
+            log.warning("camera info refused", stream=self.stream.name, why=error.message)
+            return
+        if camera is not None:
+            self.stream.set_camera(camera)

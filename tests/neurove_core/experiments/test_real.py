@@ -1,0 +1,132 @@
+"""Real events: every check gives its figure and its bound, or the reason why it was skipped."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from neurove_core import models
+from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
+from neurove_core.estimator import Estimator
+from neurove_core.evaluation.contrast import angular
+from neurove_core.evaluation.evaluate import estimate_recording
+from neurove_core.experiments import real
+from neurove_core.models import bundle
+from neurove_core.sources import open_source
+from neurove_protocol import Events, Sensor
+from neurove_service.cli import main
+from tests.builders import make_events
+from tests.recordings import SHARED, aedat4, ecd_text, shared
+
+RESULTS = Path(real.__file__).parent / "results"
+CALIB = "199.1 198.8 132.2 110.7 -0.368 0.151 -0.0003 -0.0008 0.0\n"
+SMALL = ModelConfig(
+    canonical=CanonicalConfig(width=24, height=18), network=NetworkConfig(channels=(4, 4), features=8, hidden=8)
+)
+
+
+@pytest.fixture(scope="module")
+def estimator():
+    return Estimator(bundle.untrained(3, SMALL, "small"))
+
+
+def rotating_camera(seconds: float, rad_s: float = 1.0) -> Events:
+    rotation = f"rotation?wx={rad_s / 2}%26wy={rad_s}"
+    source = f"sim://room?seed=2&camera=davis240c&pitch=0&seconds={seconds}&trajectory={rotation}"
+    return Events.join(list(open_source(source).chunks()))
+
+
+def by_name(rows):
+    return {(row["recording"].split("/")[0], row["what"].split(",")[0]): row for row in rows}
+
+
+def test_without_recordings_every_check_is_skipped_with_the_reason(estimator, tmp_path):
+    rows = list(real.run(estimator, tmp_path))
+    assert len(rows) == len(real.CHECKS)
+    assert {row["skipped"] for row in rows} == {"the recording is missing"}
+    assert {row["met"] for row in rows} == {None}
+    assert real.markdown(rows, "no model").count("skipped") == len(rows)
+
+
+def test_a_rotating_camera_is_compared_with_contrast_maximisation_over_complete_windows(estimator, tmp_path):
+    folder = tmp_path / "ecd" / "shapes_rotation"
+    folder.mkdir(parents=True)
+    events = rotating_camera(0.13)
+    events = events._replace(t=events.t + 20_000)  # so that the first and the last window are incomplete
+    (folder / "events.txt").write_bytes(ecd_text(events))
+    (folder / "calib.txt").write_text(CALIB)
+    row = by_name(real.run(estimator, tmp_path))["ecd", "rate of turning"]
+    recording = open_source(str(folder))
+    camera = recording.camera("real")
+    first, stop = events.t.searchsorted([50_000, 100_000])
+    true = angular(events.span(int(first), int(stop)), camera).w_rad_s
+    answers = estimate_recording(estimator, recording)
+    found = answers.twists[answers.start_us.tolist().index(50_000), :, 3:].mean(0)
+    assert row["made_of"]["contrast maximisation [rad/s]"] == pytest.approx(true.tolist(), rel=1e-3)
+    assert row["made_of"]["estimate [rad/s]"] == pytest.approx(found.tolist())
+    assert row["value"] == pytest.approx(np.linalg.norm(found - true) / np.linalg.norm(true), rel=1e-3)
+    assert row["met"] is (row["value"] <= 0.25)
+
+
+def test_a_recording_without_truth_or_a_complete_window_is_skipped_with_the_reason(estimator, tmp_path):
+    for place, events in (
+        ("slider_depth/events_chunk.txt", rotating_camera(0.11)),
+        ("ecd/shapes_rotation/events.txt", None),
+    ):
+        file = tmp_path / place
+        file.parent.mkdir(parents=True)
+        file.write_bytes(ecd_text(events if events is not None else rotating_camera(0.04)))
+    rows = by_name(real.run(estimator, tmp_path))
+    assert "groundtruth.txt" in rows["slider_depth", "direction of motion"]["skipped"]
+    assert "no complete window of 50 ms" in rows["ecd", "rate of turning"]["skipped"]
+
+
+def test_profiles_and_stationary_cameras_are_evaluated_over_their_windows(estimator, tmp_path):
+    (tmp_path / "ecd").mkdir()
+    (tmp_path / "ecd" / "shapes_rotation_1.43s.txt").write_bytes(ecd_text(rotating_camera(0.75, rad_s=0.2)))
+    (tmp_path / "aedat4").mkdir()
+    noise = make_events(3000, duration_us=600_000, sensor=Sensor(346, 260))
+    (tmp_path / "aedat4" / "davis346.aedat4").write_bytes(aedat4([noise], Sensor(346, 260)).data)
+    found = list(real.run(estimator, tmp_path))
+    rows = by_name(found)
+    assert rows["ecd", "yaw"]["made_of"]["windows"] == 3  # complete windows, 0.5 s after the first
+    assert -1 <= rows["ecd", "yaw"]["value"] <= 1
+    assert (
+        rows["ecd", "turning at rest [rad/s]"]["value"] >= rows["ecd", "turning at rest [rad/s]"]["made_of"]["median"]
+    )
+    stationary = {row["what"]: row for row in found if row["recording"].endswith("davis346.aedat4")}
+    flagged = stationary["share of windows flagged low activity"]
+    assert flagged["made_of"]["events in a window"] == pytest.approx(250, abs=40)
+    assert 0 <= flagged["value"] <= 1
+    assert stationary["speed at rest at 1 m [m/s]"]["value"] >= 0
+
+
+def test_no_check_is_skipped_if_all_recordings_exist(tmp_path):
+    for check in real.CHECKS:
+        shared(check.recording)
+    rows = by_name(real.run(Estimator(models.find("default")), SHARED))
+    assert not any(row["skipped"] for row in rows.values())
+    evbench = rows["evbench", "rotation about x over its truth"]["made_of"]
+    assert evbench["truth [rad/s]"] == pytest.approx(-0.142, abs=0.001)
+    stationary = rows["ecd", "turning at rest [rad/s]"]
+    assert stationary["met"] == (stationary["value"] <= real.STATIONARY_RAD_S)
+    slider = rows["slider_depth", "direction of motion"]["made_of"]["truth [m/s]"]
+    assert slider == pytest.approx([0.3, 0, 0], abs=0.05)
+
+
+def test_the_command_prints_the_same_results_as_table_and_json_and_writes_both(tmp_path, capsys):
+    arguments = ["reproduce", "real", "untrained", "--recordings", str(tmp_path / "none"), "--out", str(tmp_path)]
+    assert main.main(arguments) == 0
+    table = capsys.readouterr().out
+    assert main.main([*arguments, "--json"]) == 0
+    results = json.loads(capsys.readouterr().out)
+    assert results["model"]["name"] == "untrained"
+    assert table == real.markdown(results["checks"], real.title(results)) == (tmp_path / "real.md").read_text()
+    assert json.loads((tmp_path / "real.json").read_text())["checks"] == results["checks"]
+
+
+def test_the_committed_table_matches_the_committed_json():
+    results = json.loads((RESULTS / "real.json").read_text())
+    assert (RESULTS / "real.md").read_text() == real.markdown(results["checks"], real.title(results))
+    assert [row["what"] for row in results["checks"]] == [check.what for check in real.CHECKS]

@@ -1,0 +1,239 @@
+"""Recordings: what real ones hold, where broken ones end, and what is said about those that can not be read."""
+
+import itertools
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from neurove_core.io import BrokenRecording, MissingGeometry, UnknownSource
+from neurove_core.io.recording import BLOCK_BYTES
+from neurove_core.sources import open_source, supported
+from neurove_protocol import Events, NeuroVEError, Sensor
+from neurove_protocol.events import check_events
+from tests.builders import SENSOR, make_events
+from tests.builders_evt import HEADER_EVT2, HEADER_EVT3, TIME_HIGH, write_evt2, write_evt3
+from tests.recordings import aedat4, assert_same, ecd_text, put, read, read_broken, shared
+
+# --- real recordings -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("path", "sensor", "n", "first_us", "last_us"),
+    [
+        ("aedat4/davis346.aedat4", Sensor(346, 260), 78_830, 1589163147368868, 1589163149728813),
+        ("aedat4/dvxplorer.aedat4", Sensor(320, 240), 111_954, 1605537493718345, 1605537494308262),
+        ("prophesee/evt3.raw", Sensor(1280, 720), 1_218_618, 11_200_224, 21_968_221),
+        ("prophesee/gen4.dat", Sensor(1280, 720), 1_218_618, 5856, 10_773_853),
+        ("prophesee/evt2.raw", Sensor(640, 480), 521_252, 913_716_224, 913_812_095),
+        ("ecd/shapes_rotation", Sensor(240, 180), 30_000, 43_499_029, 43_605_033),
+        ("ecd/shapes_rotation/events.txt", Sensor(240, 180), 30_000, 43_499_029, 43_605_033),
+        ("ecd/shapes_rotation_1.43s.txt", Sensor(240, 180), 120_000, 0, 1_428_658),
+    ],
+)
+def test_a_real_recording_holds_its_known_events_each_time_it_is_read(path, sensor, n, first_us, last_us):
+    recording = open_source(str(shared(path)), sensor if path.endswith("evt2.raw") else None)
+    assert recording.sensor == sensor
+    assert not recording.endless
+    assert recording.name == Path(path).name
+    events = read(recording)
+    assert (events.n, events.t[0], events.t[-1]) == (n, first_us, last_us)
+    assert_same(read(recording), events)
+
+
+def test_evt3_and_dat_of_one_camera_agree_up_to_a_constant_in_time():
+    events = read(open_source(str(shared("prophesee/evt3.raw"))))
+    dat = read(open_source(str(shared("prophesee/gen4.dat"))))
+    assert np.unique(events.t - dat.t).size == 1
+    assert_same(events._replace(t=dat.t), dat)
+
+
+def test_a_raw_file_without_geometry_asks_for_it_and_never_guesses():
+    path = shared("prophesee/evt2.raw")
+    with pytest.raises(MissingGeometry, match="--sensor WIDTHxHEIGHT") as caught:
+        open_source(str(path))
+    assert caught.value.code == "missing_geometry"
+    with pytest.raises(BrokenRecording, match="outside the sensor 320x240"):
+        read(open_source(str(path), Sensor(320, 240)))
+
+
+def test_the_event_camera_dataset_knows_its_lens():
+    camera = open_source(str(shared("ecd/shapes_rotation"))).camera("left")
+    assert camera is not None
+    assert (camera.stream, camera.lens, camera.sensor) == ("left", "pinhole", Sensor(240, 180))
+    assert (camera.fx, camera.fy) == (199.092366542, 198.82882047)
+    assert (camera.cx, camera.cy) == (132.192071378, 110.712660011)
+    assert camera.distortion == (-0.368436311798, 0.150947243557, -0.000296130534385, -0.000759431726241, 0.0)
+    assert open_source(str(shared("ecd/shapes_rotation_1.43s.txt"))).camera("left") is None
+    assert open_source(str(shared("aedat4/davis346.aedat4"))).camera("left") is None
+
+
+# --- small recordings, written here ----------------------------------------------------------------------------------
+
+
+class Written(NamedTuple):
+    """A small recording: where the words, lines or packets in it end, and how many events are whole by then."""
+
+    name: str
+    data: bytes
+    header: int  # [bytes]
+    stops: list[int]  # byte after each word, line or packet
+    whole: list[int]  # events up to there
+    where: Callable[[int], str]  # of the first unit that is not whole, by its number
+    cut_at_stop: bool = False  # whether the end of a unit is noticed as a premature end too
+    events_end: int | None = None  # a cut from this byte on costs nothing
+
+
+def written_evt(name: str, header: bytes, events: Events) -> Written:
+    words, ends = (write_evt2 if name == "evt2" else write_evt3)(events)
+    size = words.itemsize
+    stops = [len(header) + size * (i + 1) for i in range(words.size)]
+    whole = np.searchsorted(ends, np.arange(1, words.size + 1), "right").tolist()
+    return Written(
+        f"{name}.raw", header + words.tobytes(), len(header), stops, whole, lambda i: f"byte {len(header) + size * i}"
+    )
+
+
+def written_aedat4(events: Events, *, finished: bool) -> Written:
+    bounds = list(range(0, events.n + 1, events.n // 6))
+    file = aedat4([events.span(a, b) for a, b in itertools.pairwise(bounds)], SENSOR, finished=finished)
+    # packets of events and of triggers by turns
+    triggers = [*file.starts[1:], file.end]
+    stops = [stop for pair in zip(file.stops, triggers, strict=True) for stop in pair]
+    whole = [n for n in bounds[1:] for _ in range(2)]
+    header = file.starts[0]
+    return Written(
+        "a.aedat4",
+        file.data,
+        header,
+        stops,
+        whole,
+        lambda i: f"byte {[header, *stops][i]}",
+        cut_at_stop=finished,
+        events_end=file.end,
+    )
+
+
+def written_ecd(events: Events) -> Written:
+    data = ecd_text(events)
+    stops = [i for i, byte in enumerate(data) if byte == ord("\n")]  # an end of file does for an end of line
+    return Written("a.txt", data, 0, stops, list(range(1, events.n + 1)), lambda i: f"line {i + 1}")
+
+
+EVENTS = make_events(300, seed=1, start_us=16_700_000)
+WRITTEN = {
+    "evt2": written_evt("evt2", HEADER_EVT2, EVENTS),
+    "evt3": written_evt("evt3", HEADER_EVT3, EVENTS),
+    "ecd": written_ecd(EVENTS),
+    "aedat4": written_aedat4(EVENTS, finished=True),
+    "aedat4-killed": written_aedat4(EVENTS, finished=False),
+}
+each_format = pytest.mark.parametrize("file", WRITTEN.values(), ids=WRITTEN.keys())
+
+
+@each_format
+def test_what_was_written_is_read(file, tmp_path):
+    recording = open_source(put(tmp_path, file.name, file.data), SENSOR)
+    assert_same(read(recording), EVENTS)
+    assert_same(read(recording), EVENTS)
+
+
+@each_format
+@pytest.mark.parametrize("seed", range(3))
+def test_a_cut_recording_gives_its_whole_prefix_and_then_the_place_where_it_broke(file, seed, tmp_path):
+    cuts = np.random.default_rng(seed).integers(file.header, len(file.data), 40)
+    near = np.random.default_rng(seed).choice(file.stops, 8)
+    for cut in {*cuts.tolist(), *near.tolist(), *(near + 1).tolist(), *(near - 1).tolist()}:
+        events, error = read_broken(open_source(put(tmp_path, file.name, file.data[:cut]), SENSOR))
+        units = int(np.searchsorted(file.stops, cut, "right"))
+        assert_same(events, EVENTS.span(0, [0, *file.whole][units]))
+        reached = [file.header, *file.stops][units]
+        past_the_end = file.events_end is not None and cut >= file.events_end
+        at_a_seam = cut == reached or (file.name == "a.txt" and file.data[cut - 1 : cut] == b"\n")
+        if past_the_end or (at_a_seam and not file.cut_at_stop):
+            assert error is None
+        else:
+            assert error is not None
+            assert error.details["where"] == file.where(units)
+            assert error.code == "broken_recording"
+
+
+@each_format
+def test_a_recording_cut_within_its_header_is_refused_or_has_no_events(file, tmp_path):
+    for cut in range(file.header):
+        path = put(tmp_path, file.name, file.data[:cut])
+        try:
+            events, _ = read_broken(open_source(path))
+        except (BrokenRecording, MissingGeometry, UnknownSource) as error:
+            assert path in error.message  # noqa: PT017 a text header may be cut after all that matters
+        else:
+            assert events.n == 0
+
+
+@each_format
+@pytest.mark.parametrize("seed", range(3))
+def test_a_garbled_recording_is_refused_in_our_own_words_or_read(file, seed, tmp_path):
+    rng = np.random.default_rng(seed)
+    for _ in range(60):
+        data = bytearray(file.data)
+        for at in rng.integers(0, len(data), rng.integers(1, 4)):
+            data[at] = rng.integers(0, 256)
+        try:
+            recording = open_source(put(tmp_path, file.name, bytes(data)), SENSOR)
+            events, _ = read_broken(recording)
+            check_events(events, SENSOR)
+            assert not (events.p > 1).any()
+        except NeuroVEError as error:
+            assert str(tmp_path) in error.message  # noqa: PT017 not raising is fine too
+
+
+@pytest.mark.parametrize("name", ["a.raw", "a.txt", "a.aedat4"])
+def test_a_recording_larger_than_what_is_read_at_once_comes_in_bounded_chunks(name, tmp_path):
+    n = 1_100_000 if name == "a.raw" else 300_000
+    events = make_events(n, seed=2, start_us=5, duration_us=n)
+    data = {"a.raw": large_evt2, "a.txt": ecd_text, "a.aedat4": lambda events: aedat4([events], SENSOR).data}[name](
+        events
+    )
+    assert len(data) > BLOCK_BYTES
+    recording = open_source(put(tmp_path, name, data), SENSOR)
+    assert_same(read(recording), events)
+    assert sum(1 for _ in recording.chunks()) > 1
+
+
+def large_evt2(events: Events) -> bytes:
+    """The words of write_evt2, for a million events."""
+    high = np.unique(events.t >> 6)
+    x, y, p = (column.astype(np.int64) for column in events[1:])
+    words = np.concatenate([TIME_HIGH << 28 | high, p << 28 | (events.t & 63) << 22 | x << 11 | y])
+    order = np.argsort(np.concatenate([high << 6, events.t]), kind="stable")
+    return HEADER_EVT2 + words[order].astype("<u4").tobytes()
+
+
+# --- what is no source -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("source", "why"),
+    [
+        ("missing.raw", "no such file or folder"),
+        ("", "the folder has no events.txt"),
+        ("a.xyz", "unknown suffix '.xyz'"),
+        ("events", "the file has no suffix"),
+        ("zenoh://cam0", "unknown scheme zenoh://"),
+        ("pattern://stripes", "a seed and nothing else"),
+        ("pattern://?speed=3", "a seed and nothing else"),
+    ],
+)
+def test_the_error_of_an_unknown_source_lists_the_supported_ones(source, why, tmp_path):
+    put(tmp_path, "a.xyz", b"")
+    put(tmp_path, "events", b"")
+    with pytest.raises(UnknownSource) as caught:
+        open_source(source if "://" in source else str(tmp_path / source))
+    assert why in caught.value.message
+    assert source in caught.value.message
+    if "pattern" not in source:
+        assert all(line in caught.value.message for line in supported())
+    assert caught.value.code == "unknown_source"
+    assert caught.value.details["why"]

@@ -1,0 +1,101 @@
+"""neurove doctor without a service: the checks of this machine, as text and as JSON."""
+
+import json
+
+import pytest
+
+from neurove_protocol import Flag
+from neurove_protocol.control import StreamStatus
+from neurove_service.cli import doctor, extras, installation
+from tests.protocol.messages import STATUS
+
+NOWHERE = "tcp/127.0.0.1:9"
+
+
+def test_without_a_service_the_connection_is_bad_and_the_advice_says_what_to_do(run):
+    code, out, err = run("doctor", "--connect", NOWHERE, "--json")
+    report = json.loads(out)
+    assert (code, err, report["ok"]) == (1, "", False)
+    checks = {check["what"]: check for check in report["checks"]}
+    assert checks["connection"]["level"] == "bad"
+    assert "neurove serve" in checks["connection"]["advice"]
+    assert checks["extra serve"] == {"what": "extra serve", "state": "installed", "level": "ok", "advice": ""}
+    assert {"compiled kernels", "processor", "fast path"} <= checks.keys()
+    assert "float32" in checks["fast path"]["state"]
+
+
+def test_the_table_has_one_row_for_each_check(run):
+    code, out, _ = run("doctor", "--connect", NOWHERE)
+    assert code == 1
+    assert "no router and no service at" in out
+    assert "pip install 'neurove[carla]'" in out
+
+
+def test_a_wrong_endpoint_is_reported(run):
+    _, out, _ = run("doctor", "--connect", "nonsense", "--json")
+    connection = json.loads(out)["checks"][0]
+    assert (connection["level"], "nonsense" in connection["state"]) == ("bad", True)
+
+
+def test_kernels_are_counted_where_numba_caches_them(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    assert installation.check_kernels().level == "info"
+    (tmp_path / "cache").mkdir()
+    (tmp_path / "cache" / "a.nbi").touch()
+    found = installation.check_kernels()
+    assert (found.level, found.state.startswith("1 cached")) == ("ok", True)
+
+
+def test_a_cache_that_cannot_be_written_is_bad(monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "/proc/no-such-folder")
+    monkeypatch.setattr("os.access", lambda *_: False)  # root may write everywhere
+    found = installation.check_kernels()
+    assert (found.level, "NUMBA_CACHE_DIR" in found.advice) == ("bad", True)
+
+
+@pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        (
+            "processor : 0\nflags : fpu sse2 avx2 avx512f avx512_vnni avx_vnni\n",
+            ["AVX2", "AVX-512", "VNNI", "AVX-VNNI"],
+        ),
+        ("Features : fp asimd aes\n", ["NEON"]),
+        ("flags : fpu sse2\n", []),
+        ("", []),
+    ],
+)
+def test_vector_instructions_are_read_from_cpuinfo(tmp_path, text, names):
+    (tmp_path / "cpuinfo").write_text(text)
+    assert installation.cpu_features(tmp_path / "cpuinfo") == names
+    assert installation.cpu_features(tmp_path / "missing") == []
+
+
+def test_an_extra_that_is_not_installed_is_named_with_its_modules(monkeypatch):
+    monkeypatch.setitem(extras.EXTRAS, "carla", ("no_such_module",))
+    found = {check.what: check for check in installation.check_extras()}["extra carla"]
+    assert (found.level, found.state) == ("info", "not installed: no_such_module")
+
+
+def status(**changes):
+    return StreamStatus.model_validate(STATUS).model_copy(update={"stream": "cam0", "verdict": "ok"} | changes)
+
+
+class Estimate:
+    def __init__(self, *flags):
+        self.flags = flags
+
+
+@pytest.mark.parametrize(
+    ("changes", "estimate", "levels"),
+    [
+        ({"calibrated": True, "last_packet_age_s": 0.1}, Estimate(), ["ok", "ok", "ok"]),
+        ({"calibrated": False, "last_packet_age_s": 0.1}, Estimate(Flag.UNSCALED), ["ok", "bad", "bad"]),
+        ({"calibrated": True, "last_packet_age_s": 9.0}, None, ["bad", "ok", "info"]),
+        ({"calibrated": True, "last_packet_age_s": 0.1, "verdict": "stalled"}, None, ["bad", "ok", "info"]),
+    ],
+)
+def test_each_stream_is_checked_for_clock_calibration_and_height(changes, estimate, levels):
+    found = doctor.check_stream(status(**changes), estimate)
+    assert [check.level for check in found] == levels
+    assert all(check.advice for check in found if check.level == "bad")

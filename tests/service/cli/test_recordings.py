@@ -1,0 +1,135 @@
+"""neurove convert, info and simulate: their files, their output and what they refuse."""
+
+import json
+
+import pytest
+
+from neurove_core.sources import open_source
+from neurove_protocol import Sensor
+from tests.builders import make_events
+from tests.recordings import ecd_text, shared
+
+
+def test_convert_writes_a_packet_log(run, tmp_path):
+    events = make_events(2000)
+    (tmp_path / "events.txt").write_bytes(ecd_text(events))
+    out = tmp_path / "a.mcap"
+    code, found, err = run("convert", tmp_path, out, "--sensor", "64x48", "--json")
+    assert (code, err) == (0, "")
+    assert (json.loads(found)["events"], json.loads(found)["streams"]) == (2000, ["events"])
+    assert sum(chunk.n for chunk in open_source(str(out)).chunks()) == 2000
+    code, found, _ = run("convert", out, tmp_path / "b.mcap")
+    assert (code, found.startswith(f"{tmp_path / 'b.mcap'}: 2,000 events of a.mcap")) == (0, True)
+
+
+def test_convert_writes_the_layout_of_dsec(run, tmp_path):
+    pytest.importorskip("hdf5plugin")
+    (tmp_path / "events.txt").write_bytes(ecd_text(make_events(2000)))
+    code, found, err = run("convert", tmp_path, tmp_path / "a.h5", "--sensor", "64x48")
+    assert (code, err) == (0, "")
+    assert "2,000 events" in found
+    again = open_source(str(tmp_path / "a.h5"), Sensor(64, 48))
+    assert sum(chunk.n for chunk in again.chunks()) == 2000
+
+
+def test_convert_keeps_the_triggers_of_a_real_bag(run, tmp_path):
+    bag = shared("rosbag/test_events_1")
+    assert run("convert", bag, tmp_path / "a.mcap", "--topic", "/event_camera/events")[0] == 0
+    recording = open_source(str(tmp_path / "a.mcap"))
+    assert recording.streams == ("events", "triggers")
+    assert sum(part.t.size for part in recording.triggers()) == 4157
+
+
+def test_a_broken_recording_is_reported_and_leaves_no_file(run, tmp_path):
+    (tmp_path / "events.txt").write_bytes(ecd_text(make_events(200)) + b"0.9 7 br\n")
+    code, _, err = run("convert", tmp_path, tmp_path / "c.mcap")
+    assert (code, "line 201" in err, err.count("\n")) == (1, True, 1)
+    assert [one.name for one in tmp_path.iterdir()] == ["events.txt"]
+
+
+@pytest.mark.parametrize(
+    ("source", "out", "topic", "why"),
+    [
+        ("a.txt", "a.xyz", [], "its name must end in .mcap or .h5"),
+        ("pattern://", "a.mcap", [], "it has no end"),
+        ("a.txt", "no/a.mcap", [], "No such file or directory"),
+        ("a.mcap", "b.mcap", ["--topic", "up"], "no stream 'up'; its streams are cam0"),
+        ("a.mcap", "a.mcap", [], "it is the input recording"),
+    ],
+)
+def test_an_impossible_conversion_is_one_line(run, tmp_path, monkeypatch, source, out, topic, why):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.txt").write_bytes(ecd_text(make_events(10)))
+    if source == "a.mcap":
+        run("convert", "a.txt", "a.mcap")
+    code, _, err = run("convert", source, out, *topic)
+    assert (code, why in err, err.count("\n")) == (2, True, 1), err
+
+
+def test_info_shows_what_a_recording_holds(run, tmp_path):
+    (tmp_path / "events.txt").write_bytes(ecd_text(make_events(2000)))
+    picture = tmp_path / "a.png"
+    code, found, err = run("info", tmp_path, "--sensor", "64x48", "--json", "--plot", picture)
+    about = json.loads(found)
+    assert (code, err) == (0, f"wrote {picture}\n")
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert (about["sensor"], about["events"], about["streams"]) == ({"width": 64, "height": 48}, 2000, ["events"])
+    assert (about["imu"], about["truth"], about["broken"]) == (None, None, None)
+    assert about.keys() >= {"on_fraction", "first_us", "last_us", "duration_s"}
+    code, found, _ = run("info", tmp_path, "--sensor", "64x48")
+    assert code == 0
+    assert "2,000" in found
+
+
+def test_info_of_a_real_recording_with_an_imu(run):
+    code, found, _ = run("info", shared("aedat4/davis346.aedat4"))
+    assert code == 0
+    assert all(text in found for text in ("78,830, 52.3 % ON", "2,363 samples at 1,001.2 Hz", "59", "truth"))
+
+
+def test_info_of_a_broken_recording_ends_with_1(run, tmp_path):
+    (tmp_path / "events.txt").write_bytes(ecd_text(make_events(2000)) + b"and then\n")
+    code, found, err = run("info", tmp_path, "--sensor", "64x48", "--json")
+    assert code == 1
+    assert json.loads(found)["events"] == 2000
+    assert "broken at line 2001" in err
+
+
+def test_a_simulation_contains_its_truth(run, tmp_path):
+    out = tmp_path / "a.mcap"
+    code, found, err = run("simulate", "wall", "--seconds", 0.2, "--seed", 4, "--out", out, "--json")
+    assert (code, err) == (0, "")
+    assert json.loads(found)["streams"] == ["events", "twists"]
+    recording = open_source(str(out))
+    twists = recording.twists()
+    assert sum(chunk.n for chunk in recording.chunks()) == json.loads(found)["events"] > 0
+    assert twists.twist[:, 0] == pytest.approx(0.3, abs=1e-6)  # the wall's trajectory slides at 0.3 m/s
+    assert recording.camera("cam0").height_m == 1.5
+    code, found, _ = run("info", "sim://wall?seed=4&seconds=0.2", "--json")
+    assert (code, json.loads(found)["truth"]["from"]) == (0, "twists")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere"], "scene='nowhere': known are street, bare-street, corridor, room, plain-room, wall"),
+        (["street", "--camera", "nikon"], "camera='nikon': known are"),
+        (["street", "--trajectory", "flying"], "'flying': neither a known trajectory nor a file"),
+        (["street", "--height", "0"], "height"),
+        (["street", "--seed", "-1"], "seed='-1'"),
+    ],
+)
+def test_an_impossible_simulation_is_named_and_leaves_no_file(run, tmp_path, arguments, message):
+    code, _, err = run("simulate", *arguments, "--out", tmp_path / "a.mcap")
+    assert (code, message in err) == (2, True), err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_simulations_are_written_in_known_formats_only(run, tmp_path):
+    code, _, err = run("simulate", "wall", "--out", tmp_path / "a.avi")
+    assert (code, "must end in .mcap or .h5" in err) == (2, True)
+
+
+def test_a_wrong_address_of_carla_is_named(run, tmp_path):
+    code, _, err = run("simulate", "carla", "--out", tmp_path / "a.npz", "--server", "nowhere")
+    assert (code, "--server='nowhere': give HOST:PORT" in err) == (2, True)

@@ -1,0 +1,247 @@
+import copy
+import itertools
+from dataclasses import replace
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from neurove_core.models import bundle
+from neurove_core.models.uncertainty import Uncertainty
+from neurove_protocol import CameraInfo, Flag, Sensor
+from neurove_protocol.errors import InvalidField
+from neurove_service.models.slot import ModelSlot
+from neurove_service.streams.stream import Arrival, Stream
+from tests.builders import make_packet, make_packets
+from tests.service.conftest import SMALL
+
+WINDOW_US = 50_000
+
+
+@pytest.fixture
+def stream(slot):
+    return Stream("cam0", slot)
+
+
+def feed(stream, packets):
+    return list(itertools.chain.from_iterable(stream.accept(packet, Arrival(1, 2)) for packet in packets))
+
+
+def without_trace(estimates):
+    return [estimate.model_copy(update={"trace": None}) for estimate in estimates]
+
+
+def flagged(estimates, flag):
+    return [estimate.start_us // WINDOW_US for estimate in estimates if flag in estimate.flags]
+
+
+def test_every_window_gets_one_estimate_and_nothing_is_lost(stream):
+    estimates = feed(stream, make_packets(100))
+    assert [one.start_us for one in estimates] == list(range(0, 7 * WINDOW_US, WINDOW_US))
+    assert [one.seq for one in estimates] == list(range(7))
+    assert all(one.bin_end_us == tuple(one.start_us + 10_000 * (i + 1) for i in range(5)) for one in estimates)
+    assert stream.counters.losses().nonzero() == {}
+    assert stream.counters.events_received == 100 * 100
+    assert sum(one.events for one in estimates) == sum(p.events.n for p in make_packets(100)) - tail_events()
+
+
+def tail_events():
+    return sum(int((packet.events.t >= 7 * WINDOW_US).sum()) for packet in make_packets(100))
+
+
+def test_a_lost_packet_is_counted_and_flags_its_windows(stream):
+    packets = make_packets(60)
+    estimates = feed(stream, packets[:30] + packets[31:])
+    assert stream.counters.losses().nonzero() == {"gap_packets": 1}
+    assert flagged(estimates, Flag.GAP) == [30 * 4000 // WINDOW_US]
+    assert len(estimates) == 4
+
+
+def test_a_long_gap_flags_every_window_that_it_overlaps_and_no_other(stream):
+    packets = make_packets(80)
+    estimates = feed(stream, packets[:20] + packets[50:])  # 80 ms to 200 ms are missing
+    assert flagged(estimates, Flag.GAP) == [1, 2, 3]
+    assert stream.counters.gap_packets == 30
+
+
+def test_packets_dropped_by_the_queue_count_as_overload_and_not_as_a_gap(stream):
+    packets = make_packets(60)
+    estimates = feed(stream, packets[:30])
+    stream.overloaded(5)
+    estimates += feed(stream, packets[35:])
+    assert stream.counters.losses().nonzero() == {"overload_packets": 5}
+    assert flagged(estimates, Flag.OVERLOAD) == flagged(estimates, Flag.GAP) == [2]
+
+
+def test_a_malformed_packet_does_not_also_count_as_a_gap(stream):
+    packets = make_packets(60)
+    feed(stream, packets[:30])
+    stream.refused(1)
+    feed(stream, packets[31:])
+    assert stream.counters.losses().nonzero() == {"malformed_packets": 1}
+
+
+def test_duplicate_and_late_packets_are_counted_and_change_nothing(slot):
+    packets = make_packets(60)
+    clean = feed(Stream("cam0", slot), packets)
+    disturbed = Stream("cam0", slot)
+    estimates = feed(disturbed, [*packets[:30], packets[29], packets[10], *packets[30:]])
+    assert without_trace(estimates) == without_trace(clean)
+    assert disturbed.counters.losses().nonzero() == {"duplicate_packets": 1, "out_of_order_packets": 1}
+
+
+@given(st.lists(st.integers(0, 39), min_size=0, max_size=30, unique=True), st.randoms(use_true_random=False))
+def test_every_sent_packet_is_counted(dropped, random):
+    stream = Stream("cam0", _slot())
+    kept = [packet for packet in make_packets(41, step_us=8000) if packet.seq not in dropped]
+    repeats = random.sample(kept, min(3, len(kept)))
+    for packet in kept:
+        feed(stream, [packet, packet] if packet in repeats and packet.seq else [packet])
+    counters = stream.counters
+    assert counters.duplicate_packets == sum(1 for packet in repeats if packet.seq)
+    first = min(packet.seq for packet in kept)
+    assert counters.packets_received - counters.duplicate_packets + counters.gap_packets == 41 - first
+
+
+_SLOTS: list = []
+
+
+def _slot():
+    if not _SLOTS:
+        from neurove_service.models.slot import ModelSlot
+
+        _SLOTS.append(ModelSlot("untrained"))
+    return _SLOTS[0]
+
+
+def test_a_restarted_driver_resets_the_stream_at_once(stream):
+    feed(stream, make_packets(30))
+    estimates = feed(stream, make_packets(30, start_us=10_000_000))
+    assert estimates[0].start_us == 10_000_000
+    assert Flag.RESET in estimates[0].flags
+    assert stream.counters.losses().nonzero() == {}
+    assert stream.counters.resets == 1
+
+
+def test_a_restarted_driver_whose_first_packet_was_lost_is_accepted_after_three_packets(stream):
+    feed(stream, make_packets(30))
+    estimates = feed(stream, make_packets(40, start_us=10_000_000)[1:])
+    assert estimates
+    assert stream.counters.out_of_order_packets == 2
+
+
+def test_a_sensor_clock_that_goes_backwards_resets_the_stream(stream):
+    feed(stream, make_packets(30, start_us=50_000_000))
+    estimates = feed(stream, make_packets(30, first_seq=30))
+    assert [one.start_us for one in estimates] == [0, WINDOW_US]
+    assert Flag.RESET in estimates[0].flags
+
+
+def test_another_sensor_size_resets_and_flags_the_next_estimate(stream):
+    feed(stream, make_packets(30))
+    estimates = feed(stream, make_packets(40, first_seq=30, start_us=120_000, sensor=Sensor(80, 60)))
+    assert Flag.SENSOR_CHANGED in estimates[0].flags
+    assert Flag.RESET in estimates[0].flags
+    assert Flag.SENSOR_CHANGED not in estimates[1].flags
+    assert stream.sensor == Sensor(80, 60)
+
+
+def test_camera_info_calibrates_from_the_next_packet_on(stream):
+    camera = CameraInfo(stream="cam0", width=64, height=48, lens="pinhole", fx=40, fy=40, cx=32, cy=24, height_m=1.0)
+    before = feed(stream, make_packets(30))
+    stream.set_camera(camera)
+    stream.set_camera(camera)
+    after = feed(stream, make_packets(40, first_seq=30, start_us=120_000))
+    assert all({Flag.UNCALIBRATED, Flag.UNSCALED} <= set(one.flags) for one in before)
+    assert not any({Flag.UNCALIBRATED, Flag.UNSCALED} & set(one.flags) for one in after)
+    assert flagged(after, Flag.SENSOR_CHANGED) == [after[0].start_us // WINDOW_US]
+    assert stream.counters.resets == 1
+
+
+def test_camera_info_of_another_sensor_is_not_used(stream):
+    stream.set_camera(CameraInfo(stream="cam0", width=9, height=9, lens="pinhole", fx=40, fy=40, cx=4, cy=4))
+    assert all(Flag.UNCALIBRATED in one.flags for one in feed(stream, make_packets(30)))
+
+
+def test_a_gap_in_sensor_time_without_lost_packets_skips_and_counts_windows(stream):
+    feed(stream, make_packets(30))
+    estimates = feed(stream, make_packets(30, first_seq=30, start_us=10_000_000))
+    assert stream.counters.skipped_windows == (10_000_000 - 150_000) // WINDOW_US
+    assert Flag.RESET in estimates[1].flags
+    assert estimates[1].start_us == 10_000_000
+
+
+def test_a_model_change_takes_effect_at_a_window_with_a_primed_state(slot):
+    packets = make_packets(100)
+    always_two = Stream("cam0", _at(slot, "two"))
+    expected = feed(always_two, packets)
+    slot.activate("one")
+    stream = Stream("cam0", slot)
+    estimates = feed(stream, packets[:50])
+    slot.activate("two")
+    estimates += feed(stream, packets[50:])
+    assert [one.model for one in estimates] == ["one"] * 3 + ["two"] * 4
+    assert [one.start_us for one in estimates] == [one.start_us for one in expected]
+    assert [one.twists for one in estimates[3:]] == [one.twists for one in expected[3:]]  # as if it had always served
+    assert len({one.epoch for one in estimates}) == 2
+
+
+def _at(slot, model):
+    slot.activate(model)
+    return slot
+
+
+def test_streams_do_not_leak_state_into_each_other(slot):
+    a, b = make_packets(60), make_packets(60, first_seq=1000)
+    alone = feed(Stream("cam0", slot), a)
+    together, other = Stream("cam0", slot), Stream("cam0", slot)
+    mixed = []
+    for one, two in zip(a, b, strict=True):
+        mixed += feed(together, [one])
+        feed(other, [two])
+    assert without_trace(mixed) == without_trace(alone)
+
+
+def test_a_packet_of_another_stream_is_refused(stream):
+    with pytest.raises(InvalidField, match="stream='cam1': received on the key of stream 'cam0'"):
+        stream.accept(make_packet(stream="cam1"), Arrival(1, 2))
+
+
+def test_an_internal_error_loses_one_packet_and_resets_the_stream(stream):
+    feed(stream, make_packets(30))
+    stream.failed()
+    estimates = feed(stream, make_packets(30, first_seq=30, start_us=120_000))
+    assert stream.counters.failed_packets == 1
+    assert Flag.RESET in estimates[0].flags
+
+
+def test_few_events_and_a_young_state_are_flagged(stream):
+    estimates = feed(stream, make_packets(100, n=0))
+    assert all(Flag.LOW_ACTIVITY in one.flags for one in estimates)
+    assert flagged(estimates, Flag.SETTLING) == [0, 1, 2, 3]
+    assert flagged(estimates, Flag.RESET) == [0]
+    assert all(Flag.UNTRAINED in one.flags for one in estimates)
+
+
+def test_an_estimate_of_a_calibrated_model_has_a_covariance_and_the_flag_uncertain(tmp_path):
+    plain = bundle.untrained(1, SMALL, "one")
+    network = copy.deepcopy(plain.network)
+    network.add_spread()  # sigma is 1 in every axis
+    sure, unsure = (
+        replace(plain, network=network, uncertainty=Uncertainty(torch.eye(6), bound, "a test")) for bound in (1e6, 1e-6)
+    )
+    for model, flags in ((sure, []), (unsure, [0, 1, 2, 3])):
+        path = tmp_path / "model.safetensors"
+        bundle.save(model, path)
+        estimates = feed(Stream("cam0", ModelSlot(str(path))), make_packets(60))
+        assert flagged(estimates, Flag.UNCERTAIN) == flags
+        assert estimates[-1].covariance == tuple(torch.eye(6).flatten().tolist())
+        assert estimates[-1].sigma == (1,) * 6
+        assert type(estimates[-1]).decode(estimates[-1].encode()) == estimates[-1]
+
+
+def test_an_estimate_of_a_model_without_calibration_has_no_covariance(stream):
+    (newest, *_) = reversed(feed(stream, make_packets(60)))
+    assert (newest.covariance, newest.sigma) == (None, None)
+    assert Flag.UNCERTAIN not in newest.flags
