@@ -133,10 +133,10 @@ def reproduce_velocity(args: argparse.Namespace) -> int:
                 len(experiment.methods) * len(seeds),
                 f"{one.row['method']} seed {one.row['seed']}",
             )
-    told = _made_by() | run.results(experiment, folder, found)
-    print(json.dumps(told) if args.json else report.markdown(told), end="")
+    results = _made_by() | run.results(experiment, folder, found)
+    print(json.dumps(results) if args.json else report.markdown(results), end="")
     tracks = {one.row["method"]: one.tracks for one in reversed(found)}
-    for file in [*report.save(told, out), *figures.save(told, tracks, out)]:
+    for file in [*report.save(results, out), *figures.save(results, tracks, out)]:
         print(f"wrote {file}", file=sys.stderr)
     if args.recordings:
         _real_rows("default", args.recordings, out)
