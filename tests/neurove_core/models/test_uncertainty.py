@@ -85,8 +85,8 @@ def test_intervals_of_a_fitted_model_hold_what_they_claim_on_sequences_it_never_
 def test_the_report_tells_coverage_by_axis_of_each_way_of_seeing(made):
     groups = made.report["groups"]
     assert set(groups) == set(calibration.VARIANTS) | {f"hard scenes, {seen}" for seen in calibration.VARIANTS}
-    assert groups["as it is"]["vz"]["0.9"] == pytest.approx(0.9, abs=0.01)
-    assert groups["as it is"]["vz"]["0.99"] > groups["as it is"]["vz"]["0.5"]
+    assert groups["unchanged"]["vz"]["0.9"] == pytest.approx(0.9, abs=0.01)
+    assert groups["unchanged"]["vz"]["0.99"] > groups["unchanged"]["vz"]["0.5"]
 
 
 def test_errors_that_go_together_are_correlated_in_the_bundle(made):
@@ -185,20 +185,20 @@ def test_a_correlation_that_is_none_is_refused(made, row, column, value, why):
 
 def test_a_bundle_of_another_camera_or_unit_is_not_calibrated(made, tmp_path):
     config = TrainingConfig(model=SMALL.model_copy(update={"canonical": CanonicalConfig()}))
-    with pytest.raises(BadModel, match="not those of the configuration"):
+    with pytest.raises(BadModel, match="differ from those of the configuration"):
         calibration.calibrate(made.bundle, config, tmp_path)
     with pytest.raises(BadModel, match="linear_unit='m/s'"):
         calibration.calibrate(replace(made.bundle, linear_unit="m/s"), TrainingConfig(model=SMALL), tmp_path)
-    with pytest.raises(InvalidField, match="sequences=15: at least 16"):
+    with pytest.raises(InvalidField, match="sequences=15: must be at least 16"):
         calibration.calibration_sets(TrainingConfig(), 15)
 
 
-def test_a_sequence_is_seen_as_it_is_with_holes_with_few_events_and_with_many():
+def test_the_variants_of_a_sequence_are_unchanged_with_gaps_with_few_events_and_with_many():
     rng = np.random.default_rng(3)
     counts = rng.integers(0, 4, (60, 4, 5, 6)).astype(np.uint8)
-    plain, holes, few, many = (way for way, _ in variants_of(rng, counts, np.ones((60, 2, 6), np.float32)))
+    plain, gaps, few, many = (way for way, _ in variants_of(rng, counts, np.ones((60, 2, 6), np.float32)))
     assert (plain == counts).all()
-    empty = (holes == 0).all(axis=(1, 2, 3))
+    empty = (gaps == 0).all(axis=(1, 2, 3))
     assert 0 < empty.sum() < 60
     assert few[40:].sum() < 0.7 * counts[40:].sum()
     assert many.sum() > counts.sum()

@@ -180,7 +180,7 @@ def test_norms_that_ranks_share_take_the_place_of_each_kind_s_own(kind):
 def test_a_baseline_has_no_uncertainty(kind, tmp_path):
     model = replace(bundle.untrained(0, config_of(kind)), linear_unit=PER_HEIGHT)
     with pytest.raises(BadModel, match=f"kind='{kind}': only a network of kind 'neurove'"):
-        list(calibration.watch(model, []))
+        list(calibration.collect_errors(model, []))
     claimed = replace(model, uncertainty=Uncertainty(torch.eye(6), 0.5, "a test"))
     with pytest.raises(ValueError, match=f"kind='{kind}' has none"):
         claimed.to_bytes()
