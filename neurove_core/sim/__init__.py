@@ -1,1 +1,1 @@
-"""Event-camera simulator: scene and trajectory -> events with exact truth, without any recording."""
+"""Event-camera simulator: events with exact ground truth from a scene and a trajectory, without any recording."""

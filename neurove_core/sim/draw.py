@@ -1,4 +1,4 @@
-"""A picture of a simulation: what the camera sees, the events it makes of it, and how far everything is."""
+"""Draw a simulation: the image of the camera, its events, and the depth."""
 
 import itertools
 from pathlib import Path
@@ -14,25 +14,25 @@ from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
 
 EVENTS_US: Final = 60_000
-"""How long events are collected for the picture."""
+"""Time in which the events of the picture are collected."""
 
 
 def draw(simulation: Simulation, path: Path, t_s: float = 1.0) -> None:
-    """Write a PNG: the picture at a time, the events that follow, and the depth.
+    """Write a PNG with the image at a time, the events that follow, and the depth.
 
     Args:
-        simulation: what to draw.
+        simulation: to draw.
         path: of the file.
-        t_s: when [s].
+        t_s: time of the image [s].
 
     Raises:
-        MissingExtra: matplotlib is not installed. InvalidField: the file can not be written.
+        MissingExtra: matplotlib is not installed. InvalidField: the file cannot be written.
     """
     figure = blank_figure(13, 3.8)
     view, rays, sensor = simulation.view(t_s), rays_of(simulation.lens.info), simulation.sensor
     steps = itertools.islice(simulation.steps(t_s), EVENTS_US // INTERVAL_US)
     events = Events.join([step.events for step in steps])
-    shown = np.exp(as_image(rays, sensor, view.light)) ** 0.45  # about as a screen shows it
+    shown = np.exp(as_image(rays, sensor, view.light)) ** 0.45  # gamma of a screen
     depth = as_image(rays, sensor, np.log10(np.where(np.isfinite(view.depth), view.depth, np.nan)))
     pictures = [
         (f"{simulation.name}, t = {t_s:g} s", shown, {"cmap": "gray", "vmin": 0, "vmax": 1}),
@@ -54,7 +54,7 @@ def draw(simulation: Simulation, path: Path, t_s: float = 1.0) -> None:
 
 
 def event_image(events: Events, sensor: Sensor) -> NDArray[np.uint8]:
-    """Events as an RGB image (H, W, 3): the last one of a pixel counts, blue for ON, red for OFF, else white."""
+    """Events as an RGB image (H, W, 3) on white: the last event of a pixel is blue for ON and red for OFF."""
     image = np.full((sensor.height, sensor.width, 3), 255, np.uint8)
     image[events.y, events.x] = np.where(events.p[:, None] > 0, [40, 80, 220], [220, 50, 40])
     return image

@@ -1,4 +1,4 @@
-"""The simulator as a recording: events of a camera that moves through a scene, and exactly how it moves."""
+"""The simulator as a recording: events of a camera that moves through a scene, with its exact twists."""
 
 import itertools
 import math
@@ -36,60 +36,58 @@ from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
 
 INTERVAL_US: Final = 20_000
-"""How much time is simulated at once; a chunk of events."""
+"""Time that is simulated at once; the events of one interval are a chunk."""
 
 MOTION_PX: Final = 0.5
-"""No pixel sees more motion than this between two of its renders."""
+"""Greatest motion of a pixel between two of its renders."""
 
 TRUTH_HZ: Final = 1000
-"""How often `Simulation.twists` tells the velocity."""
+"""Sampling rate of `Simulation.twists`."""
 
 
 class Step(NamedTuple):
-    """One interval: its events, and how the camera moved at each instant that anything was rendered at."""
+    """One interval: its events, and the twists of the camera at the times of all renders."""
 
     start_us: int
     stop_us: int
     events: Events
-    twists: Twists  # at the renders, the interval's end the last of them; exact, of the trajectory
-    renders: float  # pictures rendered, in whole sensors: tiles are rendered at their own rates
+    twists: Twists  # exact, at the renders; the last one is at the end of the interval
+    renders: float  # number of rendered images, in whole sensors; tiles have their own rates
 
     def shifted(self, shift_us: int) -> "Step":
-        """The same with all times shifted."""
+        """The same step with all times shifted."""
         events, twists = (part._replace(t=part.t + shift_us) for part in (self.events, self.twists))
         return Step(self.start_us + shift_us, self.stop_us + shift_us, events, twists, self.renders)  # type: ignore[arg-type]
 
 
 class View(NamedTuple):
-    """What the camera saw at one instant; see `Simulation.view`."""
+    """The image of the camera at one instant; see `Simulation.view`."""
 
     light: NDArray[np.float32]  # (N,) log intensity
-    depth: NDArray[np.float32]  # (N,) along z [m], infinite where nothing is
+    depth: NDArray[np.float32]  # (N,) along z [m]; infinite where there is only sky
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Simulation(EventsOnly):
-    """A camera that films a scene along a trajectory; see `Recording`.
+    """A camera that moves through a scene along a trajectory; see `Recording`.
 
-    Nothing is kept from one reading to the next: the same events come each time, and for the same seed. Where it lasts
-    longer than its trajectory, the film is cut there, and goes on along the next one in another scene of its kind.
+    Each reading starts anew and gives the same events for the same seed. If the simulation lasts longer than its
+    trajectory, it continues along the next trajectory in another scene of the same kind.
     """
 
     scene: str
     make_scene: Callable[[CameraPath, int], Scene]
-    trajectory: CameraPath  # of the camera, as it is mounted
+    trajectory: CameraPath  # of the mounted camera
     lens: Camera
     pixels: PixelConfig
     seed: int
     duration_s: float  # infinite for one without end
-    next_trajectory: Callable[[int], CameraPath] | None = (
-        None  # the trajectories that come after the first, by number from 1 on
-    )
-    motion_px: float = MOTION_PX  # training trades a little of each event's time for speed with more than the usual
+    next_trajectory: Callable[[int], CameraPath] | None = None  # trajectory number 1, 2, ...; None: there is only one
+    motion_px: float = MOTION_PX  # a larger bound is faster, and less exact in the times of events; training uses one
 
     @property
     def name(self) -> str:
-        """Scene, trajectory and seed."""
+        """Name: scene, trajectory and seed."""
         return f"{self.scene} {self.trajectory.name} {self.seed}"
 
     @property
@@ -99,16 +97,16 @@ class Simulation(EventsOnly):
 
     @property
     def endless(self) -> bool:
-        """Whether it never ends."""
+        """Whether the simulation never ends."""
         return math.isinf(self.duration_s)
 
     @property
     def streams(self) -> tuple[str, ...]:
-        """Events and twists; of a simulation without end the truth comes with `steps` alone."""
+        """Events and twists. An endless simulation has no twists here; `steps` has them."""
         return ("events",) if self.endless else ("events", "twists")
 
     def camera(self, stream: str) -> CameraInfo:
-        """The lens, with its height above the ground."""
+        """The lens and its height above the ground."""
         return self.lens.info.model_copy(update={"stream": stream})
 
     def chunks(self) -> Iterator[Events]:
@@ -117,17 +115,17 @@ class Simulation(EventsOnly):
             yield from in_chunks(step.events)
 
     def twists(self) -> Twists | None:
-        """How the camera moves, at TRUTH_HZ and exact; None for a simulation without end."""
+        """The exact twists of the camera at TRUTH_HZ; None for an endless simulation."""
         if self.endless:
             return None
         t_us = np.arange(0, round(self.duration_s * 1e6) + 1, 1_000_000 // TRUTH_HZ, dtype=np.int64)
         return Twists(t_us, self.trajectory.twist(t_us / 1e6))
 
     def steps(self, start_s: float = 0.0) -> Iterator[Step]:
-        """The same events with their truth, interval by interval, also those without events.
+        """All intervals with their events and truth, including intervals without events.
 
         Args:
-            start_s: when to begin; the pixels are then as after a long past, as they else are at 0.
+            start_s: time to start at; the pixels are settled at that time, as they are at 0 by default.
         """
         if self.next_trajectory is None or start_s:
             yield from _Playback(self, self.trajectory, self.seed, start_s).run(round(start_s * 1e6), self.duration_s)
@@ -140,13 +138,13 @@ class Simulation(EventsOnly):
             shift_us, trajectory = shift_us + stop_us, self.next_trajectory(number)
 
     def view(self, t_s: float) -> View:
-        """What the camera sees at this time, pixel by pixel as `rays_of` orders them."""
-        film = _Playback(self, self.trajectory, self.seed, t_s)
-        return View(film.state.light, film.depth)
+        """Render the image at a time, with the pixels in the order of `rays_of`."""
+        playback = _Playback(self, self.trajectory, self.seed, t_s)
+        return View(playback.state.light, playback.depth)
 
 
 class _Playback:
-    """One reading of a simulation: what it carries from interval to interval."""
+    """One reading of a simulation: its state from interval to interval."""
 
     def __init__(self, simulation: Simulation, trajectory: CameraPath, seed: int, t_s: float = 0.0) -> None:
         self._simulation, self._trajectory = simulation, trajectory
@@ -171,19 +169,21 @@ class _Playback:
         return light
 
     def _candidates(self, world: World, position: NDArray[np.float64], rotation: NDArray[np.float64]) -> Candidates:
-        """What each tile may see from some places along an interval, its ends among them."""
+        """The panels that each tile may see from some poses in an interval; its ends are among them."""
         views = views_of(world.panels, position, rotation)
         return candidates_of(views, self._rays.box, world.sky.far_m, self._margin)
 
     def _places(self, t_s: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         position, rotation = self._trajectory.pose(t_s)
-        return np.ascontiguousarray(position), np.ascontiguousarray(rotation)  # one layout, one compilation
+        return np.ascontiguousarray(position), np.ascontiguousarray(
+            rotation
+        )  # one memory layout avoids a second compilation
 
     def _world(self, t_s: float) -> World:
         return World(self._scene.near(t_s), self._textures, self._scene.sky)
 
     def run(self, start_us: int, end_s: float) -> Iterator[Step]:
-        """All intervals from where it began."""
+        """Simulate all intervals up to a time."""
         end_us = math.inf if math.isinf(end_s) else round(end_s * 1e6)
         while start_us < end_us:
             stop_us = int(min(start_us + INTERVAL_US, end_us))
@@ -191,7 +191,7 @@ class _Playback:
             start_us = stop_us
 
     def step(self, start_us: int, stop_us: int) -> Step:
-        """The next interval."""
+        """Simulate the next interval."""
         span_us, config = stop_us - start_us, self._simulation.pixels
         parts, steps = self._parts(start_us, stop_us)
         when = (start_us + span_us * np.arange(steps + 1) / steps) * 1e-6
@@ -223,9 +223,10 @@ class _Playback:
         return Step(start_us, stop_us, events, twists, float((parts * sizes).sum() / sizes.sum()))
 
     def _parts(self, start_us: int, stop_us: int) -> tuple[NDArray[np.int64], int]:
-        """Into how many steps each tile's interval is cut, and the grid's steps, of which each is a divisor.
+        """The number of steps of each tile in the interval, and the number of steps of the grid.
 
-        The largest motion in a tile and in those around it counts, for what is at their border may come into it.
+        Each number of steps divides that of the grid. It follows from the greatest motion in a tile and its neighbours,
+        because objects may enter the tile from them.
         """
         speeds = np.zeros(self._rays.first.size - 1)
         ends = np.array([start_us, (start_us + stop_us) / 2, stop_us]) * 1e-6
@@ -257,18 +258,18 @@ def simulate(
     seed: int = 0,
     seconds: float | None = None,
 ) -> Simulation:
-    """A recording that is made as it is read.
+    """Create a simulation; it renders while it is read.
 
     Args:
-        scene: one of scene.SCENES.
+        scene: one of `scene.SCENES`.
         trajectory: of a level camera at height 0; the camera's mount is added.
-        camera: see camera.named_camera.
-        pixels: how they behave.
+        camera: see `camera.named_camera`.
+        pixels: configuration of the pixels.
         seed: of the scene and of the pixels.
-        seconds: how long; by default as long as the trajectory.
+        seconds: duration; by default that of the trajectory.
 
     Raises:
-        InvalidField: the scene is unknown, the seed below 0, or `seconds` longer than the trajectory.
+        InvalidField: the scene is unknown, the seed is below 0, or `seconds` exceeds the trajectory.
     """
     make_scene = named_scene(scene)
     if seed < 0:

@@ -1,4 +1,4 @@
-"""`sim://SCENE?...`: a simulation named by a URL."""
+"""`sim://SCENE?...`: open a simulation by its URL."""
 
 import math
 from typing import Final
@@ -25,29 +25,29 @@ TRAJECTORY_OF: Final = {
     "plain-room": "handheld",
     "wall": "slider?vx=0.3",
 }
-"""What moves the camera where nothing else is said."""
+"""Default trajectory of each scene."""
 
 _SEEDED: Final = ("driving", "handheld")
 _FIELDS: Final = ("trajectory", "seed", "camera", "height", "pitch", "seconds")
 
 
 def simulation_of(url: str, sensor: Sensor | None = None) -> Simulation:
-    """The simulation of `sim://`, or `sim://room?seed=3&camera=davis240c&seconds=10`.
+    """Create the simulation of a URL such as `sim://` or `sim://room?seed=3&camera=davis240c&seconds=10`.
 
-    A generated trajectory takes the simulation's seed where it names none of its own. Without `seconds` a generated
-    trajectory is followed by the next, without end; any other lasts as long as it does.
+    A generated trajectory uses the seed of the simulation unless it has its own. Without `seconds`, generated
+    trajectories follow each other without end; a simulation on any other trajectory ends with it.
 
     >>> simulation_of("sim://?seed=3&seconds=2").name
     'street driving 3 3'
 
     Args:
-        url: with the scene as its host, and of trajectory, seed, camera, height [m], pitch [deg] and seconds what is to
-            differ from the default. A trajectory's own parameters follow it, its `&` written `%26`.
-        sensor: must be the camera's, where given.
+        url: its host is the scene; its parameters are trajectory, seed, camera, height [m], pitch [deg] and seconds,
+            each with a default. Parameters of the trajectory follow its name, with `&` written as `%26`.
+        sensor: if given, it must be that of the camera.
 
     Raises:
-        UnknownSource: the URL is none of a simulation. InvalidField: what it asks for does not exist or is out of its
-            bound.
+        UnknownSource: the URL is not that of a simulation.
+        InvalidField: a name is unknown, or a value is out of bounds.
     """
     parts = urlsplit(url)
     query = dict(parse_qsl(parts.query, keep_blank_values=True))

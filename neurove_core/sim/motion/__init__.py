@@ -1,1 +1,1 @@
-"""How the simulated camera moves."""
+"""Trajectories of the simulated camera."""

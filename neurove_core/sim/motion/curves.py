@@ -1,4 +1,4 @@
-"""Trajectory: a smooth path of a camera with exact derivatives, as a spline, as a screw, or as mounted on a vehicle."""
+"""Trajectories with exact derivatives: a constant twist, a spline, and a mounted camera."""
 
 import math
 from abc import ABC, abstractmethod
@@ -15,17 +15,17 @@ Array = NDArray[np.float64]
 
 
 class Trajectory(ABC):
-    """Where a camera is at any time from 0 s to its duration, and how it moves; twice continuously differentiable.
+    """Pose and twist of a camera at any time from 0 s to its duration; twice continuously differentiable.
 
-    The world has its axes x right, y down, z forward, as the camera at the start of a drive. The pose is that of the
-    optical frame of a camera that is nominally level and at its nominal height, which is y = 0. All methods take times
-    of any shape (...).
+    The axes of the world are x right, y down, z forward, as those of the camera at the start of a drive. The pose is
+    that of the optical frame of a camera that is nominally level and at its nominal height, y = 0. All methods accept
+    times of any shape (...).
     """
 
     __slots__ = ()
 
     name: str
-    duration_s: float  # inf: it never ends
+    duration_s: float  # inf: the trajectory never ends
 
     @abstractmethod
     def position_orientation(self, t_s: ArrayLike) -> tuple[Array, Array]:
@@ -62,7 +62,7 @@ class Trajectory(ABC):
 
     def _within(self, t_s: ArrayLike) -> Array:
         t = np.asarray(t_s, np.float64)
-        outside = ~((t >= 0) & (t <= self.duration_s + 1e-9))  # so written that nan is outside
+        outside = ~((t >= 0) & (t <= self.duration_s + 1e-9))  # in this form nan counts as outside
         if outside.any():
             value = float(t[outside][0])
             raise InvalidField(f"trajectory {self.name}", "t_s", value, f"must be 0 to {self.duration_s:g} s")
@@ -71,7 +71,7 @@ class Trajectory(ABC):
 
 @dataclass(frozen=True, slots=True)
 class ScrewTrajectory(Trajectory):
-    """A constant twist for ever: at rest, straight on, turning in place, or a helix."""
+    """A constant twist without end: stationary, straight, turning in place, or a helix."""
 
     name: str
     constant: tuple[float, ...]  # vx vy vz [m/s] wx wy wz [rad/s]
@@ -89,30 +89,31 @@ class ScrewTrajectory(Trajectory):
 
 @dataclass(frozen=True, slots=True)
 class SplineTrajectory(Trajectory):
-    """A uniform cubic B-spline of positions and of quaternions, these normalised.
+    """A uniform cubic B-spline of positions and of quaternions, which are normalised.
 
-    The knots steer the path, which passes them at a distance (a sixth of the second difference) but for the first and
-    the last, through which it goes. That costs no equations to solve and rings nowhere; what is at rest over five knots
-    is at rest.
+    The spline passes through the first and the last knot, and near the others (at a sixth of the second difference). It
+    needs no system of equations and does not overshoot. Where five knots are equal, the camera is stationary.
     """
 
     name: str
     duration_s: float
-    step_s: float  # from knot to knot
-    control: Array = field(repr=False)  # (knots + 2, 7) position and quaternion, one more before and after the path
+    step_s: float  # time between knots
+    control: Array = field(
+        repr=False
+    )  # (knots + 2, 7) position and quaternion; one extra row before and after the knots
 
     @classmethod
     def through(
         cls, name: str, step_s: float, position: Array, orientation: Array, duration_s: float = math.inf
     ) -> "SplineTrajectory":
-        """The path that these knots steer.
+        """Create the spline of these knots.
 
         Args:
-            name: what to call it.
-            step_s: time from knot to knot [s].
+            name: of the trajectory.
+            step_s: time between knots [s].
             position: (N, 3) [m], N >= 2.
             orientation: (N, 4) unit quaternions, of either sign.
-            duration_s: where to end, before the last knot; by default there.
+            duration_s: end of the trajectory; at most, and by default, the last knot.
         """
         dots = (orientation[1:] * orientation[:-1]).sum(axis=1)
         signs = np.concatenate([[1.0], np.cumprod(np.where(dots < 0, -1.0, 1.0))])
@@ -133,12 +134,12 @@ class SplineTrajectory(Trajectory):
         squared = (value[..., 3:] ** 2).sum(-1, keepdims=True)
         back = rotations.inverse(value[..., 3:])
         v = rotations.turn(back / np.sqrt(squared), rate[..., :3])
-        # of s = |s| q the part along s only changes |s|, and is the scalar of conj(s) ds/dt: left out here
+        # with s = |s| q, the part of ds/dt along s changes only |s|; it is the scalar of conj(s) ds/dt, left out here
         w = 2 * rotations.product(back, rate[..., 3:])[..., :3] / squared
         return np.concatenate([v, w], axis=-1)
 
     def _evaluate(self, t_s: ArrayLike) -> tuple[Array, Array]:
-        """Value (..., 7) of the spline and its derivative [1/s]."""
+        """Value (..., 7) of the spline, and its derivative [1/s]."""
         at = self._within(t_s) / self.step_s
         first = np.clip(at.astype(np.int64), 0, len(self.control) - 4)
         u = (at - first)[..., None]
@@ -150,39 +151,39 @@ class SplineTrajectory(Trajectory):
 
 @dataclass(frozen=True, slots=True)
 class Mounted(Trajectory):
-    """The same path for a camera at a height above the ground plane y = 0, and pitched down on its mount.
+    """A trajectory for a camera at a height above the ground plane y = 0 and with a pitch on its mount.
 
-    The optical centre is where the trajectory has it, only higher; so its linear velocity is the same vector, seen from
-    a turned frame.
+    The optical centre is that of the trajectory, shifted upwards. Its linear velocity is therefore the same vector, in
+    a rotated frame.
     """
 
     trajectory: Trajectory
     height_m: float
-    pitch_deg: float = 0.0  # above 0 it looks down
+    pitch_deg: float = 0.0  # positive: downwards
 
     def __post_init__(self) -> None:
-        if not 0 <= self.height_m <= 1000:  # so written that nan fails
+        if not 0 <= self.height_m <= 1000:  # in this form nan fails
             raise InvalidField("camera mount", "height_m", self.height_m, "must be 0 to 1000 m")
         if not -90 <= self.pitch_deg <= 90:
             raise InvalidField("camera mount", "pitch_deg", self.pitch_deg, "must be -90 to 90 degrees")
 
     @property
     def name(self) -> str:  # type: ignore[override]  # read here, never set
-        """That of the path."""
+        """As the trajectory without mount."""
         return self.trajectory.name
 
     @property
     def duration_s(self) -> float:  # type: ignore[override]  # read here, never set
-        """That of the path."""
+        """As the trajectory without mount."""
         return self.trajectory.duration_s
 
     @property
     def _mount(self) -> Array:
-        """Quaternion (4,) from the mounted camera's axes to the level one's."""
+        """Quaternion (4,) from the axes of the mounted camera to those of the level camera."""
         return rotations.exp(np.array([-math.radians(self.pitch_deg), 0.0, 0.0]))
 
     def position_orientation(self, t_s: ArrayLike) -> tuple[Array, Array]:
-        """See `Trajectory`; the ground is at y = 0 and the camera above it, at negative y."""
+        """See `Trajectory`; the ground is at y = 0, and the camera above it has a negative y."""
         position, q = self.trajectory.position_orientation(t_s)
         return position - np.array([0.0, self.height_m, 0.0]), rotations.product(q, self._mount)
 

@@ -1,4 +1,4 @@
-"""Paths that are made up from a seed: a drive through streets, and a camera waved about in a room."""
+"""Random trajectories from a seed: a drive through streets, and a hand-held camera in a room."""
 
 import math
 from typing import Final
@@ -13,39 +13,39 @@ Array = NDArray[np.float64]
 
 _DRIVE_STEP_S: Final = 0.1
 _HAND_STEP_S: Final = 0.02
-_TAIL_S: Final = 10.0  # made and cut off, so that a longer drive of the same seed begins as the shorter one does
+_TAIL_S: Final = 10.0  # generated and dropped, so that a longer drive of the same seed begins like the shorter one
 
 TOP_M_S: Final = 12.0
-"""No drive is faster."""
+"""Greatest speed of a drive."""
 
 MAX_HEADING: Final = 1.6
-"""No drive turns further than this away from its first direction [rad], but for its springs."""
+"""Greatest heading of a drive relative to its first direction [rad], without the motion of the suspension."""
 
 LEVER_M: Final = 1.5
-"""How far the camera is ahead of the axle that does not steer, and so slips sideways."""
+"""Distance of the camera ahead of the unsteered axle; it gives the camera a sideways velocity in corners."""
 
 
 def driving(seed: int, seconds: float = 600.0) -> SplineTrajectory:
-    """A car's path on level ground: 0 to 12 m/s, stops, bends and corners, a little pitch, roll and heave.
+    """Generate the trajectory of a car on level ground: 0 to 12 m/s, with stops, bends, corners, pitch, roll and heave.
 
-    Accelerations are those of calm driving (1.6 m/s2 on, 2.2 m/s2 off, 2.5 m/s2 sideways). It always gets on along z:
-    its heading stays within MAX_HEADING of it, so that the path does not cross itself. The body leans and dives with
-    its acceleration and shakes with its speed; at rest it is still. Meant to be like MVSEC's outdoor_day: forward speed
-    5 (3) m/s, yaw rate 0.12 to 0.16 rad/s in the root mean square, at most some 0.6.
+    Accelerations are those of calm driving (1.6 m/s2 forward, 2.2 m/s2 braking, 2.5 m/s2 sideways). The heading stays
+    within MAX_HEADING of z, so that the path does not cross itself. The body pitches and rolls with the acceleration
+    and shakes with the speed; a standing car does not move. The model is MVSEC's outdoor_day: forward speed 5 (3) m/s,
+    yaw rate 0.12 to 0.16 rad/s root mean square, at most about 0.6.
     """
     rng, shaking = np.random.default_rng((seed, 1)), np.random.default_rng((seed, 2))
     n = math.ceil(seconds / _DRIVE_STEP_S) + 1
     tail = round(_TAIL_S / _DRIVE_STEP_S)
     speed, yaw_rate = (_eased(values) for values in _manoeuvres(rng, n + tail))
     yaw = np.cumsum(yaw_rate) * _DRIVE_STEP_S
-    # 0.006 rad per m/s2: nose up under power, down under the brakes, and over to the outside of a bend
+    # 0.006 rad per m/s2: nose up in acceleration, nose down in braking, and roll to the outside of a bend
     lean = 0.006 * np.stack([_rate(speed), 0 * speed, -yaw_rate * speed], axis=1)
     shake = noise(shaking, n + tail, 3, 0.4, 1.5, _DRIVE_STEP_S) * np.minimum(speed / 5, 1)[:, None]
     tilt = lean + shake * np.array([0.0025, 0.0, 0.0025])
     heading = rotations.exp(np.stack([0 * yaw, yaw, 0 * yaw], axis=1))
     step = np.stack([np.sin(yaw) * speed, 0 * yaw, np.cos(yaw) * speed], axis=1) * _DRIVE_STEP_S
     position = np.concatenate([np.zeros((1, 3)), np.cumsum((step[1:] + step[:-1]) / 2, axis=0)])
-    position += LEVER_M * rotations.turn(heading, np.array([0.0, 0.0, 1.0]))  # which swings out in corners
+    position += LEVER_M * rotations.turn(heading, np.array([0.0, 0.0, 1.0]))  # the camera swings out in corners
     position = position - position[:1]
     position[:, 1] = 0.01 * shake[:, 1]
     orientation = rotations.product(heading, rotations.exp(tilt))
@@ -53,12 +53,12 @@ def driving(seed: int, seconds: float = 600.0) -> SplineTrajectory:
 
 
 def _manoeuvres(rng: np.random.Generator, n: int) -> tuple[Array, Array]:
-    """Speed (n,) [m/s] within the accelerations, and yaw rate (n,) [rad/s], to the right above 0; still with kinks."""
+    """Speed (n,) [m/s] within the accelerations, and yaw rate (n,) [rad/s], positive to the right; not smoothed yet."""
     speed, yaw_rate = np.zeros(n), np.zeros(n)
     v, heading, i = float(rng.uniform(3, 9)), 0.0, 0
     while i < n:
         kind = rng.choice(["straight", "bend", "corner", "stop"], p=[0.35, 0.3, 0.2, 0.15])
-        kind = kind if i else "straight"  # the first second is eased in from nowhere
+        kind = kind if i else "straight"  # a drive begins straight
         side = -math.copysign(1.0, heading) if abs(heading) > 0.3 else float(rng.choice([-1.0, 1.0]))
         target, curvature, angle = float(rng.uniform(4, TOP_M_S)), 0.0, 0.0
         duration_s = float(rng.uniform(4, 12))
@@ -74,7 +74,7 @@ def _manoeuvres(rng: np.random.Generator, n: int) -> tuple[Array, Array]:
             if i == n or (kind == "corner" and turned >= angle - 1e-9):
                 break
             v += float(np.clip(target - v, -0.22, 0.16))
-            # corners wait until the car is slow enough for them
+            # a corner begins when the car is slow enough
             ready = turned < angle and (kind != "corner" or v <= target + 0.5)
             rate = min(curvature * v, 2.5 / max(v, 1.0), (angle - turned) / _DRIVE_STEP_S) if ready else 0.0
             turned += rate * _DRIVE_STEP_S
@@ -85,7 +85,7 @@ def _manoeuvres(rng: np.random.Generator, n: int) -> tuple[Array, Array]:
 
 
 def _eased(values: Array) -> Array:
-    """Each value's weighted mean over the 1.2 s that follow it; no overshoot, and rest stays rest."""
+    """Smooth values: the weighted mean over the following 1.2 s; no overshoot, and standstill stays standstill."""
     kernel = np.hanning(15)[1:-1]
     padded = np.concatenate([values, np.full(kernel.size - 1, values[-1])])
     return np.convolve(padded, kernel / kernel.sum(), mode="valid")
@@ -96,21 +96,21 @@ def _rate(values: Array) -> Array:
 
 
 def hand_held(seed: int, seconds: float = 60.0, moved: float = 1.0, turned: float = 1.0) -> SplineTrajectory:
-    """A camera waved about in front of a scene: six degrees of freedom, calm and wild by turns.
+    """Generate the trajectory of a hand-held camera in six degrees of freedom, alternately calm and fast.
 
-    Within half a metre or so of where it starts and looking along z within some 40 degrees. Its spectra and speeds are
-    modelled on poster_6dof of the Event Camera Dataset: speed 0.9 m/s in the median and 2.4 at 99 %, turning 1.2 rad/s
-    in the median and 12 at 99 %.
+    The camera stays within about half a metre of its start and looks along z within about 40 degrees. Spectra and
+    speeds follow poster_6dof of the Event Camera Dataset: speed 0.9 m/s median and 2.4 at the 99th percentile, angular
+    speed 1.2 rad/s median and 12 at the 99th percentile.
 
     Args:
-        seed: of the path; the same one for any `moved` and `turned`.
-        seconds: how long it lasts.
-        moved: factor of how far it moves; 0 leaves a camera that turns in place.
-        turned: factor of how far it turns; 0 leaves one that moves without turning.
+        seed: of the trajectory; `moved` and `turned` only scale it.
+        seconds: duration.
+        moved: factor of the translation; 0 gives a camera that turns in place.
+        turned: factor of the rotation; 0 gives a camera that moves without turning.
     """
     n = math.ceil(seconds / _HAND_STEP_S) + 1
     rng = [np.random.default_rng((seed, 3, k)) for k in range(4)]
-    # how wild it is comes and goes over some seconds
+    # the intensity of the motion varies over some seconds
     wild = np.exp(np.clip(0.35 * noise(rng[0], n, 1, 0.02, 0.06, _HAND_STEP_S) - 0.1, -1.0, 0.5))
     wild_turns = np.exp(np.clip(1.0 * noise(rng[1], n, 1, 0.02, 0.06, _HAND_STEP_S) - 0.5, -2.0, 1.2))
     position = moved * 0.12 * wild * noise(rng[2], n, 3, 0.3, 0.9, _HAND_STEP_S)
@@ -120,9 +120,10 @@ def hand_held(seed: int, seconds: float = 60.0, moved: float = 1.0, turned: floa
 
 
 def noise(rng: np.random.Generator, n: int, channels: int, low_hz: float, high_hz: float, step_s: float) -> Array:
-    """Smooth random numbers (n, channels) of variance 1, with most of their power between two frequencies.
+    """Generate smooth noise (n, channels) of variance 1, with most of its power between two frequencies.
 
-    White noise through the difference of two Gaussians; more numbers of the same generator begin with the same ones.
+    It is white noise filtered by the difference of two Gaussians. A longer signal of the same generator begins with the
+    shorter one.
     """
     narrow, wide = 1 / (2 * np.pi * high_hz * step_s), 1 / (2 * np.pi * low_hz * step_s)  # standard deviations [steps]
     reach = math.ceil(3.5 * wide)

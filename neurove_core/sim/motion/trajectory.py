@@ -1,4 +1,4 @@
-"""Trajectories by name: made up from a seed, of constant velocity, or from a file of poses."""
+"""Trajectories by name: generated from a seed, of constant velocity, or from a file of poses."""
 
 import math
 from pathlib import Path
@@ -40,18 +40,18 @@ TRAJECTORIES: Final = (
     "slider?vx=0.3&vy=0&vz=0",
     "a file of poses, FILE?start=0&smooth=0.5&flat=1",
 )
-"""What `parse_trajectory` knows, each with its defaults or an example."""
+"""Trajectories that `parse_trajectory` accepts, each with its defaults or an example."""
 
 MAX_SECONDS: Final = 86_400.0
 MAX_RATE: Final = 100.0  # [m/s] or [rad/s]
 DRIVE_M: Final = 50.0
-"""A recorded path that spans more than this is taken for a drive."""
+"""A recorded path that spans more than this counts as a drive."""
 
-_FLAT_S: Final = 4.0  # hills are slower than this; pitching on the springs is faster
+_FLAT_S: Final = 4.0  # hills are slower than this; pitching on the suspension is faster
 
 
 def still(seconds: float = math.inf) -> ScrewTrajectory:
-    """A camera at rest."""
+    """A stationary camera."""
     return ScrewTrajectory("still", (0.0,) * 6, seconds)
 
 
@@ -61,33 +61,32 @@ def rotation(wx: float, wy: float, wz: float, seconds: float = math.inf) -> Scre
 
 
 def slider(vx: float, vy: float = 0.0, vz: float = 0.0, seconds: float = math.inf) -> ScrewTrajectory:
-    """A camera that moves straight on at a constant velocity [m/s], without turning."""
+    """A camera that moves at a constant velocity [m/s] without turning."""
     return ScrewTrajectory("slider", (vx, vy, vz, 0.0, 0.0, 0.0), seconds)
 
 
 def from_poses(
     poses: Poses, name: str = "poses", *, smooth_s: float | None = None, flat: bool | None = None
 ) -> SplineTrajectory:
-    """The smooth path along recorded poses, from the first to the last (less at most a fifth of the filter).
+    """Create a smooth trajectory along recorded poses, from the first to the last (less at most a fifth of the filter).
 
-    The poses go through the filter of geometry.twists (window `smooth_s`); a spline's knots are taken from them every
-    fifth of that. So it is not the recorded path to the millimetre, but an exact twist belongs to it.
+    The poses pass the filter of geometry.twists (window `smooth_s`), which gives the knots of a spline at every fifth
+    of the window. The trajectory is not exactly the recorded path, but its twist is exact.
 
-    The world is turned and shifted, not stretched: such that the camera is level on average (the mean of its own down
-    is y), and
-    - a drive, or any path with `flat`, starts at the origin and looks along z at first. Hills are taken off: what is
-      slower than some seconds is removed from its height, and from the tilt of the camera likewise, so that a level
-      ground stays where it is beneath it. A steady pitch or roll of the recorded camera goes with that: see Mounted.
-    - any other looks along z on average, and its mean position is the origin.
+    The world is rotated and shifted, not scaled. The camera is level on average (the mean of its down axis is y), and:
+    - A drive, or any path with `flat`, starts at the origin and looks along z at first. Hills are removed: slow changes
+      (over some seconds) are subtracted from the height and from the tilt of the camera, so that a level ground stays
+      below it. This also removes a constant pitch or roll of the recorded camera; see Mounted.
+    - Any other path looks along z on average, and its mean position is the origin.
 
     Args:
-        poses: the camera's optical frame in any world; without gaps above 0.5 s.
-        name: what to call it.
+        poses: of the optical frame of the camera in any world; without gaps above 0.5 s.
+        name: of the trajectory.
         smooth_s: length of the filter [s]; by default geometry.filter_for(poses).
-        flat: whether to take hills off; by default where the path spans more than DRIVE_M.
+        flat: whether to remove hills; by default only if the path spans more than DRIVE_M.
 
     Raises:
-        InvalidField: these are no poses, too few, or have a gap; or smooth_s is not above 0 s.
+        InvalidField: the poses are invalid, too few, or have a gap; or smooth_s is not above 0 s.
     """
     check_poses(poses)
     smooth_s = filter_for(poses) if smooth_s is None else smooth_s
@@ -106,26 +105,26 @@ def _knots(poses: Poses, smooth_s: float) -> Poses:
     """Filtered poses at equal times."""
     if poses.t.size < 3 or poses.t[-1] - poses.t[0] < smooth_s * 1e6:
         raise InvalidField(
-            "trajectory", "poses", poses.t.size, f"at least 3, over more than the filter's {smooth_s:g} s"
+            "trajectory", "poses", poses.t.size, f"must be at least 3, over more than the {smooth_s:g} s of the filter"
         )
     t = np.arange(poses.t[0], poses.t[-1] + 1, smooth_s * 2e5).astype(np.int64)
     knots = interpolate_poses(smoothed(poses, filter_s=smooth_s), t)
     if np.isnan(knots.position_m).any():
-        hole = int(np.isnan(knots.position_m[:, 0]).argmax())
-        at_s = float(t[hole] - t[0]) / 1e6
-        raise InvalidField("trajectory", "t", at_s, "a gap of more than 0.5 s between poses can not be filled")
+        gap = int(np.isnan(knots.position_m[:, 0]).argmax())
+        at_s = float(t[gap] - t[0]) / 1e6
+        raise InvalidField("trajectory", "t", at_s, "a gap of more than 0.5 s between poses cannot be filled")
     return knots
 
 
 def _level(knots: Poses, drive: bool) -> tuple[Array, Array]:
-    """Position and orientation in the world that `from_poses` speaks of."""
+    """Position and orientation in the world that `from_poses` describes."""
     q, position = knots.orientation, knots.position_m
     axes = rotations.matrix_of(q)
     forward = axes[0, :, 2] if drive else axes[:, :, 2].mean(axis=0)
     down = axes[:, :, 1].mean(axis=0)
     down, length = down / max(float(np.linalg.norm(down)), 1e-9), float(np.linalg.norm(down))
     right = np.cross(down, forward)
-    if length < 0.3 or np.linalg.norm(right) < 0.1:  # it looks everywhere: only its first view can be the world's
+    if length < 0.3 or np.linalg.norm(right) < 0.1:  # it looks in all directions: use the axes of the first pose
         turned = rotations.inverse(q[0])
     else:
         right /= np.linalg.norm(right)
@@ -135,11 +134,11 @@ def _level(knots: Poses, drive: bool) -> tuple[Array, Array]:
 
 
 def _without_hills(position: Array, q: Array, step_s: float) -> tuple[Array, Array]:
-    """The path with its height and its tilt above some seconds taken off; heading and ground track stay."""
+    """Remove changes of height and tilt that are slower than some seconds; heading and ground track stay."""
     down = _slow(rotations.turn(q, np.array([0.0, 1.0, 0.0])), step_s)
     down /= np.linalg.norm(down, axis=1, keepdims=True)
     y = np.array([0.0, 1.0, 0.0])
-    # the shortest rotation that brings the slow down back to y
+    # the shortest rotation from the slow part of the down axis to y
     back = np.concatenate([np.cross(down, y), 1 + down @ y[:, None]], axis=1)
     back /= np.linalg.norm(back, axis=1, keepdims=True)
     flat = position.copy()
@@ -148,7 +147,7 @@ def _without_hills(position: Array, q: Array, step_s: float) -> tuple[Array, Arr
 
 
 def _slow(values: Array, step_s: float) -> Array:
-    """Each column's mean with its neighbours in time, weighted by a bell some seconds wide; mirrored at the ends."""
+    """Smooth each column over some seconds, with a bell-shaped kernel; mirrored at the ends."""
     half = min(max(1, round(_FLAT_S / step_s)), len(values) - 1)
     kernel = np.hanning(2 * half + 3)[1:-1]
     first, last = values[:1], values[-1:]
@@ -157,17 +156,17 @@ def _slow(values: Array, step_s: float) -> Array:
 
 
 def parse_trajectory(text: str, seconds: float | None = None) -> Trajectory:
-    """The trajectory of a name, or of a file of poses; see TRAJECTORIES.
+    """Create a trajectory from a name or from a file of poses; see TRAJECTORIES.
 
     >>> parse_trajectory("rotation?wy=0.5").twist(1.0).tolist()
     [0.0, 0.0, 0.0, 0.0, 0.5, 0.0]
 
     Args:
         text: a name or a path, with its parameters as in the query of a URL.
-        seconds: how long a generated one lasts, unless it says `seconds=`.
+        seconds: duration of a generated trajectory without `seconds=`.
 
     Raises:
-        InvalidField: the name or a parameter is unknown, or a value out of its bound; or the file holds no path.
+        InvalidField: the name or a parameter is unknown, a value is out of bounds, or the file contains no path.
     """
     name, _, query = text.rpartition("?") if "?" in text else (text, "", "")
     given = _Parameters(text, query)
@@ -190,35 +189,39 @@ def parse_trajectory(text: str, seconds: float | None = None) -> Trajectory:
 
 
 def _from_file(name: str, given: "_Parameters", seconds: float | None) -> SplineTrajectory:
-    """The trajectory along a file's poses, from `start` s after the first on."""
+    """Create the trajectory along the poses of a file, from `start` seconds after the first pose on."""
     path = Path(name)
     if not path.is_file():
         known = "; ".join(TRAJECTORIES)
-        raise InvalidField("trajectory", "name", name, f"neither a known trajectory nor a file; known are {known}")
+        raise InvalidField(
+            "trajectory", "name", name, f"neither a known trajectory nor a file; known trajectories: {known}"
+        )
     start = given.number("start", 0.0, 0.0, 1e6)
     smooth = given.optional("smooth", 1e-3, 60.0)
     flat = given.optional("flat", 0, 1)
     given.done()
     poses = read_poses(path)
     since = (poses.t - poses.t[:1]) / 1e6
-    keep = (since >= start) & (since <= start + (seconds or math.inf) + 0.5)  # the filter sees a little further
+    keep = (since >= start) & (
+        since <= start + (seconds or math.inf) + 0.5
+    )  # the filter needs some poses after the end
     if not keep.any():
         raise InvalidField("trajectory", "start", start, f"{path} lasts {since[-1] if since.size else 0:g} s")
-    cut = Poses(poses.t[keep], poses.position_m[keep], poses.orientation[keep])
-    whole = from_poses(cut, path.stem, smooth_s=smooth, flat=None if flat is None else flat > 0)
+    part = Poses(poses.t[keep], poses.position_m[keep], poses.orientation[keep])
+    whole = from_poses(part, path.stem, smooth_s=smooth, flat=None if flat is None else flat > 0)
     lasting = min(whole.duration_s, seconds or math.inf)
     return SplineTrajectory(whole.name, lasting, whole.step_s, whole.control)
 
 
 class _Parameters:
-    """The parameters that were given; each is asked for, and none may be left over."""
+    """The given parameters; each is read once, and unread ones are refused."""
 
     def __init__(self, text: str, query: str) -> None:
         self._text = text
         self._values = dict(parse_qsl(query, keep_blank_values=True))
 
     def optional(self, field: str, low: float, high: float) -> float | None:
-        """The parameter as a number within these bounds, or None where it was not given."""
+        """The parameter as a number within these bounds, or None if it is not given."""
         text = self._values.pop(field, None)
         if text is None:
             return None
@@ -226,7 +229,7 @@ class _Parameters:
             value = float(text)
         except ValueError:
             value = math.nan
-        if not low <= value <= high:  # so written that nan fails
+        if not low <= value <= high:  # in this form nan fails
             raise InvalidField(f"trajectory {self._text}", field, text, f"must be a number from {low:g} to {high:g}")
         return value
 
@@ -236,14 +239,14 @@ class _Parameters:
         return default if value is None else value
 
     def whole(self, field: str, default: int) -> int:
-        """The parameter as a whole number from 0 on."""
+        """The parameter as an integer of at least 0."""
         text = self._values.pop(field, str(default))
         if not (text.isascii() and text.isdecimal() and len(text) < 10):
-            bound = "a whole number of at most 9 digits is expected"
+            bound = "must be an integer of at most 9 digits"
             raise InvalidField(f"trajectory {self._text}", field, text, bound)
         return int(text)
 
     def done(self) -> None:
-        """Refuse what nobody asked for."""
+        """Refuse parameters that were not read."""
         for field, value in self._values.items():
-            raise InvalidField(f"trajectory {self._text}", field, value, "no such parameter of this trajectory")
+            raise InvalidField(f"trajectory {self._text}", field, value, "this trajectory has no such parameter")

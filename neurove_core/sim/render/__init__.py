@@ -1,1 +1,1 @@
-"""From a scene and a pose to events: rendering, the camera, the pixels."""
+"""Cameras, rendering and pixels: from a scene and a pose to events."""

@@ -1,4 +1,4 @@
-"""Simulated cameras: real ones by name, any pinhole, and the ray of each of their pixels."""
+"""Simulated cameras: real cameras by name, any pinhole, and the ray of each pixel."""
 
 import math
 import re
@@ -15,7 +15,7 @@ from neurove_protocol.events import Sensor
 
 STREAM: Final = "sim"
 TILE: Final = 8
-"""Side of a tile [px]: the pixels that are rendered at one rate."""
+"""Side of a tile [px]; all pixels of a tile are rendered at one rate."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,11 +24,11 @@ class Camera:
 
     name: str
     info: CameraInfo
-    pitch_deg: float = 5.0  # how far it looks down
+    pitch_deg: float = 5.0  # downwards
 
     @property
     def height_m(self) -> float:
-        """How high it is mounted above the ground [m]."""
+        """Height above the ground [m]."""
         return self.info.height_m or DEFAULT_HEIGHT_M
 
 
@@ -57,27 +57,29 @@ _DAVIS240C: Final = CameraInfo(  # Event Camera Dataset (Mueggler 2017), calib.t
     cy=110.712660011,
     distortion=(-0.368436311798, 0.150947243557, -0.000296130534385, -0.000759431726241, 0.0),
 )
-_DAVIS240C_SLIDER: Final = CameraInfo(  # the same data set's slider recordings have a longer lens: their calib.txt
-    stream=STREAM,
-    width=240,
-    height=180,
-    lens="pinhole",
-    fx=335.419462958,
-    fy=335.352935612,
-    cx=129.924663379,
-    cy=99.1864303447,
-    distortion=(-0.138592767408, 0.0933736664192, -0.000335586987532, 0.000173720158228, 0.0),
+_DAVIS240C_SLIDER: Final = (
+    CameraInfo(  # calib.txt of the slider recordings in the same data set, which have a longer lens
+        stream=STREAM,
+        width=240,
+        height=180,
+        lens="pinhole",
+        fx=335.419462958,
+        fy=335.352935612,
+        cx=129.924663379,
+        cy=99.1864303447,
+        distortion=(-0.138592767408, 0.0933736664192, -0.000335586987532, 0.000173720158228, 0.0),
+    )
 )
 
 
 def _halved(full: CameraInfo) -> CameraInfo:
-    """The same lens over pixels of twice the size: pixel i covers 2i and 2i + 1, whose common centre is 2i + 0.5."""
+    """The same lens with pixels of twice the size: pixel i covers 2i and 2i + 1, with their centre at 2i + 0.5."""
     half = {"width": full.width // 2, "height": full.height // 2, "fx": full.fx / 2, "fy": full.fy / 2}
     return full.model_copy(update=half | {"cx": (full.cx - 0.5) / 2, "cy": (full.cy - 0.5) / 2})
 
 
 def pinhole(sensor: Sensor, focal_px: float) -> CameraInfo:
-    """A perfect lens, centred on the sensor, of this focal length [px]."""
+    """An ideal lens of this focal length [px], centred on the sensor."""
     return CameraInfo(
         stream=STREAM,
         width=sensor.width,
@@ -98,24 +100,24 @@ CAMERAS: Final = {
     # Gen3.1 VGA: 15 um pixels (Prophesee, PPS3MVCD) behind an 8 mm lens: 8 / 0.015 = 533 px, 62 deg across.
     "prophesee": pinhole(Sensor(640, 480), 8 / 0.015),
 }
-"""Lenses by name."""
+"""Cameras by name."""
 
 _PINHOLE = re.compile(r"pinhole:([0-9]{1,4})x([0-9]{1,4}):([0-9]{1,3}(?:\.[0-9]{1,6})?)")
 
 
 def named_camera(name: str, height_m: float = DEFAULT_HEIGHT_M, pitch_deg: float = 5.0) -> Camera:
-    """The camera of this name, mounted so high and looking so far down.
+    """Create a camera by its name, with its mount.
 
     >>> round(named_camera("pinhole:320x240:90").info.fx, 3)
     160.0
 
     Args:
         name: one of CAMERAS, or `pinhole:WIDTHxHEIGHT:HFOV` with the horizontal field of view in degrees.
-        height_m: above the ground [m].
-        pitch_deg: how far it looks down [deg].
+        height_m: height above the ground [m].
+        pitch_deg: pitch downwards [deg].
 
     Raises:
-        InvalidField: no such camera, or its mount or field of view is out of bounds.
+        InvalidField: the camera is unknown, or its mount or field of view is out of bounds.
     """
     if not 0.05 <= height_m <= 100:
         raise InvalidField("camera", "height_m", height_m, "must be 0.05 to 100 m")
@@ -129,7 +131,7 @@ def _any_pinhole(name: str) -> CameraInfo:
     match = _PINHOLE.fullmatch(name)
     if match is None:
         known = ", ".join(CAMERAS)
-        raise InvalidField("camera", "camera", name, f"known are {known}, and pinhole:WIDTHxHEIGHT:HFOV_DEG")
+        raise InvalidField("camera", "camera", name, f"known cameras: {known}, and pinhole:WIDTHxHEIGHT:HFOV_DEG")
     width, height, hfov_deg = int(match[1]), int(match[2]), float(match[3])
     if not 1 <= hfov_deg <= 150:
         raise InvalidField("camera", "hfov_deg", hfov_deg, "must be 1 to 150 deg")
@@ -139,25 +141,25 @@ def _any_pinhole(name: str) -> CameraInfo:
 
 
 class Rays(NamedTuple):
-    """Where each pixel looks, in the optical frame as (x, y, 1); pixels lie tile by tile, N of them in M tiles.
+    """The ray (x, y, 1) of each pixel in the optical frame; N pixels in M tiles, tile by tile.
 
-    A pixel that the lens sends no ray in front of the camera is not among them: it sees nothing and has no events.
+    Pixels without a ray in front of the camera are left out; they have no events.
     """
 
     x: NDArray[np.float64]  # (N,) of the ray
     y: NDArray[np.float64]  # (N,)
-    step_x: NDArray[np.float64]  # (N,) how much x grows from a pixel to the next in its row
-    step_y: NDArray[np.float64]  # (N,) how much y grows from a pixel to the next in its column
+    step_x: NDArray[np.float64]  # (N,) change of x from a pixel to the next one in its row
+    step_y: NDArray[np.float64]  # (N,) change of y from a pixel to the next one in its column
     column: NDArray[np.uint16]  # (N,) of the pixel
     row: NDArray[np.uint16]  # (N,)
-    first: NDArray[np.int64]  # (M + 1,) tile m has the pixels first[m] up to but without first[m + 1]
+    first: NDArray[np.int64]  # (M + 1,) tile m has pixels first[m] to first[m + 1] - 1
     tile_row: NDArray[np.int64]  # (M,) of the tile in the grid of tiles
     tile_column: NDArray[np.int64]  # (M,)
-    box: NDArray[np.float64]  # (M, 4) of the tile's rays, half a pixel wider: least x, least y, greatest x, greatest y
+    box: NDArray[np.float64]  # (M, 4) least x, least y, greatest x, greatest y of the rays, half a pixel wider
 
 
 def rays_of(info: CameraInfo) -> Rays:
-    """The ray of each pixel of a camera."""
+    """Compute the ray of each pixel of a camera."""
     row, column = np.divmod(np.arange(info.width * info.height), info.width)
     x, y = _ray(info, column, row)
     step_x = _ray(info, column + 0.5, row)[0] - _ray(info, column - 0.5, row)[0]
@@ -189,7 +191,7 @@ def _ray(info: CameraInfo, column: NDArray[np.float64], row: NDArray[np.float64]
 
 
 def as_image(rays: Rays, sensor: Sensor, values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Values (N,) of the rays as an image (H, W); nan where no ray is."""
+    """Arrange values (N,) of the rays as an image (H, W); nan where a pixel has no ray."""
     image = np.full((sensor.height, sensor.width), np.nan, np.float32)
     image[rays.row, rays.column] = values
     return image

@@ -1,4 +1,4 @@
-"""Which panels a tile may see during an interval, so that its pixels ask no others."""
+"""Culling: the panels that a tile may see during an interval."""
 
 from typing import NamedTuple
 
@@ -10,19 +10,19 @@ from neurove_core.sim.render.views import NEAR_M
 
 
 class Candidates(NamedTuple):
-    """Panels by tile, M tiles: tile m may see panel[first[m]] up to but without panel[first[m + 1]], nearest first."""
+    """Panels by tile, M tiles: tile m may see panel[first[m]] to panel[first[m + 1] - 1], nearest first."""
 
-    kept: NDArray[np.int64]  # those of all panels that any tile may see
+    kept: NDArray[np.int64]  # indices of the panels that any tile may see
     first: NDArray[np.int64]  # (M + 1,)
-    panel: NDArray[np.int64]  # (K,) place among those kept
-    nearest: NDArray[np.float64]  # (K,) least depth of any of its points, or less [m]
+    panel: NDArray[np.int64]  # (K,) index into `kept`
+    nearest: NDArray[np.float64]  # (K,) lower bound of the depth of the panel [m]
 
 
 @fast
 def _corners_of(view: NDArray[np.float64], corner: NDArray[np.float64]) -> None:  # pragma: no cover (machine code)
-    """The corners (4, 3) of a panel in the camera's frame."""
+    """Fill in the corners (4, 3) of a panel in the frame of the camera."""
     for c in range(4):
-        # from the camera's place in the panel's coordinates to the corner
+        # from the camera, in the coordinates of the panel, to the corner
         du = (view[12] if c in (0, 3) else -view[12]) - view[9]
         dv = (view[13] if c < 2 else -view[13]) - view[10]
         for k in range(3):
@@ -33,12 +33,12 @@ def _corners_of(view: NDArray[np.float64], corner: NDArray[np.float64]) -> None:
 def _edges_of(
     views: NDArray[np.float64], corner: NDArray[np.float64], edges: NDArray[np.float64]
 ) -> None:  # pragma: no cover (machine code)
-    """Planes through the camera and each edge of a panel: a ray (x, y, 1) hits it only on the inner side of all four.
+    """Planes through the camera and the edges of a panel; a ray (x, y, 1) hits it only inside all four planes.
 
     Args:
-        views: (P, VIEW) of the panel from P places.
-        corner: (4, 3) to work in.
-        edges: (P, 4, 3) filled with the unit normals, which look inwards.
+        views: (P, VIEW) of the panel from P poses.
+        corner: (4, 3) work space.
+        edges: (P, 4, 3) filled with the unit normals, which point inwards.
     """
     for j in range(views.shape[0]):
         _corners_of(views[j], corner)
@@ -50,14 +50,14 @@ def _edges_of(
             inner = x * across[0] + y * across[1] + z * across[2]
             scale = np.sqrt(x * x + y * y + z * z)
             if abs(inner) <= 1e-9 * scale * (abs(across[0]) + abs(across[1]) + abs(across[2])):
-                scale = np.inf  # seen edge-on: says nothing
+                scale = np.inf  # seen edge-on: no information
             scale = scale if inner > 0 else -scale
             edges[j, c, 0], edges[j, c, 1], edges[j, c, 2] = x / scale, y / scale, z / scale
 
 
 @fast
 def _may_hit(edges: NDArray[np.float64], tile: NDArray[np.float64], around: float) -> bool:  # pragma: no cover
-    """Whether, from any of the places, no edge has all of the tile on its outer side, by more than `around`."""
+    """Whether the tile, widened by `around`, is not completely outside an edge, for any pose."""
     for j in range(edges.shape[0]):
         outside = False
         for c in range(4):
@@ -73,15 +73,15 @@ def _may_hit(edges: NDArray[np.float64], tile: NDArray[np.float64], around: floa
 def _box_of(
     view: NDArray[np.float64], box: NDArray[np.float64], corner: NDArray[np.float64]
 ) -> float:  # pragma: no cover (machine code)
-    """Where a panel lies in the picture: least x, least y, greatest x, greatest y of its part before the camera.
+    """Bounding box of a panel in the image: least x, least y, greatest x, greatest y of its part in front.
 
     Args:
         view: (VIEW,) of the panel.
         box: (4,) filled.
-        corner: (4, 3) filled with its corners in the camera's frame.
+        corner: (4, 3) filled with its corners in the frame of the camera.
 
     Returns:
-        its least depth, infinite if it lies behind.
+        its least depth; infinite if it lies behind the camera.
     """
     box[0], box[1], box[2], box[3] = np.inf, np.inf, -np.inf, -np.inf
     nearest = np.inf
@@ -110,13 +110,13 @@ def _widen(box: NDArray[np.float64], x: float, y: float) -> None:  # pragma: no 
 def candidates_of(
     views: NDArray[np.float64], tiles: NDArray[np.float64], far_m: float, margin: float
 ) -> Candidates:  # pragma: no cover (machine code)
-    """The panels that each tile may see.
+    """Find the panels that each tile may see.
 
     Args:
-        views: (P, N, VIEW) from some places along the interval, its two ends among them.
-        tiles: (M, 4) what each tile looks at; see Rays.box.
-        far_m: what is further away is not seen.
-        margin: added around each tile, in the units of a ray's x and y.
+        views: (P, N, VIEW) from some poses in the interval, including its ends.
+        tiles: (M, 4) box of the rays of each tile; see Rays.box.
+        far_m: greatest visible distance.
+        margin: added around each tile, in the units of x and y of a ray.
     """
     n, m = views.shape[1], tiles.shape[0]
     boxes, nearest = np.empty((n, 4)), np.full(n, np.inf)
@@ -134,7 +134,7 @@ def candidates_of(
                     moved = max(moved, min(abs(box[k] - boxes[i, k]), 1.0))
             boxes[i, 0], boxes[i, 1] = min(boxes[i, 0], box[0]), min(boxes[i, 1], box[1])
             boxes[i, 2], boxes[i, 3] = max(boxes[i, 2], box[2]), max(boxes[i, 3], box[3])
-        around[i] = margin + 0.3 * moved  # the panel does not go quite straight from place to place
+        around[i] = margin + 0.3 * moved  # the panel does not move in an exact straight line between the poses
         boxes[i, 0] -= around[i]
         boxes[i, 1] -= around[i]
         boxes[i, 2] += around[i]
@@ -148,7 +148,10 @@ def candidates_of(
     for i in range(n):
         inside = boxes[i, 0] <= edge[2] and boxes[i, 2] >= edge[0] and boxes[i, 1] <= edge[3] and boxes[i, 3] >= edge[1]
         wanted[i] = inside and nearest[i] < far_m
-    kept, place = np.flatnonzero(wanted), np.cumsum(wanted) - 1  # in their own order, which decides between equals
+    kept, place = (
+        np.flatnonzero(wanted),
+        np.cumsum(wanted) - 1,
+    )  # in their own order, which decides between equal depths
     order = order[wanted[order]]
     count = kept.size
     seen = np.empty((count, m), np.bool_)
@@ -157,7 +160,7 @@ def candidates_of(
     for k in range(count):
         x0, y0, x1, y1 = boxes[order[k]]
         _edges_of(views[:, order[k]], corner, edges)
-        for tile in range(m):  # `&` and not `and`: without branches this is a few tiles per cycle
+        for tile in range(m):  # `&`, not `and`: without branches this handles a few tiles per cycle
             touch = (x0 <= high_x[tile]) & (x1 >= low_x[tile]) & (y0 <= high_y[tile]) & (y1 >= low_y[tile])
             seen[k, tile] = touch
         for tile in range(m):

@@ -1,8 +1,8 @@
-"""One interval of simulated time: each tile rendered as often as it moves, and the events of its pixels.
+"""Simulate one interval: render each tile at its own rate, and make the events of its pixels.
 
-The image of a driving camera rushes past at its borders and hardly moves ahead. So each tile of pixels has its own step
-between renders, of the largest motion in it and around it, and not the whole sensor that of its fastest pixel: the same
-bound for every pixel at some fifth of the renders.
+The image of a driving camera moves fast at its borders and slowly in the middle. Each tile therefore has its own step
+between renders, from the greatest motion in and around it. This keeps the same bound for every pixel with about a fifth
+of the renders that one rate for the whole sensor would need.
 """
 
 import math
@@ -20,21 +20,21 @@ from neurove_core.sim.render.tile_rows import DEPTH, LANES, LIGHT, ROWS, load_ti
 from neurove_core.sim.render.views import Backdrop
 
 GRIDS: Final = (60, 240, 960)
-"""Into how many equal steps an interval may be cut; a tile is rendered after each or after some of them."""
+"""Numbers of equal steps of an interval; a tile is rendered after all or some of them."""
 
 
 @fast
 def tile_speeds(
     rays: Rays, depth: NDArray[np.float32], twists: NDArray[np.float64], out: NDArray[np.float64]
 ) -> None:  # pragma: no cover (machine code)
-    """The largest image motion in each tile [px/s].
+    """Compute the greatest image motion in each tile [px/s].
 
-    Source: the motion field of a rigid scene (Longuet-Higgins and Prazdny 1980), over the size of the pixel.
+    Source: the motion field of a rigid scene (Longuet-Higgins and Prazdny 1980), divided by the size of the pixel.
 
     Args:
         rays: of the camera.
         depth: (N,) of each ray [m].
-        twists: (K, 6) the largest of these counts.
+        twists: (K, 6); the greatest motion of these counts.
         out: (M,) filled.
     """
     for tile in range(out.size):
@@ -65,20 +65,20 @@ def run_tiles(
     state: PixelState,
     depth: NDArray[np.float32],
 ) -> EventBuffer:  # pragma: no cover (machine code)
-    """Render each tile in equal steps to the end of the interval; events not yet in order.
+    """Render each tile in equal steps to the end of the interval; return the unsorted events.
 
     Args:
         backdrop: of the world.
         rays: of the camera.
-        candidates: what each tile may see in the interval.
-        views: (G + 1, candidates.kept, VIEW) after each step of the grid, from the interval's start on.
-        rotations: (G + 1, 3, 3) likewise.
-        parts: (M,) into how many steps each tile's interval is cut; each divides G.
-        span_us: the interval's length.
-        weights: (G + 1, 3) of low_pass for an interval cut into so many steps.
-        mismatch: of the pixels of the sensor, as the rays are ordered.
-        state: of the pixels, changed.
-        depth: (N,) changed.
+        candidates: panels that each tile may see in the interval.
+        views: (G + 1, candidates.kept, VIEW) at each step of the grid, including the start of the interval.
+        rotations: (G + 1, 3, 3) at the same times.
+        parts: (M,) number of steps of each tile; each divides G.
+        span_us: duration of the interval.
+        weights: (G + 1, 3) of low_pass; row k is for an interval of k steps.
+        mismatch: of the pixels of the sensor, in the order of the rays.
+        state: of the pixels; changed in place.
+        depth: (N,) changed in place.
     """
     steps = views.shape[0] - 1
     t, pixel, p, n = np.empty(4096, np.int32), np.empty(4096, np.int32), np.empty(4096, np.uint8), 0

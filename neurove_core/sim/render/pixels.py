@@ -1,9 +1,10 @@
-"""Pixels of an event camera: log intensity -> events, by ESIM's principle.
+"""Pixels of an event camera: events from log intensity, by the principle of ESIM.
 
-Source: Rebecq, Gehrig, Scaramuzza, ESIM (CoRL 2018), section 4: between two renders the log intensity of a pixel is a
-straight line, and it makes an event each time it gets a threshold away from the level of the event before. Mismatch,
-leak, shot noise, bandwidth and the defaults are those of v2e (Hu, Liu, Delbruck, CVPRW 2021), its command line.
-Differs: bandwidth and shot noise do not depend on how bright it is; a shot noise event leaves the pixel's level alone.
+Source: Rebecq, Gehrig, Scaramuzza, ESIM (CoRL 2018), section 4: between two renders the log intensity of a pixel
+changes linearly, and the pixel makes an event each time it differs by a threshold from the level of the previous event.
+Mismatch, leak, shot noise, bandwidth and the defaults are those of the command line of v2e (Hu, Liu, Delbruck, CVPRW
+2021).
+Differs: bandwidth and shot noise do not depend on the brightness; a shot noise event does not change the pixel's level.
 """
 
 import math
@@ -19,89 +20,89 @@ from neurove_protocol.errors import InvalidField, TimeBackwards
 from neurove_protocol.events import Events, Sensor
 
 LEAST_THRESHOLD: Final = 0.01
-"""Mismatch takes no threshold below this (ESIM) [log intensity]."""
+"""Lower bound of a threshold with mismatch (ESIM) [log intensity]."""
 
 LONGEST_US: Final = 10_000_000
-"""Frames may not lie further apart than this [us]."""
+"""Greatest time between two frames [us]."""
 
 
 class PixelConfig(Config):
-    """How the pixels behave."""
+    """Configuration of the pixels."""
 
-    threshold_on: float = Field(0.2, gt=0, le=10, description="Rise of log intensity that makes an ON event (v2e).")
-    threshold_off: float = Field(0.2, gt=0, le=10, description="Fall that makes an OFF event (v2e).")
-    threshold_sigma: float = Field(0.03, ge=0, le=1, description="Spread of both between pixels (v2e).")
+    threshold_on: float = Field(0.2, gt=0, le=10, description="Rise of log intensity for an ON event (v2e).")
+    threshold_off: float = Field(0.2, gt=0, le=10, description="Fall of log intensity for an OFF event (v2e).")
+    threshold_sigma: float = Field(0.03, ge=0, le=1, description="Standard deviation of both between pixels (v2e).")
     refractory_us: int = Field(
-        500, ge=0, le=1_000_000, description="A pixel's event so soon after its last is lost (v2e) [us]."
+        500, ge=0, le=1_000_000, description="Time after an event in which the pixel makes no other (v2e) [us]."
     )
-    leak_hz: float = Field(0.01, ge=0, le=1000, description="ON events of a pixel that sees no change (v2e) [Hz].")
-    shot_noise_hz: float = Field(0.001, ge=0, le=1000, description="Random events of a pixel, ON or OFF (v2e) [Hz].")
-    hot_fraction: float = Field(
-        5e-5, ge=0, le=1, description="Share of pixels that never rest (evbench's DAVIS240: 2 of 43,200)."
+    leak_hz: float = Field(0.01, ge=0, le=1000, description="Rate of ON events of a pixel without change (v2e) [Hz].")
+    shot_noise_hz: float = Field(
+        0.001, ge=0, le=1000, description="Rate of random events of a pixel, ON or OFF (v2e) [Hz]."
     )
-    hot_hz: float = Field(100.0, ge=0, le=10_000, description="Events of such a pixel (our choice) [Hz].")
+    hot_fraction: float = Field(5e-5, ge=0, le=1, description="Share of hot pixels (evbench's DAVIS240: 2 of 43,200).")
+    hot_hz: float = Field(100.0, ge=0, le=10_000, description="Rate of events of a hot pixel (our choice) [Hz].")
     cutoff_hz: float = Field(
-        300.0, ge=0, le=1e6, description="Of the first-order low pass of log intensity; 0 for none (v2e) [Hz]."
+        300.0, ge=0, le=1e6, description="Cutoff of the first-order low pass of log intensity; 0: none (v2e) [Hz]."
     )
     eps: float = Field(0.001, gt=0, le=1, description="L = log(I + eps), I from 0 to 1 (ESIM, CARLA).")
 
 
 USUAL: Final = PixelConfig()
-"""Pixels as they usually are."""
+"""The default pixels."""
 
 QUIET: Final = PixelConfig(
     threshold_sigma=0, refractory_us=0, leak_hz=0, shot_noise_hz=0, hot_fraction=0, hot_hz=0, cutoff_hz=0
 )
-"""Perfect pixels: thresholds alone."""
+"""Ideal pixels: only thresholds."""
 
 
 class Mismatch(NamedTuple):
-    """N pixels, each as it was made."""
+    """Mismatch of N pixels: the parameters of each."""
 
     on: NDArray[np.float64]  # (N,) threshold of each [log intensity]
     off: NDArray[np.float64]  # (N,)
-    leak: NDArray[np.float64]  # (N,) how fast its level sinks [log intensity / us]
+    leak: NDArray[np.float64]  # (N,) rate at which its level sinks [log intensity / us]
 
 
 class Pixels(NamedTuple):
-    """N pixels of a configuration."""
+    """N pixels of one configuration."""
 
     config: PixelConfig
     seed: int
     mismatch: Mismatch
-    hot: NDArray[np.int64]  # places of those that never rest
+    hot: NDArray[np.int64]  # indices of the hot pixels
 
     @property
     def n(self) -> int:
-        """How many there are."""
+        """Number of pixels."""
         return int(self.mismatch.on.size)
 
 
 class PixelState(NamedTuple):
-    """What N pixels carry from render to render."""
+    """State of N pixels between renders."""
 
     light: NDArray[np.float32]  # (N,) log intensity at the last render
     seen: NDArray[np.float64]  # (N,) the same after the low pass
-    level: NDArray[np.float64]  # (N,) where the last event left it
-    last_us: NDArray[np.int64]  # (N,) when the last event was
+    level: NDArray[np.float64]  # (N,) level after the last event
+    last_us: NDArray[np.int64]  # (N,) time of the last event
 
 
 class EventBuffer(NamedTuple):
-    """Events of one interval as they are found, pixel after pixel; of M rows the first `n` count."""
+    """Buffer for the events of one interval; the first `n` of M rows are valid."""
 
-    t: NDArray[np.int32]  # (M,) from the interval's start [us]
+    t: NDArray[np.int32]  # (M,) from the start of the interval [us]
     pixel: NDArray[np.int32]  # (M,)
     p: NDArray[np.uint8]  # (M,)
     n: int
 
     @classmethod
     def empty(cls, rows: int) -> "EventBuffer":
-        """None yet, and room for so many."""
+        """Create an empty buffer of this many rows."""
         return cls(np.empty(rows, np.int32), np.empty(rows, np.int32), np.empty(rows, np.uint8), 0)
 
 
 def make_pixels(config: PixelConfig, n: int, seed: int) -> Pixels:
-    """`n` pixels with the mismatch that this seed gives."""
+    """Create `n` pixels with the mismatch of a seed."""
     rng = np.random.default_rng((seed, 106))
     spread = config.threshold_sigma
     on = np.maximum(config.threshold_on + spread * rng.standard_normal(n), LEAST_THRESHOLD)
@@ -111,7 +112,7 @@ def make_pixels(config: PixelConfig, n: int, seed: int) -> Pixels:
 
 
 def settled_state(pixels: Pixels, light: NDArray[np.float32]) -> PixelState:
-    """The pixels after a long past under a first render (N,): each anywhere between its thresholds."""
+    """State of settled pixels for a first render (N,): each level is random between the thresholds."""
     rng = np.random.default_rng((pixels.seed, 107))
     level = light + rng.uniform(-0.999, 0.999, light.size) * np.minimum(pixels.mismatch.on, pixels.mismatch.off)
     never = np.full(light.size, np.iinfo(np.int64).min // 2)
@@ -119,9 +120,9 @@ def settled_state(pixels: Pixels, light: NDArray[np.float32]) -> PixelState:
 
 
 def low_pass(cutoff_hz: float, span_us: float) -> tuple[float, float, float]:
-    """Weights of the last output, the last and the new input in the new output, the input a straight line in between.
+    """Weights of the last output, the last input and the new input in the new output of the low pass.
 
-    That is the exact answer of a first-order low pass to a ramp.
+    They give the exact response of a first-order low pass to an input that changes linearly.
 
     >>> low_pass(0, 100)
     (0.0, 0.0, 1.0)
@@ -146,23 +147,23 @@ def find_crossings(
     stop_us: float,
     found: EventBuffer,
 ) -> tuple[int, int]:  # pragma: no cover (machine code)
-    """Let pixels see a new render, and write down their events until all have seen it or the room is used up.
+    """Apply a new render to pixels and store their events, until all pixels are done or the buffer is full.
 
     Args:
         mismatch: of all pixels.
-        state: of all of them, changed.
-        light: (K,) log intensity now, of the pixels from `first` on.
-        first: the pixel that light[0] belongs to.
-        done: so many of the K have seen it already.
-        weights: of low_pass, over this time.
-        start_us: the last render, from the interval's start [us].
-        stop_us: now.
-        found: where to write them.
+        state: of all pixels; changed in place.
+        light: (K,) new log intensity of the pixels from `first` on.
+        first: index of the pixel of light[0].
+        done: number of the K pixels that are already done.
+        weights: of low_pass, for this time.
+        start_us: time of the last render, from the start of the interval [us].
+        stop_us: time of the new render.
+        found: buffer for the events.
 
     Returns:
-        how many of the K have seen it, and how many events are found.
+        the number of pixels that are done, and the number of events in the buffer.
     """
-    n, room = found.n, found.t.size
+    n, size = found.n, found.t.size
     span = stop_us - start_us
     for k in range(done, light.size):
         i = first + k
@@ -178,7 +179,7 @@ def find_crossings(
             step = -mismatch.off[i]
             events = int(after / step)
         if events:
-            if n + events > room:
+            if n + events > size:
                 return k, n
             for e in range(1, events + 1):
                 part = min(max((e * step - before) / (after - before), 0.0), 1.0)
@@ -201,7 +202,7 @@ def find_crossings_reference(
     start_us: float,
     stop_us: float,
 ) -> tuple[list[tuple[int, int, int]], PixelState]:
-    """What find_crossings computes for all pixels, in plain Python: (t, pixel, p) of each event, and the new state."""
+    """Reference implementation of find_crossings for all pixels: (t, pixel, p) of each event, and the new state."""
     rows, levels, seens = [], [], []
     span = stop_us - start_us
     for i, (was, new) in enumerate(zip(state.light.tolist(), light.tolist(), strict=True)):
@@ -225,7 +226,7 @@ def find_crossings_reference(
 
 
 def add_noise(pixels: Pixels, start_us: int, stop_us: int, found: EventBuffer) -> EventBuffer:
-    """The events, and those that nothing made: shot noise of all pixels, and hot ones'; the same for the same times."""
+    """Add shot noise and the events of hot pixels; the same times and seed give the same noise."""
     config, span = pixels.config, stop_us - start_us
     rng = np.random.default_rng((pixels.seed, 108, start_us & ((1 << 63) - 1)))
     shots = rng.poisson(config.shot_noise_hz * pixels.n * span * 1e-6)
@@ -245,16 +246,16 @@ def add_noise(pixels: Pixels, start_us: int, stop_us: int, found: EventBuffer) -
 def sort_events(
     found: EventBuffer, start_us: int, span_us: int, refractory_us: int, last_us: NDArray[np.int64]
 ) -> EventBuffer:  # pragma: no cover (machine code)
-    """The events by time, without those that come too soon after the last of their pixel.
+    """Sort the events by time, without those within the refractory time of their pixel.
 
-    A lost event has moved its pixel's level all the same, as in ESIM.
+    A lost event has changed the level of its pixel nevertheless, as in ESIM.
 
     Args:
         found: with times from 0 to span_us.
-        start_us: what their times count from, in sensor time.
-        span_us: the interval's length.
-        refractory_us: how long a pixel says nothing.
-        last_us: (N,) sensor time of each pixel's last event, changed.
+        start_us: sensor time of the start of the interval.
+        span_us: duration of the interval.
+        refractory_us: refractory time of a pixel.
+        last_us: (N,) sensor time of the last event of each pixel; changed in place.
     """
     begin = np.zeros(span_us + 2, np.int64)
     for i in range(found.n):
@@ -287,22 +288,22 @@ def events_of(
     stop_us: int,
     sensor: Sensor,
 ) -> tuple[Events, PixelState]:
-    """From one frame to the next: the events of a whole sensor in between.
+    """Make the events of a whole sensor between two frames.
 
     Args:
         pixels: of the sensor, row by row.
         state: after the frame at start_us.
         light: (H, W) log intensity at stop_us, such as log(I + eps).
-        start_us: of the last frame.
-        stop_us: of this one.
+        start_us: time of the last frame.
+        stop_us: time of this frame.
         sensor: the pixel array.
 
     Returns:
-        the events from start_us to stop_us, by time, and the state after this frame.
+        the events from start_us to stop_us, sorted by time, and the state after this frame.
 
     Raises:
-        InvalidField: the frame is of another size, holds what is no number, or is too long after the last.
-        TimeBackwards: it is not later than the last.
+        InvalidField: the frame has another size, contains nan or inf, or comes too late after the last frame.
+        TimeBackwards: the frame is not later than the last one.
     """
     if light.shape != (sensor.height, sensor.width) or pixels.n != light.size:
         raise InvalidField("frame", "shape", light.shape, f"the sensor is {sensor}, rows first")
@@ -330,7 +331,7 @@ def events_of(
 
 
 def with_double_size(found: EventBuffer) -> EventBuffer:
-    """The same events, and room for twice as many."""
+    """The same events in a buffer of twice the size."""
     more = EventBuffer.empty(found.t.size)
     return EventBuffer(
         np.concatenate((found.t, more.t)),

@@ -1,4 +1,4 @@
-"""What render computes, in plain numpy: every ray against every panel, written for reading."""
+"""Reference implementation of `render` in plain numpy: every ray against every panel."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +13,10 @@ Array = NDArray[np.float64]
 
 
 def render_reference(world: World, rays: Rays, position: Array, rotation: Array, eps: float) -> tuple[Array, Array]:
-    """Log intensity (N,) and depth (N,) of each ray; see render.render."""
+    """Compute log intensity (N,) and depth (N,) of each ray; see `render.render`."""
     direction = np.stack([rays.x, rays.y, np.ones_like(rays.x)], 1)
     n, behind = rays.x.size, _sky(world.sky, direction @ rotation.T)
-    depths, shares, values = np.full((2, n), np.inf), np.zeros((2, n)), np.zeros((2, n))  # of the two nearest
+    depths, shares, values = np.full((2, n), np.inf), np.zeros((2, n)), np.zeros((2, n))  # of the two nearest panels
     for i in range(world.panels.n):
         t, cover, value = _panel(world, i, rays, direction, position, rotation)
         far = t**2 * (direction**2).sum(1) / world.sky.far_m**2
@@ -35,14 +35,14 @@ def render_reference(world: World, rays: Rays, position: Array, rotation: Array,
 def _panel(
     world: World, i: int, rays: Rays, direction: Array, position: Array, rotation: Array
 ) -> tuple[Array, Array, Array]:
-    """Depth, share of the pixel covered, and intensity of one panel along all rays (N,)."""
+    """Depth, covered share of the pixel, and intensity of one panel for all rays (N,)."""
     panels: Panels = world.panels
-    u, v = panels.u[i] @ rotation, panels.v[i] @ rotation  # in the camera's frame
+    u, v = panels.u[i] @ rotation, panels.v[i] @ rotation  # in the frame of the camera
     normal, place = np.cross(u, v), (position - panels.centre[i]) @ rotation
-    with np.errstate(all="ignore"):  # a ray along the plane meets it nowhere
+    with np.errstate(all="ignore"):  # a ray parallel to the plane does not meet it
         t = -(normal @ place) / (direction @ normal)
         at = np.stack([t * (direction @ axis) + axis @ place for axis in (u, v)])  # (2, N) on the panel [m]
-        # how far the pixel's sides reach on the panel: (2, N) each, of the step in x and of that in y
+        # sides of the pixel on the panel, (2, N) each: for the step in x and the step in y
         across, down = (
             np.stack([t * step * (axis[k] - (direction @ axis) * normal[k] / (direction @ normal)) for axis in (u, v)])
             for k, step in ((0, rays.step_x), (1, rays.step_y))
@@ -59,7 +59,7 @@ def _panel(
 
 
 def _sample(textures: Textures, name: str, where: Array, side_x: Array, side_y: Array) -> Array:
-    """Intensity (N,) at (2, N) [texels] of a footprint with these sides (2, N)."""
+    """Intensity (N,) at positions (2, N) [texels], for a footprint with these sides (2, N)."""
     size_x, size_y = (side_x**2).sum(0), (side_y**2).sum(0)
     along = np.where(size_x < size_y, side_y, side_x)
     long2, short2 = np.maximum(size_x, size_y), np.minimum(size_x, size_y)
@@ -83,7 +83,7 @@ def _sample(textures: Textures, name: str, where: Array, side_x: Array, side_y: 
 
 
 def _bilinear(image: NDArray[np.float32], at: Array) -> Array:
-    """A periodic image at places (2, N), column and row; the centre of its first texel is at 0.5."""
+    """Interpolate a periodic image at positions (2, N), column and row; the centre of its first texel is at 0.5."""
     side = image.shape[0]
     left, top = np.floor(at - 0.5)
     du, dv = (at - 0.5) - (left, top)
@@ -95,7 +95,7 @@ def _bilinear(image: NDArray[np.float32], at: Array) -> Array:
 
 
 def _sky(sky: Sky, direction: Array) -> Array:
-    """Intensity (N,) of the sky in directions of the world (N, 3)."""
+    """Intensity (N,) of the sky in directions (N, 3) of the world."""
     x, y, z = direction.T
     slope = -y / np.sqrt(x * x + z * z + 1e-12)
     row = np.clip(slope * (SKY_ROWS - 1) / SKY_TOP, 0, SKY_ROWS - 1.001)

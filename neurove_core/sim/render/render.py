@@ -1,4 +1,4 @@
-"""Pictures: linear intensity and depth of each pixel of a camera."""
+"""Render images: log intensity and depth of each pixel of a camera."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ def render_all(
     light: NDArray[np.float32],
     depth: NDArray[np.float32],
 ) -> None:  # pragma: no cover (machine code)
-    """Log intensity (N,) and depth (N,) of all tiles, from one place, whose views (N, VIEW) and rotation are given."""
+    """Render log intensity (N,) and depth (N,) of all tiles from one pose, given by its views and rotation."""
     work = np.empty(ROWS * LANES, np.float32)
     for tile in range(rays.first.size - 1):
         a, b = candidates.first[tile], candidates.first[tile + 1]
@@ -35,17 +35,17 @@ def render_all(
 def render(
     world: World, rays: Rays, position: NDArray[np.float64], rotation: NDArray[np.float64], eps: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """One picture, every ray against every panel.
+    """Render one image, every ray against every panel.
 
     Args:
-        world: what can be seen.
+        world: panels, textures and sky.
         rays: of the camera.
         position: (3,) of the camera in the world [m].
         rotation: (3, 3) camera to world.
         eps: added to the linear intensity before its logarithm.
 
     Returns:
-        log intensity (N,) and depth (N,) [m] of each ray; depth is along z, infinite where no panel is.
+        log intensity (N,) and depth (N,) [m] of each ray; depth is along z, and infinite where there is no panel.
     """
     tiles, panels = rays.first.size - 1, np.arange(world.panels.n)
     light, depth = np.empty(rays.x.size, np.float32), np.empty(rays.x.size, np.float32)

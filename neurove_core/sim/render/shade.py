@@ -1,6 +1,6 @@
-"""What a panel's texture and the sky look like along the rays of a tile.
+"""Shading: sample the texture of a panel and the sky along the rays of a tile.
 
-Texture is read trilinearly with up to TAPS taps along the longer axis of the pixel's footprint.
+Textures are sampled trilinearly, with up to TAPS samples along the longer axis of the footprint of the pixel.
 """
 
 import math
@@ -15,7 +15,7 @@ from neurove_core.sim.world.panels import SKY_COLUMNS, SKY_ROWS, SKY_TOP
 from neurove_core.sim.world.textures import CHAIN, LEVELS, SIZE
 
 TAPS: Final = 3
-"""Most texture reads along the footprint's longer axis."""
+"""Greatest number of samples along the longer axis of the footprint."""
 
 _U: Final = SHADE
 _V: Final = SHADE + 1 * LANES
@@ -31,11 +31,11 @@ _FINE: Final = SHADE + 10 * LANES
 _COARSE: Final = SHADE + 16 * LANES
 
 _ZERO, _HALF, _ONE, _TWO, _THREE = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2), np.float32(3)
-_TWO_FROM, _THREE_FROM = np.float32(1.5**2), np.float32(2.001**2)  # squared ratio of the footprint's sides
+_TWO_FROM, _THREE_FROM = np.float32(1.5**2), np.float32(2.001**2)  # squared ratio of the sides of the footprint
 _MOST_LOD, _LAST = np.float32(LEVELS - 1 - 1e-6), np.float32(LEVELS - 2)
 _EXPONENT, _BIAS = np.float32(0.5 / (1 << 23)), np.float32(63.5)
 _SIZE = np.float32(SIZE)
-_LARGER = np.float32(4 / 3)  # so much larger is a level with all finer ones, but for the finest itself
+_LARGER = np.float32(4 / 3)  # size of a level with all finer levels except the finest, relative to the level
 _SKY_SCALE: Final = (SKY_ROWS - 1) / SKY_TOP
 
 
@@ -48,14 +48,14 @@ def texture_of(
     y0: float,
     work: NDArray[np.float32],
 ) -> None:  # pragma: no cover (machine code)
-    """The rows FRONT and BACK of the pixels that show this panel there.
+    """Fill the rows FRONT and BACK of the pixels that show this panel.
 
     Args:
         texels: see Textures.
         view: (VIEW,) of the panel.
-        panel: its number, as it stands in the rows PANEL and SECOND.
-        x0: of the tile's first ray.
-        y0: likewise.
+        panel: its index, as in the rows PANEL and SECOND.
+        x0: of the first ray of the tile.
+        y0: of the first ray of the tile.
         work: of the tile.
     """
     most = _footprint(view, panel, x0, y0, work)
@@ -73,18 +73,18 @@ def texture_of(
 def _footprint(
     view: NDArray[np.float64], panel: np.float32, x0: float, y0: float, work: NDArray[np.float32]
 ) -> int:  # pragma: no cover (machine code)
-    """Where each pixel lies on the texture [texels], its longer side there, how often to read it, and at which level.
+    """Footprint of each pixel on the texture [texels]: position, longer side, number of samples, and mip level.
 
-    Pixels that do not show the panel get some place on it.
+    Pixels that do not show the panel get an arbitrary position.
 
     Returns:
-        the most reads of any pixel.
+        the greatest number of samples of a pixel.
     """
     f, ku, kv = np.float32, view[14], view[15]
     u1, u2, u0 = f(view[0] * ku), f(view[1] * ku), f((view[0] * x0 + view[1] * y0 + view[2]) * ku)
     v1, v2, v0 = f(view[3] * kv), f(view[4] * kv), f((view[3] * x0 + view[4] * y0 + view[5]) * kv)
     n1, n2, n0 = f(view[6]), f(view[7]), f(view[6] * x0 + view[7] * y0 + view[8])
-    # the texture repeats: so near to its beginning that single precision is enough
+    # the texture repeats; near its origin single precision is enough
     at_u, at_v = f((view[9] * ku + view[16]) % SIZE), f((view[10] * kv + view[17]) % SIZE)
     away = f(view[11])
     ints = work.view(np.int32)
@@ -111,11 +111,11 @@ def _footprint(
         work[_LEVEL + p] = max(max(short2, long2 / (part * part)), _ONE)
         work[_SUM + p] = _ZERO
     for p in range(LANES):
-        # the logarithm as straight lines between powers of two, as the bits of a number have it: continuous, and at
-        # most 0.05 of a level off
+        # the logarithm as straight lines between powers of two, from the bits of the number: continuous, with an error
+        # of at most 0.05 of a level
         lod = min(np.float32(ints[_LEVEL + p]) * _EXPONENT - _BIAS, _MOST_LOD)
         level = np.floor(lod)
-        # near a level that level alone is read, and the passage from one to the next is the steeper for it
+        # near a level only that level is read; the transition between two levels is steeper in return
         work[_BLEND + p] = min(max(_TWO * (lod - level) - _HALF, _ZERO), _ONE)
         exponent = np.int32(min(max(level, _ZERO), _LAST))
         ints[_SCALE + p] = np.int32((127 - exponent) << 23)  # the bits of 1 / 2^level
@@ -129,7 +129,7 @@ def _footprint(
 def _read(
     texels: NDArray[np.float32], base: np.float32, tap: np.float32, work: NDArray[np.float32]
 ) -> None:  # pragma: no cover (machine code)
-    """Add one read of each pixel's texture to its sum: bilinear in two levels, and between them."""
+    """Add one sample of the texture to the sum of each pixel: bilinear in two levels, and linear between them."""
     ints = work.view(np.int32)
     for p in range(LANES):
         share, fine = (tap + _HALF) / work[_TAPS + p] - _HALF, work[_SCALE + p]
@@ -143,7 +143,7 @@ def _read(
         ints[_COARSE + p], ints[_COARSE + LANES + p] = np.int32(upper + left), np.int32(upper + right)
         ints[_COARSE + 2 * LANES + p], ints[_COARSE + 3 * LANES + p] = np.int32(lower + left), np.int32(lower + right)
         work[_COARSE + 4 * LANES + p], work[_COARSE + 5 * LANES + p] = du, dv
-    # alone, for the compiler can not know that what is read here is not what is written
+    # a separate loop, because the compiler cannot know that reads and writes do not overlap
     for p in range(_FINE, _FINE + 4 * LANES):
         work[p] = texels[np.uint32(ints[p])]
     for p in range(_COARSE, _COARSE + 4 * LANES):
@@ -164,7 +164,7 @@ def _read(
 def _around(
     u: np.float32, v: np.float32, start: np.float32, side: np.float32
 ) -> tuple[np.float32, np.float32, np.float32, np.float32, np.float32, np.float32]:  # pragma: no cover (machine code)
-    """The texels around (u, v) of the level that begins at `start`: two rows, two columns, and the way between each."""
+    """The texels around (u, v) of the level at `start`: two rows, two columns, and the fractions between them."""
     u -= _HALF
     v -= _HALF
     left, top = np.floor(u), np.floor(v)
@@ -190,7 +190,7 @@ def _bilinear(
 def sky_of(
     image: NDArray[np.float32], haze: float, rotation: NDArray[np.float64], x: float, y: float
 ) -> float:  # pragma: no cover (machine code)
-    """Intensity of the sky where the ray (x, y, 1) looks."""
+    """Intensity of the sky in the direction of the ray (x, y, 1)."""
     wx = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]
     wy = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2]
     wz = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2]

@@ -1,12 +1,12 @@
-"""Ray casting of one tile of pixels: which panels its rays meet, and the light that comes along them.
+"""Ray casting of one tile of pixels: find the panels that its rays hit, and their light.
 
-A panel is carried into the camera's frame, where a ray is the fixed (x, y, 1) of its pixel: so a hit costs three inner
-products, and its parameter is the depth z itself. Where a pixel lies across a panel's edge, what is behind shows
-through by its share, so that an edge moves smoothly between two renders and not a pixel at a time.
+Panels are transformed into the frame of the camera, where a ray is the fixed (x, y, 1) of its pixel. A hit then costs
+three inner products, and its parameter is the depth z itself. A pixel on the edge of a panel mixes the panel with the
+background by their shares, so that an edge moves smoothly between two renders.
 
-All loops run over the LANES pixels of a tile, in single precision and without branches, so that the compiler does 8 or
-16 pixels at once; what a panel has in common for all of them is computed once, in double precision. Rays are counted
-from the tile's first, which keeps the plane of a panel exact to 1e-7 of its depth where it is seen from its edge.
+All loops run over the LANES pixels of a tile, in single precision and without branches, so that the compiler handles 8
+or 16 pixels at once. Values that are common to all pixels are computed once, in double precision. Rays are relative to
+the first ray of the tile, which keeps the plane of a panel exact to 1e-7 of its depth where it is seen edge-on.
 """
 
 import numpy as np
@@ -51,17 +51,17 @@ def render_tile(
     y0: float,
     work: NDArray[np.float32],
 ) -> None:  # pragma: no cover (machine code)
-    """Log intensity and depth that the rays of a tile find: the rows LIGHT and DEPTH.
+    """Render a tile: fill the rows LIGHT and DEPTH.
 
     Args:
         backdrop: of the world.
-        views: (N, VIEW) of all panels, from here.
+        views: (N, VIEW) of all panels from this pose.
         rotation: (3, 3) camera to world.
-        candidates: the panels that may lie in their way, by the least depth of any of their points.
-        nearest: those depths, or less [m].
-        x0: of the tile's first ray.
-        y0: likewise.
-        work: (ROWS * LANES,) as load_tile left it.
+        candidates: panels that the rays may hit, sorted by their least depth.
+        nearest: lower bounds of those depths [m].
+        x0: of the first ray of the tile.
+        y0: of the first ray of the tile.
+        work: (ROWS * LANES,) filled by load_tile.
     """
     for p in range(LANES):
         work[DEPTH + p] = work[BEHIND + p] = _INF
@@ -83,7 +83,7 @@ def render_tile(
 
 @fast
 def _all_nearer(work: NDArray[np.float32], depth: np.float32) -> bool:  # pragma: no cover (machine code)
-    """Whether nothing from this depth on can be seen in any pixel."""
+    """Whether every pixel hides everything from this depth on."""
     open_ = 0
     for p in range(LANES):
         last = work[DEPTH + p] if work[COVER + p] >= _ONE else work[BEHIND + p]
@@ -95,7 +95,7 @@ def _all_nearer(work: NDArray[np.float32], depth: np.float32) -> bool:  # pragma
 def _meet(
     view: NDArray[np.float64], i: int, x0: float, y0: float, far2: np.float32, work: NDArray[np.float32]
 ) -> None:  # pragma: no cover (machine code)
-    """Where the rays meet a panel, and what share of each pixel it covers; the two nearest are kept."""
+    """Intersect the rays with a panel: depth and covered share of each pixel; the two nearest panels are kept."""
     f = np.float32
     u1, u2, u0 = f(view[0]), f(view[1]), f(view[0] * x0 + view[1] * y0 + view[2])
     v1, v2, v0 = f(view[3]), f(view[4]), f(view[3] * x0 + view[4] * y0 + view[5])
@@ -116,7 +116,7 @@ def _meet(
         share = share_u * share_v
         first, second = work[DEPTH + p], work[BEHIND + p]
         panel1, panel2, cover = work[PANEL + p], work[SECOND + p], work[COVER + p]
-        # of two in one plane always the same is in front, or they would flicker
+        # of two panels in one plane, the same one is always in front; otherwise they would flicker
         before = (t < first) | ((t == first) & (panel < panel1))
         between = (t < second) | ((t == second) & (panel < panel2))
         hit = between & (t > _NEAR) & (t * t * work[SLANT2 + p] < far2) & (share > _ZERO)
@@ -142,7 +142,7 @@ def _seen(work: NDArray[np.float32], panel: np.float32) -> bool:  # pragma: no c
 def _look_behind(
     backdrop: Backdrop, rotation: NDArray[np.float64], x0: float, y0: float, far2: np.float32, work: NDArray[np.float32]
 ) -> None:  # pragma: no cover (machine code)
-    """The row SKY, where it shows: beside the panels, and through those that fade in the distance."""
+    """Fill the row SKY where the sky is visible: next to panels, and through distant panels that fade."""
     for p in range(LANES):
         t1, t2 = work[DEPTH + p], work[BEHIND + p]
         t = t2 if work[COVER + p] < _ONE else t1
@@ -152,7 +152,7 @@ def _look_behind(
 
 @fast
 def _mix(eps: np.float32, far2: np.float32, work: NDArray[np.float32]) -> None:  # pragma: no cover (machine code)
-    """The row LIGHT, of what is in front, behind it, and behind all."""
+    """Fill the row LIGHT: mix the two nearest panels and the sky."""
     ints = work.view(np.int32)
     for p in range(LANES):
         sky, slant2 = work[SKY + p], work[SLANT2 + p] / far2
@@ -181,6 +181,6 @@ _THIRDS, _FIFTHS, _SEVENTHS = np.float32(2 / 3), np.float32(2 / 5), np.float32(2
 
 @fast
 def _clear(far: np.float32) -> np.float32:  # pragma: no cover (machine code)
-    """How much is seen of what is at a squared share `far` of the distance where nothing is."""
+    """Visibility of a point at this squared ratio of its distance to the greatest visible distance."""
     clear = min(max((_ONE - far) * _FADING, _ZERO), _ONE)
     return clear * clear

@@ -1,4 +1,4 @@
-"""The numbers of one tile of pixels, row by row in one array: what its kernels work in."""
+"""Work space of the kernels for one tile of pixels: rows in one array."""
 
 from typing import Final
 
@@ -9,7 +9,7 @@ from neurove_core.sim.render.camera import TILE, Rays
 from neurove_core.sim.render.compile import fast
 
 LANES: Final = TILE * TILE
-"""Pixels of a tile; one that has fewer repeats its last."""
+"""Pixels of a tile; a tile with fewer pixels repeats its last one."""
 
 X: Final = 0 * LANES
 Y: Final = 1 * LANES
@@ -26,18 +26,20 @@ BACK: Final = 11 * LANES
 SKY: Final = 12 * LANES
 LIGHT: Final = 13 * LANES
 SHADE: Final = 14 * LANES
-"""Where each row of a tile's numbers begins in the one array that holds them all: so the compiler sees that they do not
-overlap. X, Y: of the ray, from the tile's first; STEP_X, STEP_Y: see Rays; SLANT2: squared distance over squared depth;
-DEPTH, BEHIND: of the two nearest panels, PANEL, SECOND: which (-1 none), COVER: which share the nearest covers; FRONT,
-BACK, SKY: intensities of those two and of what is behind; LIGHT: log intensity; SHADE: rows that shade.py works in."""
+"""Start of each row in the array. The rows share one array so that the compiler sees that they do not overlap.
+
+X, Y: ray, relative to the first ray of the tile; STEP_X, STEP_Y: see Rays; SLANT2: squared distance over squared depth;
+DEPTH, BEHIND: depths of the two nearest panels; PANEL, SECOND: their indices (-1: none); COVER: share of the pixel that
+the nearest panel covers; FRONT, BACK, SKY: intensities of the two panels and of the sky; LIGHT: log intensity; SHADE:
+work space of shade.py."""
 
 ROWS: Final = 36
-"""Rows in all."""
+"""Number of rows."""
 
 
 @fast
 def load_tile(rays: Rays, tile: int, work: NDArray[np.float32]) -> None:  # pragma: no cover (machine code)
-    """Put the rays of a tile into its rows."""
+    """Load the rays of a tile into its rows."""
     first, stop = rays.first[tile], rays.first[tile + 1]
     for p in range(LANES):
         i = min(first + p, stop - 1)

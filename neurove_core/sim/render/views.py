@@ -1,4 +1,4 @@
-"""A world as a camera sees it from some place: each of its panels in the camera's frame, in one row of numbers."""
+"""Views of a world from a pose: each panel in the frame of the camera, as one row of numbers."""
 
 from typing import Final, NamedTuple
 
@@ -10,15 +10,15 @@ from neurove_core.sim.world.panels import Panels, Sky
 from neurove_core.sim.world.textures import Textures
 
 VIEW: Final = 20
-"""Numbers of a panel in a camera's frame, in one row that a kernel reads: u, v, normal (3 each); the camera's place
-along u, along v, and from it; half of each side; density (2), offset (2), texture, gain."""
+"""Length of the row of a panel: u, v, normal (3 each); position of the camera along u and v, and its distance from the
+panel; half of each side (2); density (2); offset (2); texture; gain."""
 
 NEAR_M: Final = 0.02
-"""What is nearer than this is not seen."""
+"""Least visible depth [m]."""
 
 
 class World(NamedTuple):
-    """What can be seen."""
+    """Everything that can be seen."""
 
     panels: Panels
     textures: Textures
@@ -26,7 +26,7 @@ class World(NamedTuple):
 
 
 class Backdrop(NamedTuple):
-    """What the kernels need of a world beside its panels' views."""
+    """Data of a world that the kernels need in addition to the views of its panels."""
 
     texels: NDArray[np.float32]  # see Textures
     sky: NDArray[np.float32]  # see Sky.image
@@ -36,7 +36,7 @@ class Backdrop(NamedTuple):
 
     @classmethod
     def of(cls, world: World, eps: float) -> "Backdrop":
-        """That of a world."""
+        """Create the backdrop of a world."""
         return cls(world.textures.texels, world.sky.image, world.sky.haze, world.sky.far_m, eps)
 
 
@@ -44,10 +44,10 @@ class Backdrop(NamedTuple):
 def views_of(
     panels: Panels, position: NDArray[np.float64], rotation: NDArray[np.float64]
 ) -> NDArray[np.float64]:  # pragma: no cover (machine code)
-    """The panels as a camera sees them from each of some places.
+    """Compute the views of panels from several poses.
 
     Args:
-        panels: N of them, in the world.
+        panels: N panels in the world.
         position: (G, 3) of the camera.
         rotation: (G, 3, 3) camera to world.
 

@@ -1,1 +1,1 @@
-"""What the simulated camera sees: scenes, panels, textures."""
+"""The simulated world: scenes, panels, textures."""

@@ -1,4 +1,4 @@
-"""What a simulated world is made of: textured rectangles, and a sky with a far horizon."""
+"""The parts of a simulated world: textured rectangles, and a sky."""
 
 from typing import Any, Final, NamedTuple
 
@@ -8,56 +8,56 @@ from numpy.typing import NDArray
 from neurove_core.sim.world.textures import NAMES, SIZE
 
 ENDLESS: Final = 1e5
-"""Half of the side of a panel without end [m]."""
+"""Half of the side of an endless panel [m]."""
 
 SKY_ROWS: Final = 64
 SKY_COLUMNS: Final = 1024
 CLEAR2: Final = 0.25
-"""Up to which squared share of far_m a panel is seen clearly."""
+"""A panel begins to fade at this squared ratio of its distance to far_m."""
 
 SKY_TOP: Final = 0.5
-"""Slope (height over distance) of the sky's last row; what is higher looks like it."""
+"""Slope (height over distance) of the last row of the sky; higher directions look the same."""
 
 
 class Panels(NamedTuple):
-    """Rectangles in the world (x right, y down, z forward), seen from both sides; N of them."""
+    """N rectangles in the world (x right, y down, z forward), visible from both sides."""
 
     centre: NDArray[np.float64]  # (N, 3) [m]
     u: NDArray[np.float64]  # (N, 3) unit vector along one side
-    v: NDArray[np.float64]  # (N, 3) unit vector along the other, square to u
+    v: NDArray[np.float64]  # (N, 3) unit vector along the other side, perpendicular to u
     half: NDArray[np.float64]  # (N, 2) half of each side [m]
     density: NDArray[np.float64]  # (N, 2) of the texture along u and v [texels/m]
     offset: NDArray[np.float64]  # (N, 2) texture coordinates of the centre [texels]
-    texture: NDArray[np.int64]  # (N,) place in textures.NAMES
-    gain: NDArray[np.float64]  # (N,) how bright it is lit, 1 in full light
+    texture: NDArray[np.int64]  # (N,) index into textures.NAMES
+    gain: NDArray[np.float64]  # (N,) brightness of its light, 1 for full light
 
     @property
     def n(self) -> int:
-        """How many there are."""
+        """Number of panels."""
         return int(self.gain.size)
 
     @classmethod
     def join(cls, parts: list["Panels"]) -> "Panels":
-        """All panels of the parts, of which there is at least one."""
+        """Join the panels of at least one part."""
         columns: list[Any] = [np.concatenate(column) for column in zip(*parts, strict=True)]
         return cls(*columns)
 
     def take(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> "Panels":
-        """Some of them."""
+        """Select panels."""
         columns: list[Any] = [column[chosen] for column in self]
         return Panels(*columns)
 
 
 class Sky(NamedTuple):
-    """What lies behind all panels, infinitely far: a skyline by azimuth and slope; and the haze before it.
+    """The infinitely distant background: a skyline by azimuth and slope, and haze below the horizon.
 
-    From CLEAR2 on a panel fades into it with its distance d, as (1 - d^2 / far_m^2)^2, until nothing is left at far_m:
-    so nothing appears or goes suddenly.
+    From CLEAR2 on, a panel fades into the background with its distance d, as (1 - d^2 / far_m^2)^2, and vanishes at
+    far_m. Panels therefore do not appear or disappear suddenly.
     """
 
     image: NDArray[np.float32]  # (SKY_ROWS, SKY_COLUMNS) linear intensity, row 0 at the horizon
-    haze: float  # linear intensity of all below the horizon that no panel covers
-    far_m: float  # where nothing is left of a panel
+    haze: float  # linear intensity below the horizon where there is no panel
+    far_m: float  # distance at which a panel has vanished
 
 
 def panel(
@@ -71,15 +71,15 @@ def panel(
     offset: tuple[float, float] = (0.0, 0.0),
     gain: float = 1.0,
 ) -> Panels:
-    """One rectangle.
+    """Create one rectangle.
 
     Args:
         centre: (3,) in the world [m].
         u: (3,) along its first side, of any length.
-        v: (3,) along the second, square to u.
+        v: (3,) along the second side, perpendicular to u.
         size_m: its sides [m].
         texture: one of textures.NAMES.
-        repeat_m: after which length the texture repeats.
+        repeat_m: length after which the texture repeats.
         offset: of the texture [repeats].
         gain: of its light.
     """
@@ -101,7 +101,10 @@ NOTHING: Final = panel(np.zeros(3), np.eye(3)[0], np.eye(3)[1], (1.0, 1.0), NAME
 
 
 def upright(start: NDArray[np.float64], end: NDArray[np.float64], top_m: float, texture: str, **more: object) -> Panels:
-    """A rectangle on the ground between two points (x, z), so high [m], lit by the way it looks; `more` as of panel."""
+    """Create an upright rectangle between two points (x, z) on the ground; `more` as for `panel`.
+
+    The default light depends on the direction of the rectangle.
+    """
     along = np.array([end[0] - start[0], 0.0, end[1] - start[1]])
     length = float(np.linalg.norm(along))
     centre = np.array([(start[0] + end[0]) / 2, -top_m / 2, (start[1] + end[1]) / 2])
@@ -119,16 +122,16 @@ def box(
     offset: tuple[float, float] = (0.0, 0.0),
     bottom_m: float = 0.0,
 ) -> Panels:
-    """Four sides and the top of a box on the ground, or above it.
+    """Create the four sides and the top of a box on or above the ground.
 
     Args:
-        centre: (x, z) of its middle [m].
+        centre: (x, z) of its centre [m].
         heading: (x, z) unit vector along its length.
         size_m: length, width, height.
         texture: of all its faces.
-        repeat_m: after which length the texture repeats.
+        repeat_m: length after which the texture repeats.
         offset: of the texture [repeats].
-        bottom_m: how high it hangs.
+        bottom_m: height of its bottom above the ground.
     """
     length, width, height = size_m
     along, across = heading * length / 2, np.array([-heading[1], heading[0]]) * width / 2

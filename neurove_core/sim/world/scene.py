@@ -1,4 +1,4 @@
-"""Scenes by name: what a trajectory is filmed in."""
+"""Scenes by name: the surroundings of a trajectory."""
 
 from collections.abc import Callable
 from typing import Final, Protocol
@@ -13,22 +13,22 @@ from neurove_protocol.errors import InvalidField
 
 
 class Scene(Protocol):
-    """What stands around a trajectory."""
+    """The surroundings of a trajectory."""
 
     sky: Sky
 
     def near(self, t_s: float) -> Panels:
-        """All panels that may be seen at this time; asked with times that never run backwards."""
+        """All panels that may be visible at a time; times must not go backwards."""
 
 
 class FixedScene:
-    """A scene that is all there from the beginning."""
+    """A scene that does not change."""
 
     def __init__(self, panels: Panels, sky: Sky) -> None:
         self._panels, self.sky = panels, sky
 
     def near(self, t_s: float) -> Panels:
-        """All of it."""
+        """All panels."""
         return self._panels
 
 
@@ -38,19 +38,19 @@ def street(trajectory: CameraPath, seed: int) -> Scene:
 
 
 def bare_street(trajectory: CameraPath, seed: int) -> Scene:
-    """The same street on a ground of one plain colour, without lines: nothing on it moves."""
+    """The same street on a ground of one colour without lines: the ground makes no events."""
     return Street(trajectory, seed, BARE, _skyline(seed, BARE.far))
 
 
 def corridor(trajectory: CameraPath, seed: int) -> Scene:
-    """Ground, ceiling, walls close by, boxes along them."""
+    """Ground, ceiling, close walls, and boxes along them."""
     return Street(trajectory, seed, CORRIDOR, Sky(_flat(0.1), 0.1, CORRIDOR.far))
 
 
 def room(trajectory: CameraPath, seed: int) -> Scene:
     """A textured room around the whole trajectory, with boards and boxes along its walls.
 
-    Of a trajectory longer than two minutes it is around those.
+    The room is built around the first two minutes of a longer trajectory.
     """
     t_s = np.linspace(0, min(trajectory.duration_s, 120.0), 2400)
     position = trajectory.pose(t_s)[0]
@@ -78,9 +78,9 @@ def room(trajectory: CameraPath, seed: int) -> Scene:
 
 
 def plain_room(trajectory: CameraPath, seed: int) -> Scene:
-    """A room of plain walls around the whole trajectory, with a few flat shapes on them: little to see but edges.
+    """A room of plain walls around the whole trajectory, with a few flat shapes on them: few features except edges.
 
-    Of a trajectory longer than two minutes it is around those.
+    The room is built around the first two minutes of a longer trajectory.
     """
     t_s = np.linspace(0, min(trajectory.duration_s, 120.0), 2400)
     position = trajectory.pose(t_s)[0]
@@ -107,9 +107,9 @@ def _shapes(
     v: NDArray[np.float64],
     sides: tuple[float, float],
 ) -> list[Panels]:
-    """Rectangles, turned at random, on a wall of these sides: one on each square metre or so, at most forty.
+    """Create randomly rotated rectangles on a wall: about one per square metre, at most forty.
 
-    Each lies a little further from the wall than the one before: what overlaps is never in one plane.
+    Each rectangle lies a little further from the wall than the previous one, so that overlapping ones are not coplanar.
     """
     count = min(40, 1 + int(rng.poisson(sides[0] * sides[1] * rng.uniform(0.5, 1.5))))
     parts = []
@@ -127,7 +127,7 @@ def _shapes(
 def _furniture(
     rng: np.random.Generator, start: NDArray[np.float64], end: NDArray[np.float64], height: float
 ) -> list[Panels]:
-    """Boards on a wall and boxes before it."""
+    """Create boards on a wall and boxes in front of it."""
     length = float(np.linalg.norm(end - start))
     along = (end - start) / length
     inward = np.array([-along[1], along[0]])
@@ -151,7 +151,7 @@ def _lowered(panels: Panels, down_m: float) -> Panels:
 
 
 def wall(trajectory: CameraPath, seed: int, distance_m: float = 1.0) -> Scene:
-    """One textured plane without end, square to where the camera looks at first, so far from it [m]."""
+    """One endless textured plane, perpendicular to the first viewing direction, at a distance [m] from the camera."""
     position, rotation = trajectory.pose(np.zeros(1))
     right, down, ahead = rotation[0].T
     size, offset = (2 * ENDLESS, 2 * ENDLESS), tuple(np.random.default_rng((seed, 104)).uniform(size=2))
@@ -167,17 +167,17 @@ SCENES: Final[dict[str, Callable[[CameraPath, int], Scene]]] = {
     "plain-room": plain_room,
     "wall": wall,
 }
-"""Scenes by name: trajectory, as the camera goes, and seed."""
+"""Functions that build each scene from the trajectory of the camera and a seed."""
 
 
 def named_scene(name: str) -> Callable[[CameraPath, int], Scene]:
-    """The scene of this name.
+    """Return the function that builds the scene of this name.
 
     Raises:
-        InvalidField: there is none.
+        InvalidField: the name is unknown.
     """
     if name not in SCENES:
-        raise InvalidField("simulation", "scene", name, f"known are {', '.join(SCENES)}")
+        raise InvalidField("simulation", "scene", name, f"known scenes: {', '.join(SCENES)}")
     return SCENES[name]
 
 
@@ -186,7 +186,7 @@ def _flat(value: float) -> NDArray[np.float32]:
 
 
 def _skyline(seed: int, far_m: float) -> Sky:
-    """A bright sky over hills and far houses, which rise out of the haze."""
+    """Create a bright sky over hills and distant houses in haze."""
     rng = np.random.default_rng((seed, 105))
     haze = rng.uniform(0.45, 0.7)
     image = np.tile(np.linspace(haze, 1.3 * haze, SKY_ROWS)[:, None], (1, SKY_COLUMNS))
@@ -194,7 +194,7 @@ def _skyline(seed: int, far_m: float) -> Sky:
     hills = sum(rng.uniform(1, 3) / k * np.sin(k * angle + rng.uniform(0, 7)) for k in (2, 3, 5, 9))
     top = 5 + np.round(hills)
     left = 0
-    while left < SKY_COLUMNS:  # houses, each as wide and high as it likes
+    while left < SKY_COLUMNS:  # houses of random width and height
         wide = int(rng.integers(6, 40))
         if rng.uniform() < 0.6:
             top[left : left + wide] += rng.uniform(1, 8)

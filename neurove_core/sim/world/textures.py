@@ -1,4 +1,4 @@
-"""Procedural textures: periodic, many octaves, each with a mip chain; their contrast is drawn by seed."""
+"""Procedural textures: periodic, with many octaves and a mip chain each; the seed draws their contrast."""
 
 from typing import Final, NamedTuple
 
@@ -6,20 +6,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 SIZE: Final = 512
-"""Side of a texture [texels]; it repeats beyond."""
+"""Side of a texture [texels]; textures are periodic."""
 
 LEVELS: Final = 8
-"""Mip levels, each half the side of the one before."""
+"""Number of mip levels; each has half the side of the previous one."""
 
 NAMES: Final = ("asphalt", "facade", "brick", "posters", "foliage", "paint", "metal", "plaster")
-"""What there is; a panel names its texture by the place in this list."""
+"""Names of the textures; a panel has the index of its texture."""
 
 _CHAIN = [(SIZE >> level) ** 2 for level in range(LEVELS)]
 LEVEL_START: Final = np.cumsum([0, *_CHAIN[:-1]])
-"""Where each level begins within a texture's chain [texels]."""
+"""Start of each level in the chain of a texture [texels]."""
 
 CHAIN: Final = sum(_CHAIN)
-"""Texels of a texture with all its levels."""
+"""Number of texels of a texture with all levels."""
 
 
 class Textures(NamedTuple):
@@ -28,14 +28,14 @@ class Textures(NamedTuple):
     texels: NDArray[np.float32]  # (len(NAMES) * CHAIN,) texture after texture, level after level, row after row
 
     def level(self, name: str, level: int = 0) -> NDArray[np.float32]:
-        """One level of one texture as an image, a view."""
+        """One level of a texture as an image; a view, not a copy."""
         start = NAMES.index(name) * CHAIN + int(LEVEL_START[level])
         side = SIZE >> level
         return self.texels[start : start + side * side].reshape(side, side)
 
 
 def make_textures(seed: int) -> Textures:
-    """The textures of a seed; another seed has others, of another contrast.
+    """Create the textures of a seed; other seeds give other textures with other contrasts.
 
     >>> make_textures(1).level("brick").shape
     (512, 512)
@@ -70,7 +70,7 @@ def _lognormal(middle: float, log_noise: NDArray[np.float64]) -> NDArray[np.floa
 
 
 def _windows(rng: np.random.Generator, wall: NDArray[np.float64], columns: int, rows: int) -> NDArray[np.float64]:
-    """A wall with a grid of windows, each of its own brightness and with a bright frame."""
+    """Draw a grid of windows on a wall, each with its own brightness and a bright frame."""
     across, down = SIZE // columns, SIZE // rows
     for row in range(rows):
         for column in range(columns):
@@ -85,7 +85,7 @@ def _windows(rng: np.random.Generator, wall: NDArray[np.float64], columns: int, 
 
 
 def _bricks(rng: np.random.Generator, wall: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Courses of bricks, every second one shifted by half, each brick of its own brightness, with pale joints."""
+    """Draw bricks with light joints; every second course is shifted, and each brick has its own brightness."""
     high, wide = 16, 32
     for course in range(SIZE // high):
         tone = np.repeat(rng.uniform(0.6, 1.5, SIZE // wide), wide)
@@ -97,7 +97,7 @@ def _bricks(rng: np.random.Generator, wall: NDArray[np.float64]) -> NDArray[np.f
 
 
 def _rectangles(rng: np.random.Generator, image: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """Rectangles of all sizes over an image, across its borders too, each lighter or darker than what it covers."""
+    """Draw rectangles of all sizes over an image, also across its borders, each lighter or darker than the image."""
     for _ in range(count):
         wide, high = (8 * 16 ** rng.uniform(0, 1, 2)).astype(int)
         rows = (rng.integers(SIZE) + np.arange(high)) % SIZE
@@ -108,7 +108,7 @@ def _rectangles(rng: np.random.Generator, image: NDArray[np.float64], count: int
 
 
 def _contrasted(rng: np.random.Generator, image: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The image with its log contrast stretched by a drawn factor about its mean, within what paint can be."""
+    """Scale the log contrast of an image about its mean by a random factor, within the range of real surfaces."""
     level = np.log(image)
     mean = level.mean()
     stretched: NDArray[np.float64] = np.exp(mean + rng.uniform(0.7, 1.4) * (level - mean))
@@ -116,7 +116,7 @@ def _contrasted(rng: np.random.Generator, image: NDArray[np.float64]) -> NDArray
 
 
 def _chain(image: NDArray[np.float64]) -> NDArray[np.float32]:
-    """The image and its halvings, each texel the mean of four, one after the other."""
+    """The mip chain of an image: each texel is the mean of four of the previous level."""
     levels = []
     for _ in range(LEVELS):
         levels.append(image.astype(np.float32).ravel())

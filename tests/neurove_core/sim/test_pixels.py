@@ -1,4 +1,4 @@
-"""Simulated pixels: what light makes of them, what is noise; the compiled loop does what the plain one says."""
+"""Simulated pixels: their response to light, their noise, and the compiled loop against its reference."""
 
 import numpy as np
 import pytest
@@ -50,7 +50,7 @@ def waves(seed: int, frames: int = 20, contrast: float = 1.0) -> np.ndarray:
 
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("cutoff_hz", [0, 300])
-def test_the_compiled_pixels_do_bit_for_bit_what_the_plain_ones_do(seed, cutoff_hz):
+def test_the_compiled_pixels_equal_the_reference_bit_for_bit(seed, cutoff_hz):
     config = PixelConfig(cutoff_hz=cutoff_hz, leak_hz=5)
     rng = np.random.default_rng(seed)
     pixels = make_pixels(config, N, seed)
@@ -70,7 +70,7 @@ def test_the_compiled_pixels_do_bit_for_bit_what_the_plain_ones_do(seed, cutoff_
         np.testing.assert_array_equal(state.seen, plain.seen)
 
 
-def test_pixels_that_find_no_room_go_on_where_they_stopped():
+def test_pixels_continue_after_a_full_buffer():
     pixels = make_pixels(QUIET, N, 0)
     light = np.zeros(N, np.float32)
     jump = np.linspace(-3, 3, N).astype(np.float32)
@@ -102,7 +102,7 @@ def test_a_ramp_makes_contrast_over_threshold_events_evenly_in_time(contrast):
     frames = np.linspace(0, contrast, 11)[:, None, None] * np.ones((11, SENSOR.height, SENSOR.width))
     _, parts, _, _ = film(quiet(threshold_on=0.1), frames)
     n = sum(events.n for events in parts)
-    assert n == pytest.approx(N * (contrast / 0.1 - 0.5), rel=0.02)  # half an event to come at the end
+    assert n == pytest.approx(N * (contrast / 0.1 - 0.5), rel=0.02)  # half an event is pending at the end on average
     assert all(events.p.all() for events in parts)
     per_frame = [events.n for events in parts]
     assert max(per_frame) - min(per_frame) <= 0.1 * n
@@ -119,12 +119,12 @@ def test_the_number_of_events_scales_as_contrast_over_threshold():
     assert count(1.0, 0.02) == pytest.approx(2 * count(1.0, 0.04), rel=0.2)
 
 
-def test_still_light_makes_only_noise_at_the_configured_rate():
+def test_constant_light_makes_only_noise_at_the_configured_rate():
     seconds, config = 4.0, PixelConfig(leak_hz=0, shot_noise_hz=2.0, hot_fraction=0)
     frames = np.zeros((int(seconds * 1e6 / 50_000) + 1, SENSOR.height, SENSOR.width))
     n = sum(events.n for events in film(config, frames, period_us=50_000)[1])
     expected = 2.0 * N * seconds
-    assert abs(n - expected) < 5 * np.sqrt(expected) + 0.002 * expected  # 5 sigma, and what the refractory time takes
+    assert abs(n - expected) < 5 * np.sqrt(expected) + 0.002 * expected  # 5 sigma, and the loss in the refractory time
     assert not sum(events.n for events in film(quiet(), frames, period_us=50_000)[1])
 
 
@@ -135,7 +135,7 @@ def test_a_leak_makes_on_events_at_its_rate():
     assert all(events.p.all() for events in parts)
 
 
-def test_hot_pixels_fire_at_their_rate_and_no_others_do():
+def test_only_hot_pixels_fire_and_at_their_rate():
     frames = np.zeros((41, SENSOR.height, SENSOR.width))
     pixels, parts, _, _ = film(quiet(hot_fraction=0.05, hot_hz=80), frames, period_us=50_000)
     where = np.concatenate([events.y.astype(int) * SENSOR.width + events.x for events in parts])
@@ -144,7 +144,7 @@ def test_hot_pixels_fire_at_their_rate_and_no_others_do():
     assert abs(where.size - expected) < 5 * np.sqrt(expected)
 
 
-def test_no_pixel_speaks_again_within_its_refractory_time():
+def test_no_pixel_makes_an_event_within_its_refractory_time():
     _, parts, _, _ = film(PixelConfig(refractory_us=1500, shot_noise_hz=100), waves(1, contrast=5))
     t = np.concatenate([events.t for events in parts])
     where = np.concatenate([events.y.astype(int) * SENSOR.width + events.x for events in parts])
@@ -154,7 +154,7 @@ def test_no_pixel_speaks_again_within_its_refractory_time():
 
 
 @pytest.mark.parametrize("span_us", [10.0, 500.0, 20_000.0])
-def test_the_low_pass_answers_a_ramp_exactly(span_us):
+def test_the_response_of_the_low_pass_to_a_ramp_is_exact(span_us):
     kept, old, new = low_pass(300.0, span_us)
     tau = 1e6 / (2 * np.pi * 300)
     seen, light, slope = 0.3, 1.0, 2e-4
@@ -171,7 +171,7 @@ def test_a_cutoff_delays_events_and_loses_none():
     assert np.mean(np.concatenate([e.t for e in slow])) > np.mean(np.concatenate([e.t for e in fast])) + 500
 
 
-def test_the_same_seed_gives_the_same_events_and_another_others():
+def test_a_seed_determines_the_events():
     frames = waves(3)
     first, again, other = (film(PixelConfig(), frames, seed)[1] for seed in (1, 1, 2))
     for a, b in zip(first, again, strict=True):
@@ -180,7 +180,7 @@ def test_the_same_seed_gives_the_same_events_and_another_others():
     assert any(a.n != b.n or (a.t != b.t).any() for a, b in zip(first, other, strict=True))
 
 
-def test_one_step_leaves_the_state_it_was_given_as_it_was():
+def test_a_step_does_not_change_the_state_that_it_gets():
     pixels = make_pixels(QUIET, N, 0)
     state = settled_state(pixels, np.zeros(N, np.float32))
     kept = [column.copy() for column in state]
@@ -191,7 +191,7 @@ def test_one_step_leaves_the_state_it_was_given_as_it_was():
 
 @pytest.mark.parametrize("field", ["threshold_on", "threshold_off"])
 @pytest.mark.parametrize("value", [0, -0.2, float("nan")])
-def test_a_threshold_not_above_zero_is_refused_by_name_value_and_bound(field, value):
+def test_a_threshold_not_above_zero_is_refused_with_its_name_value_and_bound(field, value):
     with pytest.raises(ValidationError) as caught:
         PixelConfig(**{field: value})
     (error,) = caught.value.errors()

@@ -1,4 +1,4 @@
-"""The simulator: geometry, truth, pictures and the events of a whole film."""
+"""The simulator: geometry, truth, images and the events of a simulation."""
 
 import itertools
 
@@ -67,18 +67,18 @@ def world_at(scene: str, t_s: float, seed: int = 3) -> tuple[World, np.ndarray, 
 
 
 @pytest.mark.parametrize("scene", SCENES)
-def test_every_scene_is_filmed_by_its_name_alone(scene):
+def test_every_scene_can_be_simulated_by_its_name(scene):
     events = Events.join(list(simulation_of(f"sim://{scene}?camera=pinhole:24x18:75&seconds=0.5").chunks()))
     assert events.n > 100
 
 
 @pytest.mark.parametrize("scene", SCENES)
-def test_the_compiled_renderer_draws_what_the_plain_one_does(scene):
+def test_the_compiled_renderer_agrees_with_the_reference(scene):
     world, position, turned = world_at(scene, 1.7)
     rays = rays_of(named_camera("pinhole:28x21:80").info)
     light, depth = render(world, rays, position, turned, 1e-3)
     plain, plain_depth = render_reference(world, rays, position, turned, 1e-3)
-    # rounding may turn a pixel on an edge from one panel to the other, and no more than that
+    # rounding may assign a pixel on an edge to another panel, but change nothing else
     same = np.isclose(depth, plain_depth, rtol=1e-5)
     assert same.mean() > 0.995
     assert (np.abs(light - plain)[same] < 2e-3).mean() > 0.998
@@ -86,21 +86,21 @@ def test_the_compiled_renderer_draws_what_the_plain_one_does(scene):
 
 
 @pytest.mark.parametrize("scene", SCENES)
-def test_a_tile_that_asks_only_its_candidates_sees_what_all_panels_show(scene):
-    mounted = named_camera("davis346-half")  # a lens that distorts, and tiles cut off by the sensor's border
+def test_a_tile_with_only_its_candidates_shows_the_same_as_with_all_panels(scene):
+    mounted = named_camera("davis346-half")  # a lens with distortion, and tiles truncated by the border of the sensor
     simulation = simulate(scene, TRAJECTORIES[scene], mounted, QUIET, seed=3)
     view = simulation.view(1.7)
     built = named_scene(scene)(simulation.trajectory, 3)
     position, turned = simulation.trajectory.pose(np.array([1.7]))
     world = World(built.near(1.7), make_textures(3), built.sky)
     light, depth = render(world, rays_of(mounted.info), position[0], turned[0], QUIET.eps)
-    same = view.depth == depth  # but for a pixel here and there at the edge of a panel seen from its side
+    same = view.depth == depth  # except single pixels at the edge of a panel that is seen edge-on
     assert same.mean() > 0.998
     assert (np.abs(view.light - light)[same] < 1e-6).mean() > 0.998
 
 
 @pytest.mark.parametrize("name", CAMERAS)
-def test_every_ray_comes_back_to_its_pixel(name):
+def test_every_ray_projects_to_its_pixel(name):
     info = named_camera(name).info
     rays = rays_of(info)
     x, y = distort(rays.x, rays.y, info)
@@ -121,7 +121,7 @@ def test_a_scene_has_texture_and_depth(scene, seed):
     assert np.percentile(near, 90) > 1.2 * np.percentile(near, 10)
 
 
-def test_the_ground_is_as_far_below_as_the_camera_is_high():
+def test_the_depth_of_the_ground_matches_the_height_of_the_camera():
     camera = named_camera("pinhole:86x65:75", height_m=2.0, pitch_deg=10.0)
     simulation = simulate("street", slider(0, 0, 5, 9), camera, QUIET, seed=1)
     rays, view = rays_of(camera.info), simulation.view(0.5)
@@ -137,7 +137,7 @@ def test_the_ground_is_as_far_below_as_the_camera_is_high():
 
 
 def flow_px_s(rays, depth, twist, info):
-    """Motion of each pixel as the truth has it, by the textbook's equation."""
+    """Motion of each pixel from the true twist, by the standard motion-field equation."""
     x, y, near = rays.x, rays.y, 1 / depth
     vx, vy, vz, wx, wy, wz = twist
     dx = (x * vz - vx) * near + x * y * wx - (1 + x * x) * wy + y * wz
@@ -146,7 +146,7 @@ def flow_px_s(rays, depth, twist, info):
 
 
 @pytest.mark.parametrize("scene", ["street", "corridor", "room"])
-def test_flow_from_truth_and_depth_is_where_the_points_go(scene):
+def test_flow_from_truth_and_depth_matches_the_motion_of_the_points(scene):
     simulation = film(scene, TRAJECTORIES[scene], 5)
     rays, info, dt = rays_of(SMALL.info), SMALL.info, 2e-3
     depth = simulation.view(3.0).depth.astype(np.float64)
@@ -163,7 +163,7 @@ def test_flow_from_truth_and_depth_is_where_the_points_go(scene):
 
 
 @pytest.mark.parametrize("scene", ["street", "corridor", "room", "plain-room", "wall"])
-def test_the_picture_moves_by_the_flow_of_the_truth(scene):
+def test_the_image_moves_with_the_flow_of_the_truth(scene):
     simulation, info, rays = film(scene, TRAJECTORIES[scene], 5), SMALL.info, rays_of(SMALL.info)
     at, dt = 3.0, 4e-3
     views = [simulation.view(t) for t in (at, at + dt)]
@@ -171,13 +171,13 @@ def test_the_picture_moves_by_the_flow_of_the_truth(scene):
     flow = flow_px_s(rays, views[0].depth, simulation.trajectory.twist(np.array([at + dt / 2]))[0], info) * dt
     u, v = (as_image(rays, info.sensor, part) for part in flow)
     gy, gx = np.gradient((first + second) / 2)
-    change, told = second - first, -(gx * u + gy * v)
+    change, expected = second - first, -(gx * u + gy * v)
     inner = np.s_[6:-6, 6:-6]
-    assert np.median(np.abs(change - told)[inner]) < 0.5 * np.median(np.abs(change)[inner])
+    assert np.median(np.abs(change - expected)[inner]) < 0.5 * np.median(np.abs(change)[inner])
 
 
 def blurred(image):
-    """Without the finest detail, of which the difference of neighbours is no gradient."""
+    """Remove the finest detail, for which the difference of neighbours is not a gradient."""
     for axis in (0, 1):
         for _ in range(2):
             image = sum(
@@ -187,13 +187,15 @@ def blurred(image):
     return image
 
 
-def test_a_pure_rotation_is_the_homography_of_the_picture():
+def test_a_pure_rotation_warps_the_image_by_a_homography():
     rate = (0.3, -0.5, 0.4)
     simulation, info, rays = film("room", rotation(*rate, 5), 5), SMALL.info, rays_of(SMALL.info)
     dt = 0.1
     first, second = (as_image(rays, info.sensor, simulation.view(t).light) for t in (1.0, 1.0 + dt))
     turned = Mounted(rotation(*rate, 5), 1.5, 5.0).twist(1.0)[3:] * dt
-    ray = np.stack([rays.x, rays.y, np.ones_like(rays.x)], 1) @ matrix_of(exp(turned)).T  # second's rays in the first
+    ray = (
+        np.stack([rays.x, rays.y, np.ones_like(rays.x)], 1) @ matrix_of(exp(turned)).T
+    )  # rays of the second image in the first
     column, row = ray[:, 0] / ray[:, 2] * info.fx + info.cx, ray[:, 1] / ray[:, 2] * info.fy + info.cy
     inside = (column > 1) & (column < info.width - 2) & (row > 1) & (row < info.height - 2)
     left, top = np.floor(column[inside]).astype(int), np.floor(row[inside]).astype(int)
@@ -216,21 +218,21 @@ def test_the_truth_is_the_trajectory_in_the_optical_frame():
         np.testing.assert_allclose(step.twists.twist[-1], simulation.trajectory.twist(step.stop_us / 1e6), atol=1e-9)
 
 
-def test_no_pixel_moves_further_than_the_bound_between_two_renders():
+def test_no_pixel_moves_more_than_the_bound_between_two_renders():
     simulation, rays = film("street", slider(0, 0, 8, 5), 1.0), rays_of(SMALL.info)
     twist = simulation.trajectory.twist(0.5)
     fastest = np.hypot(*flow_px_s(rays, simulation.view(0.5).depth, twist, SMALL.info)).max()
     step = next(step for step in simulation.steps() if step.start_us == 500_000)
     longest_us = np.diff(np.append(step.start_us, step.twists.t)).max()
     assert fastest * longest_us * 1e-6 <= 1.02 * MOTION_PX
-    assert step.renders < 0.6 * step.twists.t.size  # for most of the picture moves less
+    assert step.renders < 0.6 * step.twists.t.size  # because most of the image moves less
 
 
 # --- events ---------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("scene", SCENES)
-def test_a_film_is_a_recording_like_any_other(scene):
+def test_a_simulation_is_a_recording_like_any_other(scene):
     simulation = film(scene, TRAJECTORIES[scene], 0.3, PixelConfig())
     last, n = 0, 0
     for chunk in simulation.chunks():
@@ -244,21 +246,21 @@ def test_a_film_is_a_recording_like_any_other(scene):
     assert not simulation.endless
 
 
-def test_the_same_seed_films_the_same_and_another_something_else():
+def test_a_seed_determines_the_simulation():
     first, again, other = (everything(film("street", driving(3, 30), 0.3, PixelConfig(), seed)) for seed in (1, 1, 2))
     for a, b in zip(first, again, strict=True):
         np.testing.assert_array_equal(a, b)
     assert first.n != other.n or (first.t != other.t).any()
 
 
-def test_a_still_camera_sees_only_noise_at_the_configured_rate():
+def test_a_stationary_camera_sees_only_noise_at_the_configured_rate():
     config, seconds = PixelConfig(leak_hz=0, shot_noise_hz=3.0, hot_fraction=0), 1.0
     n, expected = everything(film("street", still(9), seconds, config)).n, 3.0 * 86 * 65 * seconds
     assert abs(n - expected) < 5 * np.sqrt(expected) + 0.002 * expected
     assert everything(film("street", still(9), 0.2)).n == 0
 
 
-def test_events_add_up_to_the_change_of_the_picture():
+def test_events_add_up_to_the_change_of_the_image():
     simulation, rays = film("room", hand_held(1, 10), 0.4), rays_of(SMALL.info)
     events = everything(simulation)
     total = np.zeros((65, 86))
@@ -268,7 +270,7 @@ def test_events_add_up_to_the_change_of_the_picture():
     assert np.abs(total - (after - before)).max() <= 0.4 + 1e-4
 
 
-def test_how_intervals_are_cut_changes_only_how_finely_time_is_sampled(monkeypatch):
+def test_the_render_step_changes_only_the_resolution_in_time(monkeypatch):
     events = [everything(film("street", slider(0, 0, 6, 5), 0.4))]
     monkeypatch.setattr("neurove_core.sim.simulate.MOTION_PX", MOTION_PX / 4)
     events.append(everything(film("street", slider(0, 0, 6, 5), 0.4)))
@@ -278,7 +280,7 @@ def test_how_intervals_are_cut_changes_only_how_finely_time_is_sampled(monkeypat
 # --- worlds ---------------------------------------------------------------------------------------------------------
 
 
-def test_nothing_stands_in_the_way_of_a_drive():
+def test_no_object_stands_on_the_path_of_a_drive():
     for seed in range(3):
         mounted = Mounted(driving(seed, 60), 1.5, 5)
         street = named_scene("street")(mounted, seed)
@@ -312,7 +314,7 @@ def test_a_url_names_a_simulation():
     np.testing.assert_allclose(np.linalg.norm(simulation.twists().twist[:, 3:], axis=1), 0.5)
 
 
-def test_without_seconds_it_never_ends():
+def test_a_simulation_without_seconds_never_ends():
     simulation = open_source("sim://?seed=3&camera=pinhole:86x65:75")
     assert simulation.endless
     assert simulation.sensor == Sensor(86, 65)
@@ -321,7 +323,7 @@ def test_without_seconds_it_never_ends():
     assert next(simulation.chunks()).n > 0
 
 
-def test_a_film_goes_on_along_the_next_trajectory_where_one_ends():
+def test_a_simulation_continues_along_the_next_trajectory():
     mounted = [Mounted(slider(0, 0, speed, 0.1), 1.5, 5) for speed in (4.0, 6.0, 8.0)]
     simulation = Simulation(
         "street", named_scene("street"), mounted[0], SMALL, QUIET, 3, float("inf"), lambda number: mounted[number % 3]
@@ -350,7 +352,7 @@ def test_a_film_goes_on_along_the_next_trajectory_where_one_ends():
         ("sim://street?seconds=soon", "seconds"),
     ],
 )
-def test_what_does_not_exist_is_refused_by_field_value_and_bound(url, field):
+def test_an_unknown_name_or_value_is_refused_with_its_field_and_bound(url, field):
     with pytest.raises(InvalidField) as caught:
         simulation_of(url)
     assert caught.value.details["field"] == field
@@ -358,25 +360,25 @@ def test_what_does_not_exist_is_refused_by_field_value_and_bound(url, field):
 
 
 @pytest.mark.parametrize("url", ["sim://street?colour=red", "sim://street/left"])
-def test_a_url_that_is_none_of_a_simulation_is_refused(url):
+def test_a_url_that_is_not_a_simulation_is_refused(url):
     with pytest.raises(UnknownSource):
         simulation_of(url)
 
 
-def test_a_sensor_that_is_not_the_cameras_is_refused():
+def test_a_sensor_other_than_that_of_the_camera_is_refused():
     with pytest.raises(InvalidField):
         simulation_of("sim://street", Sensor(640, 480))
     assert simulation_of("sim://street?camera=prophesee", Sensor(640, 480)).sensor == Sensor(640, 480)
 
 
 @pytest.mark.parametrize(("seed", "seconds", "field"), [(-1, 1.0, "seed"), (0, 0.0, "seconds"), (0, 99.0, "seconds")])
-def test_a_simulation_without_sense_is_refused(seed, seconds, field):
+def test_invalid_seeds_and_durations_are_refused(seed, seconds, field):
     with pytest.raises(InvalidField) as caught:
         simulate("street", parse_trajectory("driving", 10), SMALL, seed=seed, seconds=seconds)
     assert caught.value.details["field"] == field
 
 
-def test_a_picture_of_a_film_appears_whole_or_not_at_all(tmp_path):
+def test_a_picture_of_a_simulation_is_written_atomically(tmp_path):
     pytest.importorskip("matplotlib")
     simulation = film("street", driving(3, 30), 5, PixelConfig())
     draw(simulation, tmp_path / "street.png", 1.0)
@@ -399,7 +401,7 @@ def test_a_simulated_slider_has_the_statistics_of_the_real_one():
         assert 0.5 < statistics(simulated)[name] / value < 2, name
 
 
-def test_mvsecs_real_drive_goes_down_a_simulated_street():
+def test_a_real_drive_of_mvsec_runs_through_a_simulated_street():
     pytest.importorskip("h5py", reason="h5py is not installed: pip install 'neurove[recordings]'")
     drive = parse_trajectory(f"{shared('mvsec/outdoor_day1_odom.h5')}?start=20", 3.0)
     simulation = simulate("street", drive, SMALL, seed=3, seconds=1.0)

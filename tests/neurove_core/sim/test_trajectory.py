@@ -1,4 +1,4 @@
-"""Trajectories: the twist is exactly the derivative of the pose, and paths are what their names promise."""
+"""Trajectories: the twist is exactly the derivative of the pose, and each trajectory moves as its name says."""
 
 import math
 from pathlib import Path
@@ -24,7 +24,7 @@ DT_S = 1e-5
 
 
 def waving(seconds: float, step_us: int = 5_000) -> Poses:
-    """A smooth path with every axis in it, as a motion-capture system would record it, in a world of its own."""
+    """A smooth path with motion in every axis, as a motion-capture system records it, in an arbitrary world."""
     t_us = np.arange(0, round(seconds * 1e6), step_us) + 1_500_000_000_000_000
     t = (t_us - t_us[0])[:, None] / 1e6
     world = rotations.exp(np.array([1.4, -0.3, 0.2]))
@@ -73,7 +73,7 @@ def test_the_twist_is_the_derivative_of_the_pose_to_a_millionth(trajectory):
 
 
 @each
-def test_pose_and_twist_are_smooth_no_jump_anywhere_and_no_kink_in_the_pose(trajectory):
+def test_pose_and_twist_are_continuous(trajectory):
     t = np.arange(0, min(trajectory.duration_s, 10.0), 1e-3)
     position, rotation = trajectory.pose(t)
     twist = trajectory.twist(t)
@@ -82,11 +82,11 @@ def test_pose_and_twist_are_smooth_no_jump_anywhere_and_no_kink_in_the_pose(traj
     )
     np.testing.assert_allclose(np.linalg.det(rotation), 1)
     assert np.abs(np.diff(position, axis=0)).max() < 0.02
-    assert np.abs(np.diff(twist, axis=0)).max() < 0.5  # of a thousandth of a second
+    assert np.abs(np.diff(twist, axis=0)).max() < 0.5  # within a millisecond
 
 
 @each
-def test_one_time_or_many_of_any_shape_the_answer_is_the_same(trajectory):
+def test_the_shape_of_the_times_does_not_change_the_result(trajectory):
     t = times(trajectory, 6)
     position, rotation = trajectory.pose(t)
     twist = trajectory.twist(t)
@@ -113,7 +113,7 @@ def test_the_start_and_the_end_are_part_of_the_path(trajectory):
         assert np.isfinite(trajectory.twist(t_s)).all()
 
 
-def test_our_filter_finds_the_exact_twist_back_in_the_sampled_poses():
+def test_the_filter_recovers_the_exact_twist_from_sampled_poses():
     t_us = np.arange(0, 20_000_000, 2_000)
     got = twists(EACH["driving"].poses(t_us), filter_s=0.04)
     np.testing.assert_allclose(got.twist, EACH["driving"].twist(t_us / 1e6), atol=5e-3)
@@ -123,7 +123,7 @@ def test_our_filter_finds_the_exact_twist_back_in_the_sampled_poses():
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_drive_is_one_of_a_car(seed):
+def test_a_drive_moves_like_a_car(seed):
     trajectory = driving(seed, 300)
     t = np.arange(0, 300, 0.02)
     twist = trajectory.twist(t)
@@ -136,14 +136,14 @@ def test_a_drive_is_one_of_a_car(seed):
     assert max(wx.std(), wz.std()) < 0.03
     assert np.abs(vz * wy).max() < 3  # sideways [m/s2]
     assert np.abs(position[:, 1]).max() < 0.1  # about its nominal height
-    assert (rotation[:, 1, 1] > math.cos(math.radians(4))).all()  # level but for its springs
+    assert (rotation[:, 1, 1] > math.cos(math.radians(4))).all()  # level except for the suspension
     standing = np.abs(twist).max(axis=1) < 1e-9
     assert 0.01 < standing.mean() < 0.3
     heading = np.arctan2(rotation[:, 0, 2], rotation[:, 2, 2])
-    assert 0.5 < np.abs(heading).max() < 1.61  # round corners, but on and on along z
+    assert 0.5 < np.abs(heading).max() < 1.61  # it turns corners but always advances along z
 
 
-def test_a_car_dives_when_it_brakes_and_leans_to_the_outside_of_a_bend():
+def test_a_car_pitches_when_it_brakes_and_rolls_to_the_outside_of_a_bend():
     trajectory, t = driving(1, 300), np.arange(0, 300, 0.02)
     _, rotation = trajectory.pose(t)
     _, _, vz, _, wy, _ = trajectory.twist(t).T
@@ -154,14 +154,14 @@ def test_a_car_dives_when_it_brakes_and_leans_to_the_outside_of_a_bend():
     assert right_down[wy * vz < -1.5].mean() > 0.005
 
 
-def test_a_drive_of_an_hour_still_gets_on_along_its_first_direction():
+def test_a_drive_of_an_hour_still_advances_along_its_first_direction():
     position, rotation = driving(0, 3600).pose(np.arange(0, 3600, 0.5))
     assert np.abs(np.arctan2(rotation[:, 0, 2], rotation[:, 2, 2])).max() < 1.61
     assert position[-1, 2] > 8_000
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_hand_held_camera_moves_as_the_one_of_poster_6dof_does(seed):
+def test_a_hand_held_camera_moves_like_that_of_poster_6dof(seed):
     trajectory = hand_held(seed, 60)
     t = np.arange(0, 60, 0.005)
     speed, turning = (np.linalg.norm(part, axis=1) for part in np.split(trajectory.twist(t), 2, axis=1))
@@ -173,7 +173,7 @@ def test_a_hand_held_camera_moves_as_the_one_of_poster_6dof_does(seed):
 
 
 @pytest.mark.parametrize("make", [driving, hand_held])
-def test_a_seed_is_one_path_and_a_longer_one_begins_as_the_shorter_does(make):
+def test_a_seed_determines_the_path_and_a_longer_path_begins_like_the_shorter(make):
     t = np.arange(0, 9, 0.1)
     short, long, other = make(5, 10), make(5, 30), make(6, 10)
     np.testing.assert_allclose(short.twist(t), long.twist(t), atol=1e-9)
@@ -181,7 +181,7 @@ def test_a_seed_is_one_path_and_a_longer_one_begins_as_the_shorter_does(make):
     assert np.abs(short.twist(t) - other.twist(t)).max() > 0.1
 
 
-def test_at_rest_nothing_moves_and_a_slider_only_slides():
+def test_a_stationary_camera_does_not_move_and_a_slider_only_translates():
     t = np.array([0.0, 5.0, 1e6])
     assert not still().twist(t).any()
     position, rotation = parse_trajectory("slider?vx=0.3").pose(t)
@@ -216,7 +216,7 @@ def test_an_impossible_mount_is_refused(field, height_m, pitch_deg):
 # --- recorded -------------------------------------------------------------------------------------------------------
 
 
-def test_a_recorded_path_is_kept_as_seen_from_the_camera_whatever_world_it_was_told_in():
+def test_the_twist_of_a_recorded_path_does_not_depend_on_its_world():
     poses = waving(10)
     trajectory = from_poses(poses)
     poses = Poses(*(column[:1990] for column in poses))
@@ -231,7 +231,7 @@ def test_a_recorded_path_is_kept_as_seen_from_the_camera_whatever_world_it_was_t
     )
 
 
-def test_a_hand_held_recording_is_level_and_looks_ahead_on_average_about_the_middle_of_the_room():
+def test_a_hand_held_recording_is_level_centred_and_looks_ahead_on_average():
     t = np.arange(0, 19, 0.01)
     position, rotation = EACH["recorded"].pose(t)
     np.testing.assert_allclose(position.mean(axis=0), 0, atol=0.2)
@@ -251,7 +251,7 @@ def hilly(n: int = 2000) -> Poses:
     return Poses(t_us, position, rotations.exp(np.stack([pitch, 0 * t, 0 * t], axis=1)))
 
 
-def test_hills_are_taken_off_a_drive_so_that_level_ground_stays_beneath_it():
+def test_hills_are_removed_from_a_drive_so_that_level_ground_stays_below_it():
     trajectory = from_poses(hilly())
     t = np.arange(0, trajectory.duration_s, 0.1)
     position, rotation = trajectory.pose(t)
@@ -282,7 +282,7 @@ def test_mvsecs_drives_become_paths_over_level_ground_with_their_speed_and_turns
     )
 
 
-def test_a_real_hand_held_path_drives_a_camera_as_fast_as_it_was():
+def test_a_real_hand_held_path_keeps_its_speed():
     trajectory = parse_trajectory(str(shared("trajectories/poster_6dof.csv")) + "?smooth=0.05")
     twist = trajectory.twist(np.arange(0, trajectory.duration_s, 0.005))
     speed, turning = (np.linalg.norm(part, axis=1) for part in np.split(twist, 2, axis=1))
@@ -310,13 +310,13 @@ def test_start_skips_and_seconds_ends_a_recorded_path(tmp_path: Path):
         ("poses", lambda p: Poses(*(column[:0] for column in p))),
     ],
 )
-def test_poses_that_are_no_path_are_refused(field, change):
+def test_invalid_poses_are_refused(field, change):
     with pytest.raises(InvalidField) as refused:
         from_poses(change(waving(3)))
     assert refused.value.details["field"] == field
 
 
-def test_a_camera_that_looks_everywhere_still_has_a_path_in_the_world_of_its_first_view():
+def test_a_camera_that_looks_in_all_directions_uses_the_axes_of_its_first_pose():
     t_us = np.arange(0, 10_000_000, 10_000)
     spin = rotations.exp(np.stack([t_us / 1e6 * 2 * np.pi / 5, 0 * t_us, 0 * t_us], axis=1))
     trajectory = from_poses(Poses(t_us, np.zeros((t_us.size, 3)), spin))
@@ -327,7 +327,7 @@ def test_a_camera_that_looks_everywhere_still_has_a_path_in_the_world_of_its_fir
 # --- names ----------------------------------------------------------------------------------------------------------
 
 
-def test_every_generated_kind_goes_by_its_name():
+def test_every_generated_trajectory_has_a_name():
     for text, name, seconds in (
         ("driving", "driving 0", 600),
         ("driving?seed=3&seconds=20", "driving 3", 20),
@@ -358,7 +358,7 @@ def test_every_generated_kind_goes_by_its_name():
         ("slider?vx=", "vx"),
     ],
 )
-def test_what_is_no_trajectory_is_refused_and_its_field_named(text, field):
+def test_an_invalid_trajectory_is_refused_and_the_error_names_the_field(text, field):
     with pytest.raises(InvalidField) as refused:
         parse_trajectory(text)
     assert refused.value.details["field"] == field
