@@ -195,17 +195,10 @@ def test_a_bundle_with_another_camera_or_unit_is_not_calibrated(made, tmp_path):
         calibration.calibration_sets(TrainingConfig(), 15)
 
 
-<<<<<<< HEAD
 def test_a_sequence_is_used_unchanged_with_gaps_with_few_and_with_many_events():
     rng = np.random.default_rng(3)
     counts = rng.integers(0, 4, (60, 4, 5, 6)).astype(np.uint8)
     plain, gaps, few, many = (variant for variant, _ in variants_of(rng, counts, np.ones((60, 2, 6), np.float32)))
-=======
-def test_the_variants_of_a_sequence_are_unchanged_with_gaps_with_few_events_and_with_many():
-    rng = np.random.default_rng(3)
-    counts = rng.integers(0, 4, (60, 4, 5, 6)).astype(np.uint8)
-    plain, gaps, few, many = (way for way, _ in variants_of(rng, counts, np.ones((60, 2, 6), np.float32)))
->>>>>>> simtrain
     assert (plain == counts).all()
     empty = (gaps == 0).all(axis=(1, 2, 3))
     assert 0 < empty.sum() < 60
