@@ -160,7 +160,7 @@ def own_file(folder: Path) -> str:
     return str(folder / "own.h5")
 
 
-def spoil(path: Path, data: h5py.Dataset, number: int) -> None:
+def corrupt_chunk(path: Path, data: h5py.Dataset, number: int) -> None:
     """Overwrite a stored chunk with invalid bytes."""
     chunk = data.id.get_chunk_info(number)
     with path.open("r+b") as file:

@@ -182,7 +182,7 @@ def _member(path: Path, name: str) -> Iterator[tuple[IO[bytes], tuple[int, ...],
     """An array in a .npz for reading in parts: its open file after the header, its shape and its type.
 
     Raises:
-        BrokenRecording: the header, or during reading the compressed data, is truncated or corrupt.
+        BrokenRecording: the header or, during reading, the compressed data is truncated or corrupt.
     """
     try:
         with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as file:

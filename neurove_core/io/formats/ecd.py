@@ -1,4 +1,4 @@
-"""Event Camera Dataset (Mueggler 2017): events as text lines `t[s] x y p`, and the lens as nine numbers.
+"""Reader of the Event Camera Dataset (Mueggler 2017): events as text lines `t[s] x y p`, and the lens as nine numbers.
 
 The same folder, or the .zip in which the data set is distributed, may also hold groundtruth.txt, imu.txt, and
 images.txt with images.
@@ -63,7 +63,7 @@ class EcdRecording(EventsOnly):
             OSError: the file cannot be opened. InvalidField: the calib.txt of the folder is invalid.
             UnknownSource: the .zip is not a zip file, or has no events.txt.
         """
-        path.open("rb").close()  # report a file that cannot be opened now
+        path.open("rb").close()  # fail now if the file cannot be opened
         place, events_file = Place(path.parent), path.name
         if path.suffix.lower() == ".zip":
             place, events_file = Place(path, folder_in_zip(path, "events.txt")), "events.txt"

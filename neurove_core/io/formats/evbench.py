@@ -1,4 +1,4 @@
-"""Recordings of eventVision-evbench (Barranco 2016): .mat files of four columns, with ground truth in a text file."""
+"""Reader of eventVision-evbench (Barranco 2016): .mat files of four columns, with ground truth in a text file."""
 
 import re
 from collections.abc import Iterator
@@ -33,8 +33,8 @@ FRAME_S: Final = 0.05
 class EvbenchRecording(EventsOnly):
     """A .mat file of the columns ts [us], x, y, pol; see `Recording`.
 
-    In the file y counts upwards, as in jAER; the reader flips it to the image's y. The events confirm this: after the
-    flip, their vertical flow has the sign of the ground truth's rotation about x.
+    In the file y counts upwards, as in jAER and against the axes of the ground truth. The reader flips it to the
+    image's y. The events confirm this: after the flip, their vertical flow has the sign of the true rotation about x.
     """
 
     path: Path

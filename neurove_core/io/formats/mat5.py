@@ -1,4 +1,4 @@
-"""Reader of number columns in MATLAB 5 files. It replaces scipy's: some corrupt files end the whole process in that."""
+"""Reader of number columns in MATLAB 5 files; in scipy's reader some corrupt files end the whole process."""
 
 import zlib
 from collections.abc import Collection, Iterator

@@ -23,12 +23,12 @@ from tests.datasets import (
     DAY_US,
     EVENTS,
     LATE,
+    corrupt_chunk,
     dsec_file,
     m3ed_file,
     make_poses,
     mvsec_file,
     own_file,
-    spoil,
     write_m3ed,
     write_mvsec,
 )
@@ -66,7 +66,7 @@ def test_since_does_not_read_earlier_events(written, name, tmp_path):
     """The earlier events are unreadable."""
     path = Path(written(tmp_path))
     with h5py.File(path) as file:
-        spoil(path, file[name], 0)
+        corrupt_chunk(path, file[name], 0)
     recording = open_source(str(path), SENSOR)
     events = EVENTS if written is m3ed_file else LATE
     assert read_broken(recording)[0].n == 0
@@ -158,7 +158,7 @@ def test_an_invalid_event_ends_the_recording_at_its_row(written, column, value, 
 def test_an_unreadable_chunk_ends_the_recording_at_its_first_row(written, name, tmp_path):
     path = Path(written(tmp_path))
     with h5py.File(path) as file:
-        spoil(path, file[name], 4)
+        corrupt_chunk(path, file[name], 4)
     events, error = read_broken(open_source(str(path), SENSOR))
     assert_same(events, (EVENTS if written is m3ed_file else LATE).span(0, 4 * CHUNK))
     assert error is not None

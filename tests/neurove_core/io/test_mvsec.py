@@ -16,7 +16,7 @@ from neurove_core.sources import open_source
 from neurove_protocol import Sensor
 from neurove_protocol.errors import InvalidField
 from tests.builders import SENSOR
-from tests.datasets import CHUNK, DAY_US, LATE, make_imu, make_poses, matrices, own_file, spoil, write_mvsec
+from tests.datasets import CHUNK, DAY_US, LATE, corrupt_chunk, make_imu, make_poses, matrices, own_file, write_mvsec
 from tests.recordings import all_samples, shared
 
 
@@ -120,7 +120,7 @@ def test_an_unreadable_imu_chunk_ends_the_stream_at_its_first_row(tmp_path):
             chunks = (CHUNK, *rows.shape[1:])
             file.create_dataset(f"imu/{name}", data=rows, chunks=chunks, compression=hdf5plugin.Zstd())
     with h5py.File(path) as file:
-        spoil(path, file["imu/gyro"], 1)
+        corrupt_chunk(path, file["imu/gyro"], 1)
     blocks = open_source(str(path)).imu()
     assert next(blocks).t.tolist() == imu.t[:CHUNK].tolist()
     with pytest.raises(BrokenRecording, match=f"row {CHUNK} of imu"):

@@ -29,7 +29,7 @@ class EventTable(NamedTuple):
 
     @property
     def n(self) -> int:
-        """How many rows all columns have."""
+        """Number of rows that every column has."""
         return min(int(column.shape[0]) for column in self.columns)
 
     def times(self, first: int, stop: int) -> Column:
