@@ -1,4 +1,4 @@
-"""Small HDF5 files in the layouts of MVSEC, DSEC and M3ED, as the tests of their readers need them."""
+"""Small HDF5 files in the layouts of MVSEC, DSEC and M3ED, for the tests of their readers."""
 
 from pathlib import Path
 from typing import Any
@@ -19,13 +19,13 @@ from tests.builders import SENSOR, make_events
 DAY_US = 1_506_117_902_000_000
 EVENTS = make_events(1000, seed=1, start_us=500_000, duration_us=1_000_000)
 LATE = EVENTS._replace(t=EVENTS.t + DAY_US)
-"""The same on a clock that shows the date, as MVSEC's and DSEC's do."""
+"""The same events in unix time, as in MVSEC and DSEC."""
 
-CHUNK = 100  # rows per stored chunk: small, so that a garbled byte costs little
+CHUNK = 100  # rows per stored chunk: small, so that a corrupt byte destroys few
 
 
 def make_poses(n: int = 30, *, seed: int = 0, start_us: int = 0, step_us: int = 50_000) -> Poses:
-    """A path that turns and moves smoothly, from a seed."""
+    """A smooth random trajectory from a seed."""
     rng = np.random.default_rng(seed)
     s = np.arange(n)[:, None] * step_us / 1e6
     size, rate, phase = rng.uniform(0.2, 1.0, 6), rng.uniform(0.5, 2.0, 6), rng.uniform(0, 6, 6)
@@ -63,7 +63,7 @@ def write_mvsec(
     name: str = "indoor_flying1",
     **storage: Any,
 ) -> str:
-    """FILE_data.hdf5 and, with poses, FILE_gt.hdf5; times of events as they are, in float seconds."""
+    """FILE_data.hdf5 and, with poses, FILE_gt.hdf5; event times are float seconds."""
     path = folder / f"{name}_data.hdf5"
     with h5py.File(path, "w") as file:
         for side, stream in (("left", events), ("right", right)):
@@ -80,12 +80,12 @@ def write_mvsec(
         with h5py.File(folder / f"{name}_gt.hdf5", "w") as file:
             file["davis/left/odometry"] = matrices(poses)
             file["davis/left/odometry_ts"] = poses.t / 1e6
-            file["davis/left/pose"] = np.tile(np.eye(4), (poses.t.size, 1, 1))  # not to be read
+            file["davis/left/pose"] = np.tile(np.eye(4), (poses.t.size, 1, 1))  # must not be read
     return str(path)
 
 
 def write_dsec_file(path: Path, events: Events, *, offset_us: int | None = None, index: bool = True) -> str:
-    """An events.h5 as DSEC's own: u4 times from 0 on, Blosc; offset_us None leaves t_offset out."""
+    """An events.h5 as in DSEC: u4 times from 0 on, Blosc; offset_us None omits t_offset."""
     t = events.t - (offset_us or 0)
     with h5py.File(path, "w") as file:
         for name, column, dtype in (
@@ -114,7 +114,7 @@ def write_m3ed(
     resolution: tuple[int, int] = (64, 48),
     name: str = "car_urban_day_horse",
 ) -> str:
-    """FILE_data.h5 and, with poses, FILE_pose_gt.h5; `mounts` are T_to_prophesee_left of `right` and `imu`."""
+    """FILE_data.h5 and, with poses, FILE_pose_gt.h5; `mounts` gives T_to_prophesee_left of `right` and `imu`."""
     mounts = mounts or {}
     path = folder / f"{name}_data.h5"
     with h5py.File(path, "w") as file:
@@ -160,8 +160,8 @@ def own_file(folder: Path) -> str:
     return str(folder / "own.h5")
 
 
-def spoil(path: Path, data: h5py.Dataset, number: int) -> None:
-    """Overwrite a stored chunk."""
+def corrupt_chunk(path: Path, data: h5py.Dataset, number: int) -> None:
+    """Overwrite a stored chunk with invalid bytes."""
     chunk = data.id.get_chunk_info(number)
     with path.open("r+b") as file:
         file.seek(chunk.byte_offset)

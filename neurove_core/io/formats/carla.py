@@ -1,7 +1,8 @@
-"""CARLA's sensor.camera.dvs: our container for what it gives, read and written (carla_server.py fills one).
+"""Reader and writer of recordings of CARLA's sensor.camera.dvs, in a container of this project.
 
-A .npz of `events` (N,) of RECORD, `width`, `height`, `fov_deg`, and where poses were recorded `pose_t_ns` (M,),
-`location` (M, 3) [m] and `rotation_deg` (M, 3) roll, pitch, yaw of the camera, all as CARLA gives them.
+The container is a .npz of `events` (N,) of RECORD, `width`, `height` and `fov_deg`. If poses were recorded, it also has
+`pose_t_ns` (M,), `location` (M, 3) [m] and `rotation_deg` (M, 3) roll, pitch, yaw of the camera. All values are in
+CARLA's convention. `carla_server.py` records one from a running server.
 """
 
 import math
@@ -29,11 +30,11 @@ RECORD: Final = np.dtype([("x", "<u2"), ("y", "<u2"), ("t", "<i8"), ("pol", "u1"
 """One event as CARLA packs it, 13 bytes: x and y [px], t simulated time [ns], pol 1 or 0."""
 
 _TO_OPTICAL = np.array([[0, 0, 1], [1, 0, 0], [0, -1, 0]])  # columns: right, down, forward in CARLA's x y z
-_MIRROR = np.diag([1.0, -1.0, 1.0])  # CARLA's world is left-handed; ours has y to the left instead
+_MIRROR = np.diag([1.0, -1.0, 1.0])  # CARLA's world is left-handed; here y points left instead
 
 
 class CarlaPoses(NamedTuple):
-    """Where a CARLA camera was, in its left-handed world: x forward, y right, z up."""
+    """Poses of a CARLA camera in its left-handed world: x forward, y right, z up."""
 
     t_ns: NDArray[np.int64]  # (N,) simulated time
     location: NDArray[np.float64]  # (N, 3) [m]
@@ -41,9 +42,9 @@ class CarlaPoses(NamedTuple):
 
 
 def to_optical(poses: CarlaPoses) -> Poses:
-    """The same poses of the camera's optical frame in a right-handed world (x forward, y left, z up).
+    """Convert to poses of the camera's optical frame in a right-handed world (x forward, y left, z up).
 
-    Turning right (yaw), up (pitch) and clockwise (roll) are positive in CARLA, and become positive rates about the
+    Turns right (yaw), up (pitch) and clockwise (roll) are positive in CARLA. They become positive rates about the
     optical y, x and z: the mirror of the world and that of the axes cancel.
     """
     rotation = _MIRROR @ _matrices(poses.rotation_deg) @ _TO_OPTICAL
@@ -91,14 +92,14 @@ class CarlaRecording(EventsOnly):
 
     @classmethod
     def open(cls, path: Path, sensor: Sensor | None = None) -> Self:
-        """The recording in this file.
+        """Open the recording in this file.
 
         Args:
-            path: the .npz file; nothing in it is unpickled.
-            sensor: its pixel array; overrides the file's.
+            path: the .npz file; objects in it are never unpickled.
+            sensor: its pixel array; overrides that of the file.
 
         Raises:
-            UnknownSource: it is no .npz, or not of such a recording.
+            UnknownSource: it is not a .npz file, or not one of this container.
         """
         try:
             with zipfile.ZipFile(path) as archive:
@@ -109,7 +110,7 @@ class CarlaRecording(EventsOnly):
             width, height, fov_deg = (_array(path, name, ()).item() for name in ("width", "height", "fov_deg"))
             own = Sensor(int(width), int(height))
         except (*BROKEN_ZIP, BrokenRecording, InvalidField) as error:
-            raise UnknownSource(path, f"it is no recording of CARLA: {error}") from None
+            raise UnknownSource(path, f"it is not a recording of CARLA: {error}") from None
         if not 0 < fov_deg < 180:
             raise UnknownSource(path, f"fov_deg={fov_deg} must lie between 0 and 180")
         posed = {"pose_t_ns", "location", "rotation_deg"} <= names
@@ -121,22 +122,22 @@ class CarlaRecording(EventsOnly):
         return self.path.name
 
     def camera(self, stream: str) -> CameraInfo | None:
-        """A perfect pinhole of the recorded horizontal field of view."""
+        """An ideal pinhole with the recorded horizontal field of view."""
         width, height = self.sensor.width, self.sensor.height
         f = width / 2 / math.tan(math.radians(self.fov_deg) / 2)
         cx, cy = (width - 1) / 2, (height - 1) / 2
         return CameraInfo(stream=stream, width=width, height=height, lens="pinhole", fx=f, fy=f, cx=cx, cy=cy)
 
     def chunks(self) -> Iterator[Events]:
-        """All events from the beginning; see `Recording`. Simulated time, cut to whole us.
+        """All events from the beginning; see `Recording`. Simulated time, rounded down to whole us.
 
         Raises:
-            BrokenRecording: an event is cut, outside the sensor, or earlier than the one before; it names the event.
+            BrokenRecording: an event is truncated, outside the sensor, or before the previous one; the error names it.
         """
         n, not_before_us = 0, None
         with _member(self.path, "events") as (file, shape, dtype):
             if len(shape) != 1 or dtype.itemsize != RECORD.itemsize:
-                raise BrokenRecording(self.path, "events", f"{dtype} {shape} are no events of {RECORD.itemsize} bytes")
+                raise BrokenRecording(self.path, "events", f"{dtype} {shape} are not events of {RECORD.itemsize} bytes")
             while n < shape[0]:
                 block = file.read(min(BLOCK_BYTES // RECORD.itemsize, shape[0] - n) * RECORD.itemsize)
                 records = np.frombuffer(block, RECORD, len(block) // RECORD.itemsize)
@@ -150,14 +151,16 @@ class CarlaRecording(EventsOnly):
                 yield from in_chunks(events)
                 n += events.n
                 if not events.n or len(block) % RECORD.itemsize:
-                    raise BrokenRecording(self.path, f"event {n}", f"there are fewer than the {shape[0]} announced")
+                    raise BrokenRecording(
+                        self.path, f"event {n}", f"there are fewer events than the {shape[0]} in the header"
+                    )
                 not_before_us = int(events.t[-1])
 
     def poses(self) -> Poses | None:
-        """Where the camera was, as `to_optical` has it, or None where that was not recorded.
+        """Poses of the optical frame, see `to_optical`; None if they were not recorded.
 
         Raises:
-            BrokenRecording: the poses are not of one length, not finite, or their time runs backwards.
+            BrokenRecording: the arrays of the poses differ in length or are not finite, or time runs backwards.
         """
         if "poses" not in self.streams:
             return None
@@ -169,17 +172,17 @@ class CarlaRecording(EventsOnly):
         return to_optical(CarlaPoses(t_ns, location, rotation))
 
     def twists(self) -> Twists | None:
-        """How the camera moved, from its poses by `geometry.twists`; None without them."""
+        """Twists of the camera from its poses, by `geometry.twists`; None without poses."""
         poses = self.poses()
         return twists(poses) if poses is not None and poses.t.size > 1 else None
 
 
 @contextmanager
 def _member(path: Path, name: str) -> Iterator[tuple[IO[bytes], tuple[int, ...], np.dtype[Any]]]:
-    """An array in a .npz, to be read in parts: its file after the header, its shape and its type.
+    """An array in a .npz for reading in parts: its open file after the header, its shape and its type.
 
     Raises:
-        BrokenRecording: its header, or while one reads, what is packed is not whole.
+        BrokenRecording: the header or, during reading, the compressed data is truncated or corrupt.
     """
     try:
         with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as file:
@@ -190,16 +193,16 @@ def _member(path: Path, name: str) -> Iterator[tuple[IO[bytes], tuple[int, ...],
                 raise ValueError("objects are not read")
             yield file, shape, dtype
     except (*BROKEN_ZIP, KeyError, SyntaxError) as error:
-        raise BrokenRecording(path, name, f"it can not be read: {error}") from None
+        raise BrokenRecording(path, name, f"it cannot be read: {error}") from None
 
 
 def _array(path: Path, name: str, want: tuple[int | None, ...]) -> NDArray[Any]:
-    """A small array of numbers from a .npz, of this shape; None is any length."""
+    """A small array of numbers from a .npz, of this shape; None matches any length."""
     with _member(path, name) as (file, shape, dtype):
         fits = len(shape) == len(want) and all(b is None or a == b for a, b in zip(shape, want, strict=True))
         size = math.prod(shape) * dtype.itemsize
         if not fits or dtype.kind not in "iuf" or size > 1 << 30:
-            raise BrokenRecording(path, name, f"{dtype} {shape} is not what is expected, numbers {want}")
+            raise BrokenRecording(path, name, f"expected numbers {want}, not {dtype} {shape}")
         return np.frombuffer(file.read(size), dtype).reshape(shape)
 
 
@@ -210,17 +213,17 @@ def write(
     fov_deg: float,
     poses: Callable[[], CarlaPoses] | None = None,
 ) -> int:
-    """Write a recording; it gets its name when it is whole.
+    """Write a recording atomically.
 
     Args:
         path: the .npz to write.
         events: arrays of RECORD, ordered by time.
         sensor: the camera's pixel array.
         fov_deg: its horizontal field of view.
-        poses: where it was, if known; asked for when the events have ended.
+        poses: gives the poses of the camera, if known; called after the last event.
 
     Returns:
-        How many events were written.
+        The number of events written.
     """
     raw = path.with_name(path.name + ".events")
     try:
@@ -239,8 +242,8 @@ def write(
                 with archive.open(f"{name}.npy", "w") as member:
                     np.lib.format.write_array(member, np.asanyarray(value), allow_pickle=False)
             with archive.open("events.npy", "w", force_zip64=True) as member, raw.open("rb") as file:
-                described = {"descr": RECORD.descr, "fortran_order": False, "shape": (n,)}
-                np.lib.format.write_array_header_1_0(member, described)
+                header = {"descr": RECORD.descr, "fortran_order": False, "shape": (n,)}
+                np.lib.format.write_array_header_1_0(member, header)
                 while block := file.read(BLOCK_BYTES):
                     member.write(block)
     finally:

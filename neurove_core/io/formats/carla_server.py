@@ -1,4 +1,4 @@
-"""A recording from a running CARLA server: a car that drives itself, and an event camera on it."""
+"""Recorder for a running CARLA server: an event camera on a car with autopilot."""
 
 import contextlib
 import queue
@@ -16,7 +16,7 @@ from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Sensor
 
 STEP_S = 0.01
-"""Simulated time of one step; CARLA makes events between the images of two steps."""
+"""Simulated time of one step [s]. CARLA computes events between the images of two steps."""
 
 
 def record(
@@ -26,33 +26,33 @@ def record(
     host: str = "127.0.0.1",
     port: int = 2000,
     timeout_s: float = 10.0,
-    sensor: Sensor = Sensor(640, 480),  # noqa: B008 a value, and frozen
+    sensor: Sensor = Sensor(640, 480),  # noqa: B008 an immutable value
     fov_deg: float = 90.0,
     mount_m: tuple[float, float, float] = (1.5, 0.0, 1.6),
     seed: int = 0,
 ) -> int:
-    """Drive a car on autopilot through the loaded town and write what its event camera sees, with the camera's poses.
+    """Drive a car on autopilot through the loaded town and write the events and poses of its camera.
 
-    The world is stepped by us while this runs, and gets its own settings back.
+    During the recording this client steps the world. Afterwards it restores the settings of the world.
 
     Args:
-        out: the .npz to write; it gets its name when it is whole.
-        seconds: how long, in simulated time [s].
-        host: of the server.
-        port: of the server.
-        timeout_s: how long to wait for its answers [s].
+        out: the .npz to write; it is written atomically.
+        seconds: length of the recording in simulated time [s].
+        host: host of the server.
+        port: port of the server.
+        timeout_s: limit for each answer of the server [s].
         sensor: the camera's pixel array.
-        fov_deg: its horizontal field of view.
-        mount_m: where it sits on the car: forward, right, up [m].
-        seed: which car, and where it starts.
+        fov_deg: the camera's horizontal field of view [deg].
+        mount_m: position of the camera on the car: forward, right, up [m].
+        seed: selects the car, its start position and the traffic.
 
     Returns:
-        How many events were written.
+        The number of events written.
 
     Raises:
         MissingExtra: CARLA's client package is not installed.
         NoCarlaServer: no server answers, or it stops answering.
-        InvalidField: `seconds` or `fov_deg` is not what it must be.
+        InvalidField: `seconds` or `fov_deg` is out of its range.
     """
     if not seconds > 0:
         raise InvalidField("carla recording", "seconds", seconds, "must be above 0")
@@ -69,13 +69,13 @@ def record(
         with _stepped(carla, client, world, seed), _camera(carla, world, sensor, fov_deg, mount_m, seed) as camera:
             poses: list[tuple[int, list[float], list[float]]] = []
             return write(out, _drive(world, camera, seconds, poses), sensor, fov_deg, lambda: _columns(poses))
-    except RuntimeError as error:  # what the client throws for whatever goes wrong with its server
+    except RuntimeError as error:  # the client raises it for every failure of its server
         raise NoCarlaServer(host, port, timeout_s, str(error)) from None
 
 
 @contextlib.contextmanager
 def _stepped(carla: Any, client: Any, world: Any, seed: int) -> Iterator[None]:
-    """The world as it moves only when we step it, and its traffic the same for the same seed."""
+    """Make the world move only when this client steps it, with traffic that repeats for the same seed."""
     before, settings = world.get_settings(), world.get_settings()
     settings.synchronous_mode, settings.fixed_delta_seconds = True, STEP_S
     traffic = client.get_trafficmanager()
@@ -85,7 +85,7 @@ def _stepped(carla: Any, client: Any, world: Any, seed: int) -> Iterator[None]:
         traffic.set_random_device_seed(seed)
         yield
     finally:
-        with contextlib.suppress(RuntimeError):  # a server that is gone needs nothing back, and its error counts more
+        with contextlib.suppress(RuntimeError):  # do not hide the error of a server that is gone
             traffic.set_synchronous_mode(False)
             world.apply_settings(before)
 
@@ -94,7 +94,7 @@ def _stepped(carla: Any, client: Any, world: Any, seed: int) -> Iterator[None]:
 def _camera(
     carla: Any, world: Any, sensor: Sensor, fov_deg: float, mount_m: tuple[float, float, float], seed: int
 ) -> Iterator[Any]:
-    """An event camera on a car that drives itself; both are gone afterwards."""
+    """An event camera on a car with autopilot; both are destroyed afterwards."""
     rng = np.random.default_rng(seed)
     cars, places = world.get_blueprint_library().filter("vehicle.*"), world.get_map().get_spawn_points()
     actors: list[Any] = []
@@ -118,28 +118,28 @@ def _camera(
 def _drive(
     world: Any, camera: Any, seconds: float, poses: list[tuple[int, list[float], list[float]]]
 ) -> Iterator[NDArray[np.void]]:
-    """Step the world and give the events of each step, as RECORD; the camera's pose at each is added to `poses`."""
-    seen: queue.SimpleQueue[NDArray[np.void]] = queue.SimpleQueue()
-    camera.listen(lambda data: seen.put(np.frombuffer(bytes(data.raw_data), RECORD)))
+    """Step the world and yield the events of each step as RECORD. Append the camera's pose of each step to `poses`."""
+    received: queue.SimpleQueue[NDArray[np.void]] = queue.SimpleQueue()
+    camera.listen(lambda data: received.put(np.frombuffer(bytes(data.raw_data), RECORD)))
     try:
         for _ in range(round(seconds / STEP_S)):
             world.tick()
             snapshot = world.get_snapshot()
             at = snapshot.find(camera.id).get_transform()
-            where, turned = at.location, at.rotation
+            location, rotation = at.location, at.rotation
             poses.append(
                 (
                     round(snapshot.timestamp.elapsed_seconds * 1e9),
-                    [where.x, where.y, where.z],
-                    [turned.roll, turned.pitch, turned.yaw],
+                    [location.x, location.y, location.z],
+                    [rotation.roll, rotation.pitch, rotation.yaw],
                 )
             )
-            while not seen.empty():  # a step without events calls nobody, so there is no waiting for one
-                yield seen.get()
+            while not received.empty():  # never wait: a step without events does not call the listener
+                yield received.get()
     finally:
         camera.stop()
-    while not seen.empty():
-        yield seen.get()
+    while not received.empty():
+        yield received.get()
 
 
 def _columns(poses: list[tuple[int, list[float], list[float]]]) -> CarlaPoses:

@@ -1,6 +1,7 @@
-"""Event Camera Dataset (Mueggler 2017): events as text lines `t[s] x y p`, and the lens as nine numbers.
+"""Reader of the Event Camera Dataset (Mueggler 2017): events as text lines `t[s] x y p`, and the lens as nine numbers.
 
-Beside them, or with them in the .zip that the data set comes as: groundtruth.txt, imu.txt, and images.txt with images.
+The same folder, or the .zip in which the data set is distributed, may also hold groundtruth.txt, imu.txt, and
+images.txt with images.
 """
 
 from bisect import bisect_left
@@ -22,22 +23,22 @@ from neurove_protocol.errors import EventOutsideSensor, InvalidField, TimeBackwa
 from neurove_protocol.events import Events, Sensor, check_events
 
 DAVIS240C = Sensor(240, 180)
-"""What the data set was recorded with."""
+"""The sensor that recorded the data set."""
 
-MAX_T_S = 1e12  # [s]; beyond it a time is no time
-UNIT_WITHIN = 1e-2  # how far from 1 the length of a quaternion may be that was written with few digits
+MAX_T_S = 1e12  # [s]; a larger time is invalid
+UNIT_WITHIN = 1e-2  # accepted distance from 1 of a quaternion's length, for files with few digits
 _NO_T, _NO_POSES = np.empty(0, np.int64), np.empty((0, 7))
 _FILES = {"imu": "imu.txt", "frames": "images.txt", "poses": "groundtruth.txt"}
 _BAD = (ValueError, EventOutsideSensor, TimeBackwards)
 _LINE = np.dtype([("t", "f8"), ("x", "u2"), ("y", "u2"), ("p", "u1")])
-_CALIB = "nine numbers are expected: fx fy cx cy k1 k2 p1 p2 k3, focal lengths above 0"
+_CALIB = "expected nine numbers: fx fy cx cy k1 k2 p1 p2 k3, focal lengths above 0"
 
 
 @dataclass(frozen=True, slots=True)
 class EcdRecording(EventsOnly):
-    """A text file of events with what lies beside it, or the same in a .zip; see `Recording`.
+    """A text file of events with the other files of its folder, or the same in a .zip; see `Recording`.
 
-    Images, the inertial unit and the poses are those of the same folder, where there are such.
+    Images, IMU samples and poses come from the same folder, where it has them.
     """
 
     path: Path
@@ -51,18 +52,18 @@ class EcdRecording(EventsOnly):
 
     @classmethod
     def open(cls, path: Path, name: str, sensor: Sensor | None = None) -> Self:
-        """The recording in this file.
+        """Open the recording in this file.
 
         Args:
             path: the file of events, or a .zip with an events.txt in it.
-            name: what to call it.
-            sensor: the pixel array; by default a DAVIS240C's.
+            name: the name of the recording.
+            sensor: the pixel array; by default that of a DAVIS240C.
 
         Raises:
-            OSError: the file can not be opened. InvalidField: the calib.txt beside it does not hold what it must.
-            UnknownSource: the .zip is none, or has no events.txt.
+            OSError: the file cannot be opened. InvalidField: the calib.txt of the folder is invalid.
+            UnknownSource: the .zip is not a zip file, or has no events.txt.
         """
-        path.open("rb").close()  # what can not be opened is told now
+        path.open("rb").close()  # fail now if the file cannot be opened
         place, events_file = Place(path.parent), path.name
         if path.suffix.lower() == ".zip":
             place, events_file = Place(path, folder_in_zip(path, "events.txt")), "events.txt"
@@ -72,10 +73,10 @@ class EcdRecording(EventsOnly):
             with place.open("calib.txt") as file:
                 where = place.path / "calib.txt" if place.inside is None else path
                 lens = parse_calib(where, file.read(1024), sensor)
-        beside = [stream for stream, file in _FILES.items() if place.has(file)]
-        if "frames" in beside and not _has_images(place):  # a list whose images were left out
-            beside.remove("frames")
-        streams = ("events", *beside)
+        others = [stream for stream, file in _FILES.items() if place.has(file)]
+        if "frames" in others and not _has_images(place):  # images.txt without its images
+            others.remove("frames")
+        streams = ("events", *others)
         return cls(path, name, sensor, lens, place, events_file, streams)
 
     def camera(self, stream: str) -> CameraInfo | None:
@@ -83,34 +84,34 @@ class EcdRecording(EventsOnly):
         return self.lens and CameraInfo(**(self.lens.model_dump() | {"stream": stream}))
 
     def chunks(self) -> Iterator[Events]:
-        """All events from the beginning; see `Recording`. Times are those of the file, to the nearest us.
+        """All events from the beginning; see `Recording`. Times are rounded to the nearest us.
 
         Raises:
-            BrokenRecording: a line is no event, or one outside the sensor or earlier than the one before; it names the
-                line.
+            BrokenRecording: a line is not an event, or its event is outside the sensor or before the previous one; the
+                error names the line.
         """
         first, not_before_us = 1, None
         for lines in self._blocks(self.events_file):
-            whole, why = len(lines), ""
+            n, why = len(lines), ""
             try:
                 events = _parse(lines, self.sensor, not_before_us)
             except _BAD:
-                whole, why = _first_bad(lines, self.sensor, not_before_us)
-                events = _parse(lines[:whole], self.sensor, not_before_us)
+                n, why = _first_bad(lines, self.sensor, not_before_us)
+                events = _parse(lines[:n], self.sensor, not_before_us)
             yield from in_chunks(events)
             if why:
-                text = lines[whole][:60].decode("ascii", "backslashreplace")
-                raise BrokenRecording(self.path, f"line {first + whole}", f"{why}: {text!r}")
+                text = lines[n][:60].decode("ascii", "backslashreplace")
+                raise BrokenRecording(self.path, f"line {first + n}", f"{why}: {text!r}")
             first += len(lines)
             not_before_us = int(events.t[-1]) if events.n else not_before_us
 
     def imu(self) -> Iterator[Imu]:
         """The samples of imu.txt, `t ax ay az gx gy gz` [s, m/s2, rad/s]; see `Recording`.
 
-        In the unit's own axes, which on these cameras are the optical frame's to within a few degrees.
+        The axes are those of the IMU. On these cameras they match the optical frame to within a few degrees.
 
         Raises:
-            BrokenRecording: a line is no sample, or an earlier one than the one before; it names the line.
+            BrokenRecording: a line is not a sample, or is before the previous one; the error names the line.
         """
         if "imu" in self.streams:
             for t, rows in self._table(_FILES["imu"], 7):
@@ -120,7 +121,7 @@ class EcdRecording(EventsOnly):
         """The poses of groundtruth.txt, `t px py pz qx qy qz qw` [s, m], or None without one.
 
         Raises:
-            BrokenRecording: a line is no pose, or an earlier one than the one before; it names the line.
+            BrokenRecording: a line is not a pose, or is before the previous one; the error names the line.
         """
         if "poses" not in self.streams:
             return None
@@ -129,12 +130,12 @@ class EcdRecording(EventsOnly):
         norm = np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
         bad = np.flatnonzero(np.abs(norm[:, 0] - 1) > UNIT_WITHIN)
         if bad.size:
-            why = f"a quaternion of length {norm[bad[0], 0]:.4g} is no rotation"
+            why = f"a quaternion of length {norm[bad[0], 0]:.4g} is not a rotation"
             raise BrokenRecording(self.path, f"{_FILES['poses']} pose {bad[0] + 1}", why)
         return Poses(t, rows[:, :3].copy(), rows[:, 3:] / norm)
 
     def twists(self) -> Twists | None:
-        """How the camera moved, from its poses by `geometry.twists`; None without them."""
+        """Twists of the camera from its poses, by `geometry.twists`; None without poses."""
         poses = self.poses()
         return twists(poses) if poses is not None and poses.t.size > 1 else None
 
@@ -143,8 +144,8 @@ class EcdRecording(EventsOnly):
 
         Raises:
             MissingExtra: Pillow is not installed.
-            BrokenRecording: a line is no image, or an earlier one than the one before, or its file is not there or can
-                not be read; it names the line.
+            BrokenRecording: a line does not name an image, is before the previous one, or its file does not exist or
+                cannot be read; the error names the line.
         """
         if "frames" not in self.streams:
             return
@@ -167,15 +168,14 @@ class EcdRecording(EventsOnly):
         if not_before_us is not None and t_us < not_before_us:
             raise BrokenRecording(self.path, where, "time runs backwards")
         parts = path.split("/")
-        if (
-            ".." in parts or path.startswith("/") or not self.place.has(path)
-        ):  # a list from elsewhere opens no file here
+        outside = ".." in parts or path.startswith("/")  # images.txt must not open files outside the recording
+        if outside or not self.place.has(path):
             raise BrokenRecording(self.path, where, f"there is no image {path!r}")
         with self.place.open(path) as file:
             return Frame(t_us, read_image(self.path, where, file))
 
     def _table(self, name: str, columns: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
-        """Times [us] and the other columns of a text file of numbers, some BLOCK_BYTES at a time."""
+        """Times [us] (N,) and the other columns of a text file of numbers, in blocks of about BLOCK_BYTES."""
         number, not_before_us = 0, -(1 << 62)
         for lines in self._blocks(name):
             kept = [line for line in lines if line.strip() and not line.lstrip().startswith(b"#")]
@@ -198,21 +198,21 @@ class EcdRecording(EventsOnly):
                 yield t, rows[:, 1:]
 
     def _blocks(self, name: str) -> Iterator[list[bytes]]:
-        """A file's lines, some BLOCK_BYTES at a time."""
+        """The lines of a file, in blocks of about BLOCK_BYTES."""
         rest = b""
         with self.place.open(name) as file:
             while block := file.read(BLOCK_BYTES):
-                whole, newline, rest = (rest + block).rpartition(b"\n")
+                lines, newline, rest = (rest + block).rpartition(b"\n")
                 if newline:
-                    yield whole.split(b"\n")
-                elif len(rest) > BLOCK_BYTES:  # no text at all: let it fail as the line that it is
+                    yield lines.split(b"\n")
+                elif len(rest) > BLOCK_BYTES:  # not text: parsing it as one line reports the error
                     break
         if rest:
             yield [rest]
 
 
 def _is_row(line: bytes, columns: int) -> bool:
-    """Whether a line is so many numbers, or nothing, or a comment."""
+    """Whether a line has this many numbers, is blank, or is a comment."""
     fields = line.split()
     if not fields or fields[0].startswith(b"#"):
         return True
@@ -227,7 +227,7 @@ def _is_row(line: bytes, columns: int) -> bool:
 
 
 def _has_images(place: Place) -> bool:
-    """Whether the first image that images.txt lists is there."""
+    """Whether the first image that images.txt lists exists."""
     with place.open(_FILES["frames"]) as file:
         lines = [line.split() for line in file.read(4096).splitlines()]
     paths = [
@@ -237,10 +237,10 @@ def _has_images(place: Place) -> bool:
 
 
 def parse_calib(path: Path, data: bytes, sensor: Sensor) -> CameraInfo:
-    """The lens that a calib.txt describes: `fx fy cx cy k1 k2 p1 p2 k3` [px, dimensionless].
+    """The lens in a calib.txt: `fx fy cx cy k1 k2 p1 p2 k3` [px, dimensionless].
 
     Raises:
-        InvalidField: these are not nine fitting numbers; it names the file.
+        InvalidField: the text is not nine valid numbers; the error names the file.
     """
     text = data.decode("ascii", "backslashreplace").strip()
     try:
@@ -258,22 +258,22 @@ def parse_calib(path: Path, data: bytes, sensor: Sensor) -> CameraInfo:
             cy=cy,
             distortion=tuple(distortion),
         )
-    except ValueError:  # pydantic's is one too
+    except ValueError:  # pydantic's error is a ValueError
         raise InvalidField(str(path), "calib", text, _CALIB) from None
 
 
 def _parse(lines: list[bytes], sensor: Sensor, not_before_us: int | None) -> Events:
-    """The events of these lines; blank lines and those that begin with # are passed over.
+    """The events of these lines. Blank lines and lines that begin with # are skipped.
 
     Raises:
-        ValueError: a line is not `t[s] x y p`. EventOutsideSensor, TimeBackwards: it is, but the event is not good.
+        ValueError: a line is not `t[s] x y p`. EventOutsideSensor, TimeBackwards: the event is invalid.
     """
     if lines and b"#" in b"".join(lines):
         lines = [line for line in lines if not line.lstrip().startswith(b"#")]
     if not any(map(bytes.strip, lines)):
         return Events.empty()
     rows = np.loadtxt(lines, _LINE, comments=None, ndmin=1)
-    if not (np.abs(rows["t"]) < MAX_T_S).all() or rows["p"].max() > 1:  # so written that nan fails
+    if not (np.abs(rows["t"]) < MAX_T_S).all() or rows["p"].max() > 1:  # in this form nan fails
         raise ValueError("t is not finite or p is neither 0 nor 1")
     events = Events.from_columns(np.rint(rows["t"] * 1e6), rows["x"], rows["y"], rows["p"])
     check_events(events, sensor, not_before_us)
@@ -281,9 +281,9 @@ def _parse(lines: list[bytes], sensor: Sensor, not_before_us: int | None) -> Eve
 
 
 def _first_bad(lines: list[bytes], sensor: Sensor, not_before_us: int | None) -> tuple[int, str]:
-    """How many of these lines come before the first bad one, and what is wrong with that.
+    """How many lines come before the first invalid one, and what is wrong with that one.
 
-    By bisection: the lines up to and with any one of them are either all good or not.
+    Finds it by bisection: once a span of leading lines fails, every longer span fails too.
     """
 
     def fault(stop: int) -> str:
@@ -302,7 +302,7 @@ def _first_bad(lines: list[bytes], sensor: Sensor, not_before_us: int | None) ->
 
 
 def _accepts(path: Path) -> bool:
-    """Whether this is a folder with events.txt, or a file of text or an archive."""
+    """Whether this is a folder with events.txt, a text file, or an archive."""
     return (path / "events.txt").is_file() if path.is_dir() else path.suffix.lower() in (".txt", ".zip")
 
 

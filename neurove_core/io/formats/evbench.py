@@ -1,4 +1,4 @@
-"""Recordings of eventVision-evbench (Barranco 2016): .mat files of four columns, and truth in a text beside them."""
+"""Reader of eventVision-evbench (Barranco 2016): .mat files of four columns, with ground truth in a text file."""
 
 import re
 from collections.abc import Iterator
@@ -18,23 +18,23 @@ from neurove_protocol.errors import EventOutsideSensor, TimeBackwards
 from neurove_protocol.events import Events, Sensor, check_events
 
 DAVIS240B = Sensor(240, 180)
-"""What they were recorded with; of its columns 190 are used."""
+"""The sensor of the recordings; they use 190 of its columns."""
 
 COLUMNS: Final = ("ts", "x", "y", "pol")
 MAX_COLUMN_BYTES: Final = 16 << 20
-"""A packed column can not be read in parts, so a longer one is refused; theirs have some 300,000 events of 7 bytes."""
+"""Largest column that is read: a packed one cannot be read in parts. A recording has some 300,000 events of 7 bytes."""
 
 TRUTH: Final = "ground-truth_3Dcam.txt"
 FRAME_S: Final = 0.05
-"""What the truth counts rotation per: "approx. 50 ms"."""
+"""Time unit of the rotations in the ground truth: "approx. 50 ms"."""
 
 
 @dataclass(frozen=True, slots=True)
 class EvbenchRecording(EventsOnly):
     """A .mat file of the columns ts [us], x, y, pol; see `Recording`.
 
-    Its y counts upwards, as jAER's does, and is turned over to be the image's. That it runs against the truth's axes
-    shows in the events: once turned over, their vertical flow has the sign of the truth's rotation about x.
+    In the file y counts upwards, as in jAER and against the axes of the ground truth. The reader flips it to the
+    image's y. The events confirm this: after the flip, their vertical flow has the sign of the true rotation about x.
     """
 
     path: Path
@@ -44,18 +44,18 @@ class EvbenchRecording(EventsOnly):
 
     @classmethod
     def open(cls, path: Path, sensor: Sensor | None = None) -> Self:
-        """The recording in this file.
+        """Open the recording in this file.
 
         Args:
             path: the .mat file.
-            sensor: the pixel array; by default a DAVIS240b's.
+            sensor: the pixel array; by default that of a DAVIS240b.
 
         Raises:
-            UnknownSource: the file is no MATLAB 5 file with these four columns, or a too long one.
+            UnknownSource: the file is not a MATLAB 5 file with these four columns, or a column is too long.
         """
         columns = _columns(path)
         if len({column.size for column in columns.values()}) != 1 or set(columns) != set(COLUMNS):
-            raise UnknownSource(path, f"it has not the columns {', '.join(COLUMNS)} of one length")
+            raise UnknownSource(path, f"it does not have the columns {', '.join(COLUMNS)} of the same length")
         truth = ("twists",) if _rotation(path) is not None else ()
         return cls(path, sensor or DAVIS240B, ("events", *truth))
 
@@ -68,7 +68,7 @@ class EvbenchRecording(EventsOnly):
         """All events from the beginning; see `Recording`. The whole file is read at once.
 
         Raises:
-            BrokenRecording: an event is outside the sensor or earlier than the one before.
+            BrokenRecording: an event is outside the sensor or before the previous one.
         """
         events = self._events()
         try:
@@ -80,10 +80,10 @@ class EvbenchRecording(EventsOnly):
         yield from in_chunks(events)
 
     def twists(self) -> Twists | None:
-        """The truth of ground-truth_3Dcam.txt beside the file, at the first event and the last; None without one.
+        """The truth in ground-truth_3Dcam.txt of the same folder, at the first and the last event; None without it.
 
-        Only the rotation about x is there; the rest is nan: the other rotations are at odds with the events and with
-        the log of the pan-tilt unit, and the unit of the translation is not told.
+        Only the rotation about x is given; the rest is nan. The other rotations contradict the events and the log of
+        the pan-tilt unit, and the unit of the translation is not documented.
         """
         rotation = _rotation(self.path)
         if rotation is None:
@@ -97,7 +97,8 @@ class EvbenchRecording(EventsOnly):
         columns = _columns(self.path)
         t, x, y, p = (columns[name].astype(np.int64) for name in COLUMNS)
         bad = (x < 0) | (y < 0) | (y >= self.sensor.height) | ((p != 0) & (p != 1))
-        if bad.any():  # told as an event outside: turned over, a y would else be a large one, and a polarity be lost
+        # Report these as events outside the sensor: otherwise the flip would hide a wrong y, and `p & 1` a wrong p.
+        if bad.any():
             x = np.where(bad, np.iinfo(np.uint16).max, x)
         return Events.from_columns(t, x.astype(np.uint16), np.maximum(self.sensor.height - 1 - y, 0), p & 1)
 
@@ -106,11 +107,11 @@ def _columns(path: Path) -> dict[str, NDArray[Any]]:
     try:
         return read_columns(path, COLUMNS, MAX_COLUMN_BYTES)
     except MatFault as fault:
-        raise UnknownSource(path, f"it can not be read as a MATLAB 5 file: {fault}") from None
+        raise UnknownSource(path, f"it cannot be read as a MATLAB 5 file: {fault}") from None
 
 
 def _rotation(path: Path) -> float | None:
-    """The rotation about x per frame [rad] that the truth beside this file tells of it."""
+    """The rotation about x per frame [rad] of this file in the ground truth of its folder, or None."""
     truth = path.parent / TRUTH
     if not truth.is_file():
         return None

@@ -1,4 +1,4 @@
-"""A built-in moving pattern: events without any recording or camera."""
+"""A built-in moving pattern: a source of events without a recording or a camera."""
 
 import math
 from collections.abc import Iterator
@@ -17,19 +17,19 @@ from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
 
 HALF_DAVIS346 = Sensor(173, 130)
-FRAME_US = 2500  # between two of these the brightness of a pixel is a straight line
+FRAME_US = 2500  # between two frames the brightness of a pixel changes linearly
 CHUNK_FRAMES = 4
 CONTRAST = 0.25  # change of log intensity that makes an event
-PERIOD_PX = 256  # the texture repeats
-DETAIL_PX = 3.0  # standard deviation of the blur that makes it smooth
-SLOPE = 0.055  # its root mean square gradient, log intensity per px in x and in y
+PERIOD_PX = 256  # period of the texture
+DETAIL_PX = 3.0  # standard deviation of the blur that smooths it
+SLOPE = 0.055  # its root mean square gradient in x and in y, log intensity per px
 SPEED_PX_S = (120.0, 80.0)  # peak image velocity in x and y
-SWING_S = 7.0  # period of the velocity; x and y a quarter of it apart, so that it never rests
+SWING_S = 7.0  # period of the velocity; x and y differ by a quarter period, so it never stops
 
 
 @dataclass(frozen=True, slots=True)
 class Pattern(EventsOnly):
-    """A smooth random texture that slides over the sensor for ever, now this way, now that; see `Recording`."""
+    """A smooth random texture that slides over the sensor without end, in changing directions; see `Recording`."""
 
     seed: int = 0
     sensor: Sensor = HALF_DAVIS346
@@ -43,35 +43,36 @@ class Pattern(EventsOnly):
         'pattern 3'
 
         Raises:
-            UnknownSource: the URL names something else. InvalidField: the seed is no whole number from 0 on.
+            UnknownSource: the URL has other parts. InvalidField: the seed is not a whole number of at most 9 digits.
         """
         parts = urlsplit(url)
         query = dict(parse_qsl(parts.query, keep_blank_values=True))
         if parts.netloc or parts.path or query.keys() - {"seed"}:
-            raise UnknownSource(url, "a pattern has a seed and nothing else")
+            raise UnknownSource(url, "a pattern URL accepts a seed and nothing else")
         seed = query.get("seed", "0")
         if not (seed.isascii() and seed.isdecimal() and len(seed) < 10):
-            raise InvalidField(url, "seed", seed, "a whole number of at most 9 digits is expected")
+            raise InvalidField(url, "seed", seed, "expected a whole number of at most 9 digits")
         return cls(int(seed), sensor or HALF_DAVIS346)
 
     @property
     def name(self) -> str:
-        """The word and the seed."""
+        """`pattern` and the seed."""
         return f"pattern {self.seed}"
 
     def camera(self, stream: str) -> CameraInfo:
-        """A perfect pinhole with the field of view of MVSEC's DAVIS346, centred."""
+        """An ideal, centred pinhole with the field of view of MVSEC's DAVIS346."""
         width, height = self.sensor.width, self.sensor.height
         f = 226.38 / 346 * width
         cx, cy = (width - 1) / 2, (height - 1) / 2
         return CameraInfo(stream=stream, width=width, height=height, lens="pinhole", fx=f, fy=f, cx=cx, cy=cy)
 
     def chunks(self) -> Iterator[Events]:
-        """Events from t = 0 on, without end; the same for the same seed. Some 100 to 400 k events per second."""
+        """Endless events from t = 0 on, the same for the same seed; about 100 to 400 k events per second."""
         texture = _texture(self.seed, self.sensor)
         before = _view(texture, self.sensor, 0)
-        rest = np.random.default_rng(self.seed).uniform(-CONTRAST, CONTRAST, before.size)  # as after a long past
-        level = before + rest.astype(np.float32)
+        # random levels, as if the texture had moved for a long time before t = 0
+        offset = np.random.default_rng(self.seed).uniform(-CONTRAST, CONTRAST, before.size)
+        level = before + offset.astype(np.float32)
         frame = 0
         while True:
             parts = []
@@ -85,13 +86,13 @@ class Pattern(EventsOnly):
 
 
 def shift_px(t_us: int) -> tuple[float, float]:
-    """How far the texture has slid at this time, in x and y [px].
+    """Displacement of the texture at this time, in x and y [px].
 
     Its velocity is SPEED_PX_S[0] * cos(w t) in x and SPEED_PX_S[1] * sin(w t) in y, w = 2 pi / SWING_S.
     """
     w = 2 * math.pi / SWING_S
-    turn = w * t_us * 1e-6
-    return SPEED_PX_S[0] / w * math.sin(turn), SPEED_PX_S[1] / w * (1 - math.cos(turn))
+    phase = w * t_us * 1e-6
+    return SPEED_PX_S[0] / w * math.sin(phase), SPEED_PX_S[1] / w * (1 - math.cos(phase))
 
 
 def _texture(seed: int, sensor: Sensor) -> NDArray[np.float32]:
@@ -105,21 +106,21 @@ def _texture(seed: int, sensor: Sensor) -> NDArray[np.float32]:
 
 
 def _view(texture: NDArray[np.float32], sensor: Sensor, t_us: int) -> NDArray[np.float32]:
-    """What the sensor sees at a time: log intensity (H * W,), between texture pixels bilinear."""
+    """The image on the sensor at a time: log intensity (H * W,), interpolated bilinearly."""
     (fx, left), (fy, top) = (math.modf(-shift % PERIOD_PX) for shift in shift_px(t_us))
     h, stride = sensor.height, sensor.width + 1
     window = texture[int(top) : int(top) + h + 1, int(left) : int(left) + stride].ravel()
     rows = window[:-stride] + np.float32(fy) * (window[stride:] - window[:-stride])
-    rows[:-1] += np.float32(fx) * (rows[1:] - rows[:-1])  # mixes rows in the last column only, which is not seen
+    rows[:-1] += np.float32(fx) * (rows[1:] - rows[:-1])  # mixes rows only in the last column, which is dropped below
     return rows.reshape(h, stride)[:, :-1].ravel()
 
 
 def _crossings(
     before: NDArray[np.float32], after: NDArray[np.float32], level: NDArray[np.float32], t0_us: int, sensor: Sensor
 ) -> tuple[Events, NDArray[np.float32]]:
-    """Where and when a pixel got CONTRAST away from the level (H * W,) of its last event, and the levels thereafter.
+    """Events where a pixel differs by CONTRAST from the level (H * W,) of its last event, and the new levels.
 
-    Once a frame at most: in FRAME_US the brightness of a pixel changes by less than half of CONTRAST.
+    A pixel has at most one event per frame: in FRAME_US its brightness changes by less than half of CONTRAST.
     """
     away = after - level
     pixels = np.flatnonzero(np.abs(away) >= CONTRAST)

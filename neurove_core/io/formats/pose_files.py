@@ -1,7 +1,7 @@
-"""Files of poses: TUM text, the Event Camera Dataset's groundtruth.txt, CSV in nanoseconds, and HDF5 of MVSEC and M3ED.
+"""Reader of pose files: TUM text, Event Camera Dataset groundtruth.txt, CSV in ns, and HDF5 of MVSEC and M3ED.
 
 A line of text is `t x y z qx qy qz qw`, or the same with commas; `#` begins a comment. If all times are whole numbers,
-they are nanoseconds when the line has commas (as EuRoC and ESIM write it) or the last time is above 1e14; otherwise
+they are nanoseconds if a line has commas (as EuRoC and ESIM write it) or the last time is above 1e14; otherwise
 times are seconds. In HDF5 the times are seconds for MVSEC and microseconds for M3ED.
 """
 
@@ -20,15 +20,10 @@ from neurove_core.io.poses import MAX_POSES, checked_poses
 from neurove_protocol.errors import InvalidField
 
 NANOSECONDS_FROM: Final = 1e14
-"""A whole-numbered time above this is in ns: as seconds it would be three million years."""
-
+"""A whole-numbered time above this is in ns: in seconds it would be three million years."""
 
 _LINES = 20_000  # parsed at once
-
-
 _COLUMNS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
-
-
 _LAYOUTS = (
     "ts, poss, rots (MVSEC odometry)",
     "davis/left/odometry (MVSEC FILE_gt.hdf5)",
@@ -38,12 +33,12 @@ _LAYOUTS = (
 
 
 def read_poses(path: Path) -> Poses:
-    """The poses in a file of text, of HDF5 with `poss` and `rots`, or of M3ED's `Cn_T_C0`; times in us.
+    """Read the poses of a text file or an HDF5 file, see the module; times in us.
 
     Raises:
-        InvalidField: a pose is none, or its time does not come after the one before; it names the line or the row.
-        UnknownSource: there is no such file, or it holds none of these layouts.
-        BrokenRecording: it is HDF5, and cut or garbled. MissingExtra: it is HDF5, and h5py is not installed.
+        InvalidField: a pose is invalid, or its time is not after the previous one; the error names the line or the row.
+        UnknownSource: the file does not exist, or has none of these layouts.
+        BrokenRecording: an HDF5 file is truncated or corrupt. MissingExtra: h5py is not installed to read HDF5.
     """
     try:
         if path.suffix.lower() in (".h5", ".hdf5"):
@@ -65,26 +60,26 @@ def _text_poses(path: Path, text: TextIO) -> Poses:
         commas = commas or any("," in line for line in lines)
         n += len(lines)
         if n > MAX_POSES:
-            raise InvalidField(str(path), "poses", n, f"at most {MAX_POSES} are read")
+            raise InvalidField(str(path), "poses", n, f"at most {MAX_POSES} are allowed")
         t, rest = _parse(path, lines, at)
         times.append(t)
         rows.append(rest)
         numbers.append(np.array(at))
     if not n:
-        raise InvalidField(str(path), "poses", 0, "at least one line `t x y z qx qy qz qw` is expected")
+        raise InvalidField(str(path), "poses", 0, "expected at least one line `t x y z qx qy qz qw`")
     t, rest, line = np.concatenate(times), np.concatenate(rows), np.concatenate(numbers)
-    whole = all(part.dtype.kind == "i" for part in times)
-    scale = 1e-3 if whole and (commas or t[-1] > NANOSECONDS_FROM) else 1e6
+    whole_numbers = all(part.dtype.kind == "i" for part in times)
+    scale = 1e-3 if whole_numbers and (commas or t[-1] > NANOSECONDS_FROM) else 1e6
     with np.errstate(all="ignore"):
         t_us = t * scale if t.dtype.kind == "f" or scale > 1 else np.rint(t / 1000)
     return checked_poses(t_us, rest[:, :3], rest[:, 3:], lambda i: f"{path}: line {line[i]}")
 
 
 def _blocks(text: TextIO) -> Iterator[tuple[list[str], list[int]]]:
-    """Lines that are neither empty nor comments, some thousand at a time, and their numbers from 1 on."""
+    """Lines that are neither empty nor comments, at most _LINES at a time, and their line numbers from 1 on."""
     lines: list[str] = []
     numbers: list[int] = []
-    for number, raw in enumerate(iter(lambda: text.readline(1 << 16), ""), 1):  # a file without line ends is no text
+    for number, raw in enumerate(iter(lambda: text.readline(1 << 16), ""), 1):  # bounded: a file may have no newline
         line = raw.partition("#")[0].strip()
         if line:
             lines.append(line)
@@ -97,7 +92,7 @@ def _blocks(text: TextIO) -> Iterator[tuple[list[str], list[int]]]:
 
 
 def _parse(path: Path, lines: list[str], numbers: list[int]) -> tuple[NDArray[Any], NDArray[np.float64]]:
-    """Times (N,) as they are written, int64 or float64, and the other seven columns (N, 7).
+    """Times (N,) in the unit of the file, int64 or float64, and the other seven columns (N, 7).
 
     Raises:
         InvalidField: a line is not eight numbers.
@@ -113,19 +108,19 @@ def _parse(path: Path, lines: list[str], numbers: list[int]) -> tuple[NDArray[An
     for line, number in zip(lines, numbers, strict=True):
         values = line.split(delimiter)
         if len(values) != len(_COLUMNS):
-            bound = f"{len(_COLUMNS)} columns are expected: {' '.join(_COLUMNS)}"
+            bound = f"expected {len(_COLUMNS)} columns: {' '.join(_COLUMNS)}"
             raise InvalidField(f"{path}: line {number}", "columns", len(values), bound)
         for field, entry in zip(_COLUMNS, values, strict=True):
             try:
                 float(entry)
             except ValueError:
-                raise InvalidField(f"{path}: line {number}", field, entry, "a number is expected") from None
-    bound = f"numbers are expected: {' '.join(_COLUMNS)}"  # such as 1_000, which Python takes and the fast parser not
+                raise InvalidField(f"{path}: line {number}", field, entry, "expected a number") from None
+    bound = f"expected numbers: {' '.join(_COLUMNS)}"  # for example 1_000: Python accepts it, loadtxt does not
     raise InvalidField(f"{path}: lines {numbers[0]} to {numbers[-1]}", "columns", lines[0], bound)
 
 
 def _hdf5_poses(path: Path, file: Any) -> Poses:
-    """The poses of an HDF5 file, whichever of the layouts it has."""
+    """The poses of an HDF5 file in any of the layouts."""
     if hdf5.has(file, "ts", "poss", "rots"):
         t, position, quaternion = table(path, file, ("ts", "poss", "rots"), (), (3,), (4,))
         return checked_poses(t * 1e6, position, quaternion, lambda i: f"{path}: row {i}")

@@ -1,4 +1,4 @@
-"""CARLA's events and poses: our container, the turn from its left-handed world, and what is said without a client."""
+"""CARLA's events and poses: the container, the conversion from its left-handed world, and the recorder's errors."""
 
 import importlib.util
 import sys
@@ -52,7 +52,7 @@ def matrix(quaternion: np.ndarray) -> np.ndarray:
 
 
 def optical_twist(first: CarlaPoses, dt_s: float) -> np.ndarray:
-    """Body twist of the optical frame between two poses, by differences."""
+    """Body twist of the optical frame from the difference of two poses."""
     got = to_optical(first)
     a, b = (matrix(quaternion) for quaternion in got.orientation)
     turn = a.T @ b
@@ -61,7 +61,7 @@ def optical_twist(first: CarlaPoses, dt_s: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("posed", [True, False])
-def test_what_was_written_is_read(posed, tmp_path):
+def test_a_written_recording_is_read_back(posed, tmp_path):
     recording = open_source(written(tmp_path, posed=posed))
     assert (recording.name, recording.sensor) == ("a.npz", SENSOR)
     assert recording.streams == (("events", "poses") if posed else ("events",))
@@ -76,7 +76,7 @@ def test_what_was_written_is_read(posed, tmp_path):
             np.testing.assert_array_equal(got, want)
 
 
-def test_the_events_of_a_camera_are_packed_to_thirteen_bytes():
+def test_an_event_has_thirteen_bytes():
     assert RECORD.itemsize == 13
 
 
@@ -101,7 +101,7 @@ def test_forward_right_and_up_are_the_optical_z_x_and_minus_y(moved, v):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_however_it_is_turned_a_camera_that_drives_its_own_way_moves_along_its_optical_axis(seed):
+def test_a_camera_that_moves_forward_moves_along_its_optical_axis_in_any_orientation(seed):
     rng = np.random.default_rng(seed)
     roll, pitch, yaw = rng.uniform(-80, 80, 3)
     p, y = np.radians([pitch, yaw])
@@ -116,7 +116,7 @@ def test_however_it_is_turned_a_camera_that_drives_its_own_way_moves_along_its_o
     ("index", "name", "value", "why"),
     [(2000, "x", 64, "outside the sensor"), (2000, "t", 0, "comes after"), (0, "y", 48, "outside the sensor")],
 )
-def test_a_bad_event_ends_the_recording_and_is_named(index, name, value, why, tmp_path):
+def test_an_invalid_event_ends_the_recording_and_is_named(index, name, value, why, tmp_path):
     rows = records(EVENTS)
     rows[name][index] = value
     write(tmp_path / "a.npz", [rows], SENSOR, 90)
@@ -127,14 +127,14 @@ def test_a_bad_event_ends_the_recording_and_is_named(index, name, value, why, tm
     assert why in error.message
 
 
-def test_a_garbled_or_cut_file_gives_a_whole_beginning_or_is_refused(tmp_path):
+def test_a_corrupt_file_gives_valid_events_first_and_a_truncated_one_is_refused(tmp_path):
     data = Path(written(tmp_path)).read_bytes()
-    for cut in (0, 100, len(data) // 2, len(data) - 1):
+    for size in (0, 100, len(data) // 2, len(data) - 1):
         with pytest.raises(UnknownSource):
-            open_source(put(tmp_path, "b.npz", data[:cut]))
-    garbled = bytearray(data)
-    garbled[len(data) // 2] ^= 0xFF
-    events, error = read_broken(open_source(put(tmp_path, "b.npz", bytes(garbled))))
+            open_source(put(tmp_path, "b.npz", data[:size]))
+    corrupt = bytearray(data)
+    corrupt[len(data) // 2] ^= 0xFF
+    events, error = read_broken(open_source(put(tmp_path, "b.npz", bytes(corrupt))))
     assert_same(events, EVENTS.span(0, events.n))
     assert error is not None
 
@@ -148,7 +148,7 @@ def test_objects_are_not_unpickled_and_other_archives_are_refused(tmp_path):
         open_source(str(tmp_path / "b.npz"))
 
 
-def test_poses_that_do_not_belong_together_are_refused(tmp_path):
+def test_inconsistent_poses_are_refused(tmp_path):
     path = written(tmp_path)
     with zipfile.ZipFile(path) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
@@ -163,17 +163,17 @@ def test_poses_that_do_not_belong_together_are_refused(tmp_path):
             open_source(path).poses()
 
 
-def test_a_recording_that_ends_early_leaves_nothing_behind(tmp_path):
-    def some():
+def test_a_recording_that_fails_leaves_no_file(tmp_path):
+    def failing():
         yield records(EVENTS)
         raise ConnectionError
 
     with pytest.raises(ConnectionError):
-        write(tmp_path / "a.npz", some(), SENSOR, 90)
+        write(tmp_path / "a.npz", failing(), SENSOR, 90)
     assert not list(tmp_path.iterdir())
 
 
-def test_without_the_client_one_is_told_what_to_install(tmp_path, monkeypatch):
+def test_the_error_without_the_client_says_how_to_install_it(tmp_path, monkeypatch):
     if importlib.util.find_spec("carla"):
         monkeypatch.setitem(sys.modules, "carla", None)
     with pytest.raises(MissingExtra, match=r"carla is not installed: pip install 'neurove\[carla\]'"):
@@ -182,6 +182,6 @@ def test_without_the_client_one_is_told_what_to_install(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("wrong", [{"seconds": 0.0}, {"seconds": 1.0, "fov_deg": 180.0}])
-def test_wrong_settings_are_named(wrong, tmp_path):
+def test_invalid_settings_are_refused_by_name(wrong, tmp_path):
     with pytest.raises(InvalidField, match="must"):
         record(tmp_path / "a.npz", **wrong)

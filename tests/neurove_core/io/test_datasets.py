@@ -1,4 +1,4 @@
-"""Recordings in HDF5, whatever the layout: MVSEC, DSEC, M3ED and our own, in files that are written here."""
+"""HDF5 recordings in all layouts: MVSEC, DSEC, M3ED and files of `write_dsec`. The tests write the files."""
 
 import re
 import sys
@@ -23,12 +23,12 @@ from tests.datasets import (
     DAY_US,
     EVENTS,
     LATE,
+    corrupt_chunk,
     dsec_file,
     m3ed_file,
     make_poses,
     mvsec_file,
     own_file,
-    spoil,
     write_m3ed,
     write_mvsec,
 )
@@ -38,7 +38,7 @@ each_layout = pytest.mark.parametrize("written", [mvsec_file, dsec_file, m3ed_fi
 
 
 @each_layout
-def test_a_file_in_a_data_sets_layout_gives_its_events_each_time(written, tmp_path):
+def test_a_file_in_each_layout_gives_the_same_events_on_every_read(written, tmp_path):
     recording = open_source(written(tmp_path), SENSOR)
     want = EVENTS if written is m3ed_file else LATE
     assert_same(read(recording), want)
@@ -50,7 +50,7 @@ def test_a_file_in_a_data_sets_layout_gives_its_events_each_time(written, tmp_pa
 
 @each_layout
 @pytest.mark.parametrize("seed", range(3))
-def test_reading_from_a_time_on_gives_all_events_from_it_and_none_before(written, seed, tmp_path):
+def test_since_gives_all_events_from_a_time_on_and_no_earlier_ones(written, seed, tmp_path):
     recording = open_source(written(tmp_path), SENSOR)
     events = EVENTS if written is m3ed_file else LATE
     rng = np.random.default_rng(seed)
@@ -62,11 +62,11 @@ def test_reading_from_a_time_on_gives_all_events_from_it_and_none_before(written
 
 
 @pytest.mark.parametrize(("written", "name"), [(dsec_file, "events/x"), (m3ed_file, "prophesee/left/x")])
-def test_what_is_before_a_time_is_not_read(written, name, tmp_path):
-    """It may even be unreadable."""
+def test_since_does_not_read_earlier_events(written, name, tmp_path):
+    """The earlier events are unreadable."""
     path = Path(written(tmp_path))
     with h5py.File(path) as file:
-        spoil(path, file[name], 0)
+        corrupt_chunk(path, file[name], 0)
     recording = open_source(str(path), SENSOR)
     events = EVENTS if written is m3ed_file else LATE
     assert read_broken(recording)[0].n == 0
@@ -74,7 +74,7 @@ def test_what_is_before_a_time_is_not_read(written, name, tmp_path):
 
 
 @each_layout
-def test_a_wrong_index_of_milliseconds_costs_time_and_no_events(written, tmp_path):
+def test_a_wrong_millisecond_index_loses_no_events(written, tmp_path):
     path = written(tmp_path)
     with h5py.File(path, "r+") as file:
         for name in ("ms_to_idx", "prophesee/left/ms_map_idx"):
@@ -88,27 +88,27 @@ def test_a_wrong_index_of_milliseconds_costs_time_and_no_events(written, tmp_pat
 
 @each_layout
 @pytest.mark.parametrize("seed", range(2))
-def test_a_cut_file_says_at_which_byte_it_ends(written, seed, tmp_path):
+def test_a_truncated_file_is_refused_with_the_byte_where_it_ends(written, seed, tmp_path):
     data = Path(written(tmp_path)).read_bytes()
-    cut = tmp_path / "cut.h5"
+    truncated = tmp_path / "truncated.h5"
     for size in np.random.default_rng(seed).integers(200, len(data), 10).tolist():
-        cut.write_bytes(data[:size])
+        truncated.write_bytes(data[:size])
         with pytest.raises(BrokenRecording) as caught:
-            open_source(str(cut), SENSOR)
+            open_source(str(truncated), SENSOR)
         assert caught.value.details["where"] == f"byte {size}"
         assert str(len(data)) in caught.value.message
 
 
 @each_layout
 @pytest.mark.parametrize("seed", range(2))
-def test_a_garbled_file_is_refused_in_our_own_words_or_read_without_a_bad_event(written, seed, tmp_path):
+def test_a_corrupt_file_is_refused_with_our_error_or_read_without_an_invalid_event(written, seed, tmp_path):
     data = Path(written(tmp_path)).read_bytes()
     rng = np.random.default_rng(seed)
     for i in range(40):
         bad = bytearray(data)
         for at in rng.integers(0, len(data) if i % 2 else min(len(data), 8000), 8):
             bad[at] = rng.integers(0, 256)
-        path = tmp_path / "garbled.h5"
+        path = tmp_path / "corrupt.h5"
         path.write_bytes(bad)
         try:
             recording = open_source(str(path), SENSOR)
@@ -119,7 +119,7 @@ def test_a_garbled_file_is_refused_in_our_own_words_or_read_without_a_bad_event(
             list(recording.imu())
             recording.twists()
         except NeuroVEError as error:
-            assert str(tmp_path) in error.message  # noqa: PT017 not raising is fine too
+            assert str(tmp_path) in error.message  # noqa: PT017 the file may also be readable
 
 
 @pytest.mark.parametrize(
@@ -129,14 +129,14 @@ def test_a_garbled_file_is_refused_in_our_own_words_or_read_without_a_bad_event(
         ("y", 48, "y=48 lies outside the sensor 64x48"),
         ("x", -1, "x=-1"),
         ("t", 3, "time runs backwards"),
-        ("t", np.nan, "t=nan is no time"),
-        ("t", np.inf, "t=inf is no time"),
-        ("t", -1e300, "is no time"),
+        ("t", np.nan, "t=nan is not a valid time"),
+        ("t", np.inf, "t=inf is not a valid time"),
+        ("t", -1e300, "is not a valid time"),
         ("p", 7, "the polarity p=7"),
     ],
 )
 @pytest.mark.parametrize("written", [mvsec_file, dsec_file, m3ed_file])
-def test_a_bad_event_ends_the_recording_at_its_row(written, column, value, why, tmp_path):
+def test_an_invalid_event_ends_the_recording_at_its_row(written, column, value, why, tmp_path):
     path, row = written(tmp_path), 537
     with h5py.File(path, "r+") as file:
         if written is mvsec_file:
@@ -158,14 +158,14 @@ def test_a_bad_event_ends_the_recording_at_its_row(written, column, value, why, 
 def test_an_unreadable_chunk_ends_the_recording_at_its_first_row(written, name, tmp_path):
     path = Path(written(tmp_path))
     with h5py.File(path) as file:
-        spoil(path, file[name], 4)
+        corrupt_chunk(path, file[name], 4)
     events, error = read_broken(open_source(str(path), SENSOR))
     assert_same(events, (EVENTS if written is m3ed_file else LATE).span(0, 4 * CHUNK))
     assert error is not None
     assert str(error.details["where"]).startswith(f"row {4 * CHUNK} of ")
 
 
-def test_columns_of_unequal_length_give_what_is_whole(tmp_path):
+def test_columns_of_unequal_length_give_their_common_rows_and_then_an_error(tmp_path):
     path = dsec_file(tmp_path)
     with h5py.File(path, "r+") as file:
         y = file["events/y"][:900]
@@ -174,24 +174,24 @@ def test_columns_of_unequal_length_give_what_is_whole(tmp_path):
     events, error = read_broken(open_source(path, SENSOR))
     assert_same(events, LATE.span(0, 900))
     assert error is not None
-    assert "unequal length" in error.message
+    assert "unequal lengths" in error.message
     assert "row 900 of events" in error.message
 
 
-def test_a_table_of_another_kind_is_told_by_its_name(tmp_path):
+def test_a_table_of_another_shape_or_type_is_refused_by_name(tmp_path):
     with h5py.File(tmp_path / "a.hdf5", "w") as file:
         file["davis/left/events"] = np.zeros((5, 3))
-    with pytest.raises(BrokenRecording, match=r"davis/left/events: numbers of shape \(N, 4\) are expected"):
+    with pytest.raises(BrokenRecording, match=r"davis/left/events: expected numbers of shape \(N, 4\)"):
         read(open_source(str(tmp_path / "a.hdf5")))
     for rows in ([b"one", b"two"], np.zeros(2, np.longdouble), np.zeros(2, np.float16)):
         with h5py.File(tmp_path / "b.h5", "w") as file:
             for name in "pxyt":
                 file[f"events/{name}"] = rows
-        with pytest.raises(BrokenRecording, match="numbers of shape"):
+        with pytest.raises(BrokenRecording, match="expected numbers of shape"):
             read(open_source(str(tmp_path / "b.h5")))
 
 
-def test_rows_that_were_never_written_are_no_events(tmp_path):
+def test_rows_that_were_never_written_are_refused(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for name in "pxyt":
             file.create_dataset(f"events/{name}", (1 << 60,), "u2", chunks=(1000,))
@@ -199,7 +199,7 @@ def test_rows_that_were_never_written_are_no_events(tmp_path):
         read(open_source(str(tmp_path / "a.h5")))
 
 
-def test_chunks_too_large_for_memory_are_refused_before_they_are_unpacked(tmp_path):
+def test_too_large_chunks_are_refused_before_decompression(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for name in "pxyt":
             file.create_dataset(f"events/{name}", (10,), "i8", maxshape=(None,), chunks=(9_000_000,), compression=1)
@@ -207,7 +207,7 @@ def test_chunks_too_large_for_memory_are_refused_before_they_are_unpacked(tmp_pa
         read(open_source(str(tmp_path / "a.h5")))
 
 
-def test_a_long_file_comes_in_bounded_chunks_and_memory(tmp_path):
+def test_a_long_file_is_read_in_bounded_chunks_and_memory(tmp_path):
     events = make_events(1_000_000, seed=2, start_us=5, duration_us=3_000_000)
     path = tmp_path / "long_data.hdf5"
     with h5py.File(path, "w") as file:
@@ -238,15 +238,15 @@ def test_an_empty_data_set_has_no_events(tmp_path):
     assert recording.twists() is None
 
 
-def test_a_compressed_file_of_another_packing_is_read_too(tmp_path):
+def test_a_file_with_another_compression_is_read(tmp_path):
     path = write_mvsec(tmp_path, LATE, compression=hdf5plugin.Zstd())
     assert_same(read(open_source(path, SENSOR)), LATE)
 
 
-# --- which layout, which stream --------------------------------------------------------------------------------------
+# --- choice of layout and stream --------------------------------------------------------------------------------------
 
 
-def test_a_file_of_no_known_layout_is_told_what_was_looked_for(tmp_path):
+def test_the_error_for_an_unknown_layout_lists_the_known_ones(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["something"] = 1
     with pytest.raises(UnknownSource) as caught:
@@ -255,20 +255,20 @@ def test_a_file_of_no_known_layout_is_told_what_was_looked_for(tmp_path):
         assert name in caught.value.message
 
 
-def test_a_file_of_truth_alone_says_that_it_has_poses(tmp_path):
+def test_the_error_for_a_file_without_events_says_that_it_has_poses(tmp_path):
     write_mvsec(tmp_path, LATE, poses=make_poses())
     with pytest.raises(UnknownSource, match="no events.*it has poses: davis/left/odometry"):
         open_source(str(tmp_path / "indoor_flying1_gt.hdf5"))
 
 
 @pytest.mark.parametrize("data", [b"", b"no HDF5 at all", b"PK\x03\x04"])
-def test_what_is_no_hdf5_is_refused(data, tmp_path):
+def test_a_file_that_is_not_hdf5_is_refused(data, tmp_path):
     (tmp_path / "a.hdf5").write_bytes(data)
-    with pytest.raises(UnknownSource, match="does not begin as HDF5 does"):
+    with pytest.raises(UnknownSource, match="does not start with the HDF5 signature"):
         open_source(str(tmp_path / "a.hdf5"))
 
 
-def test_a_topic_picks_one_of_several_cameras(tmp_path):
+def test_a_topic_selects_one_of_several_cameras(tmp_path):
     right = make_events(50, seed=9, start_us=DAY_US)
     path = write_mvsec(tmp_path, LATE, right=right)
     assert_same(read(open_source(path, SENSOR, "davis/right")), right)
@@ -281,7 +281,7 @@ def test_a_topic_picks_one_of_several_cameras(tmp_path):
         open_source(m3ed, topic="prophesee/right")
 
 
-def test_of_a_file_with_the_right_camera_alone_that_is_read(tmp_path):
+def test_the_right_camera_is_read_if_the_file_has_no_left_one(tmp_path):
     path = write_mvsec(tmp_path, LATE)
     with h5py.File(path, "r+") as file:
         file.move("davis/left", "davis/right")
@@ -296,7 +296,7 @@ def test_a_source_with_one_event_stream_refuses_a_topic(source, tmp_path):
         open_source(source if "://" in source else str(tmp_path / source), topic="left")
 
 
-def test_without_h5py_its_absence_is_told(tmp_path, monkeypatch):
+def test_the_error_without_h5py_says_how_to_install_it(tmp_path, monkeypatch):
     path = dsec_file(tmp_path)
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(MissingExtra, match=r"h5py is not installed: pip install 'neurove\[recordings\]'"):

@@ -1,4 +1,4 @@
-"""DSEC's layout: its own files, and what neurove itself writes in it."""
+"""DSEC's layout: files of the data set, and files of `write_dsec`."""
 
 import itertools
 from pathlib import Path
@@ -19,15 +19,15 @@ from tests.datasets import DAY_US, EVENTS, LATE, make_imu, make_poses, write_dse
 from tests.recordings import all_samples, assert_same, read, read_broken, shared
 
 
-def test_dsec_is_640x480_and_its_offset_may_be_absent(tmp_path):
+def test_dsec_is_640x480_and_its_time_offset_is_optional(tmp_path):
     recording = open_source(write_dsec_file(tmp_path / "events.h5", EVENTS))
     assert recording.sensor == Sensor(640, 480)
     assert_same(read(recording), EVENTS)
     assert recording.camera("cam0") is None
 
 
-def test_a_file_in_dsecs_layout_of_a_larger_sensor_asks_for_it(tmp_path):
-    """TUM-VIE's are such files."""
+def test_the_error_for_a_larger_sensor_in_dsecs_layout_asks_for_its_size(tmp_path):
+    """TUM-VIE has such files."""
     events = make_events(100, seed=4, sensor=Sensor(1280, 720))
     path = write_dsec_file(tmp_path / "events.h5", events)
     _, error = read_broken(open_source(path))
@@ -37,13 +37,13 @@ def test_a_file_in_dsecs_layout_of_a_larger_sensor_asks_for_it(tmp_path):
     assert_same(read(open_source(path, Sensor(1280, 720))), events)
 
 
-def test_dsec_without_an_index_is_read_from_a_time_on_all_the_same(tmp_path):
+def test_since_works_without_dsecs_index(tmp_path):
     recording = open_source(write_dsec_file(tmp_path / "events.h5", LATE, offset_us=DAY_US, index=False))
     assert_same(Events.join(list(recording.since(int(LATE.t[600]) + 1))), LATE.span(601, 1000))
 
 
 @pytest.mark.parametrize("offset", [2**63, [1, 2], b"soon"])
-def test_a_time_offset_that_is_none_is_named(offset, tmp_path):
+def test_an_invalid_time_offset_is_refused_by_name(offset, tmp_path):
     path = write_dsec_file(tmp_path / "events.h5", EVENTS)
     with h5py.File(path, "r+") as file:
         file["t_offset"] = np.array(offset, "u8") if isinstance(offset, int) else offset
@@ -51,14 +51,14 @@ def test_a_time_offset_that_is_none_is_named(offset, tmp_path):
         open_source(path)
 
 
-def test_what_is_written_in_dsecs_layout_is_read_back_with_all_that_the_source_had(tmp_path):
+def test_a_written_recording_is_read_back_with_all_streams_of_its_source(tmp_path):
     poses, imu = make_poses(start_us=DAY_US), make_imu(start_us=DAY_US)
     images = np.zeros((4, 260, 346), np.uint8)
     source = open_source(write_mvsec(tmp_path, LATE, imu=imu, poses=poses, images=images))
-    told: list[int] = []
-    written = write_dsec(source, tmp_path / "out.h5", told.append)
+    progress: list[int] = []
+    written = write_dsec(source, tmp_path / "out.h5", progress.append)
     assert written == (LATE.n, ("events", "poses", "twists", "imu"), ("frames",))
-    assert told == [LATE.n]
+    assert progress == [LATE.n]
     copy = open_source(str(tmp_path / "out.h5"))
     assert copy.sensor == source.sensor
     assert copy.camera("cam0") == source.camera("cam0")
@@ -74,7 +74,7 @@ def test_what_is_written_in_dsecs_layout_is_read_back_with_all_that_the_source_h
     assert read_poses(tmp_path / "out.h5").t.tolist() == poses.t.tolist()
 
 
-def test_the_index_that_is_written_is_that_of_dsecs_own_example(tmp_path):
+def test_the_written_index_matches_dsecs_own_example(tmp_path):
     t = [0, 500, 2100, 5000, 5000, 7100, 7200, 7200, 8100, 9000]
     write_dsec(Given([Events.from_columns(np.array(t) + 77, [1] * 10, [2] * 10, [1] * 10)]), tmp_path / "a.h5")
     with h5py.File(tmp_path / "a.h5") as file:
@@ -85,11 +85,11 @@ def test_the_index_that_is_written_is_that_of_dsecs_own_example(tmp_path):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_what_is_written_does_not_depend_on_how_the_source_cuts_its_chunks(seed, tmp_path):
+def test_the_written_file_does_not_depend_on_the_chunks_of_its_source(seed, tmp_path):
     events = make_events(3000, seed=seed, start_us=123, duration_us=50_000)
-    cuts = [0, *sorted(np.random.default_rng(seed).choice(np.arange(1, 3000), 20, replace=False).tolist()), 3000]
+    bounds = [0, *sorted(np.random.default_rng(seed).choice(np.arange(1, 3000), 20, replace=False).tolist()), 3000]
     write_dsec(Given([events]), tmp_path / "one.h5")
-    write_dsec(Given([events.span(a, b) for a, b in itertools.pairwise(cuts)]), tmp_path / "many.h5")
+    write_dsec(Given([events.span(a, b) for a, b in itertools.pairwise(bounds)]), tmp_path / "many.h5")
     with h5py.File(tmp_path / "one.h5") as one, h5py.File(tmp_path / "many.h5") as many:
         np.testing.assert_array_equal(one["ms_to_idx"], many["ms_to_idx"])
         t = one["events/t"][()]
@@ -100,7 +100,7 @@ def test_what_is_written_does_not_depend_on_how_the_source_cuts_its_chunks(seed,
 
 
 class Given(EventsOnly):
-    """A recording of these chunks, and an error after them."""
+    """A recording of these chunks, followed by an error if one is given."""
 
     name, sensor, endless = "given", SENSOR, False
 
@@ -113,7 +113,7 @@ class Given(EventsOnly):
             raise self.error
 
 
-def test_a_source_that_breaks_leaves_nothing_behind_and_what_was_there_stays(tmp_path):
+def test_a_broken_source_writes_nothing_and_keeps_the_existing_file(tmp_path):
     out = tmp_path / "out.h5"
     out.write_bytes(b"precious")
     broken = Given([EVENTS], BrokenRecording(Path("a.raw"), "byte 7", "why not"))
@@ -123,8 +123,8 @@ def test_a_source_that_breaks_leaves_nothing_behind_and_what_was_there_stays(tmp
     assert list(tmp_path.iterdir()) == [out]
 
 
-def test_a_source_without_end_or_with_a_jump_in_time_is_not_written(tmp_path):
-    with pytest.raises(InvalidField, match="one that ends is expected"):
+def test_an_endless_source_or_a_jump_in_time_is_refused(tmp_path):
+    with pytest.raises(InvalidField, match="must not be endless"):
         write_dsec(open_source("pattern://"), tmp_path / "out.h5")
     jump = Events.from_columns([5, MAX_SPAN_S * 1_000_000 + 6], [1, 1], [1, 1], [1, 1])
     with pytest.raises(InvalidField, match=f"at most {MAX_SPAN_S} s"):
@@ -146,7 +146,7 @@ def test_a_long_gap_is_indexed(tmp_path):
 
 
 @pytest.mark.parametrize("path", ["prophesee/evt3.raw", "ecd/shapes_rotation", "aedat4/davis346.aedat4"])
-def test_a_real_recording_survives_the_way_through_dsecs_layout(path, tmp_path):
+def test_a_real_recording_survives_a_copy_to_dsecs_layout(path, tmp_path):
     source = open_source(str(shared(path)))
     write_dsec(source, tmp_path / "out.h5")
     copy = open_source(str(tmp_path / "out.h5"))
@@ -167,7 +167,7 @@ def test_a_real_recording_survives_the_way_through_dsecs_layout(path, tmp_path):
         ("camera", "distortion", [1.0]),
     ],
 )
-def test_attributes_that_were_spoilt_are_named(group, name, value, tmp_path):
+def test_corrupt_attributes_are_refused_by_name(group, name, value, tmp_path):
     path = tmp_path / "out.h5"
     write_dsec(open_source(write_mvsec(tmp_path, LATE)), path)
     with h5py.File(path, "r+") as file:
@@ -176,7 +176,7 @@ def test_attributes_that_were_spoilt_are_named(group, name, value, tmp_path):
         open_source(str(path))
 
 
-def test_twists_that_run_backwards_are_told_by_their_row(tmp_path):
+def test_the_error_for_twists_that_run_backwards_names_the_row(tmp_path):
     write_dsec(open_source(write_mvsec(tmp_path, LATE, poses=make_poses(start_us=DAY_US))), tmp_path / "out.h5")
     with h5py.File(tmp_path / "out.h5", "r+") as file:
         file["twists/t"][3] = 0

@@ -1,4 +1,4 @@
-"""The Event Camera Dataset, as a folder and as the .zip that it comes as: lines of events and what lies beside."""
+"""The Event Camera Dataset, as a folder and as a .zip: lines of events and the other files of a recording."""
 
 import io
 import sys
@@ -91,7 +91,7 @@ def test_the_real_slider_has_poses_that_move_right():
     assert not poses.position_m[:, 1:].any()
 
 
-def test_events_alone_have_nothing_beside_them(tmp_path):
+def test_a_file_of_events_alone_has_no_other_streams(tmp_path):
     recording = open_source(put(tmp_path, "a.txt", ecd_text(EVENTS)))
     assert recording.streams == ("events",)
     assert recording.poses() is None
@@ -99,7 +99,7 @@ def test_events_alone_have_nothing_beside_them(tmp_path):
     assert not list(recording.frames())
 
 
-def test_comments_between_events_are_passed_over_and_lines_still_counted(tmp_path):
+def test_comments_between_events_are_skipped_but_counted_as_lines(tmp_path):
     text = b"# t x y p\n0.000001 1 2 1\n  # a remark\n0.000002 3 4 0\nno event\n"
     events, error = read_broken(open_source(put(tmp_path, "a.txt", text)))
     assert events.n == 2
@@ -122,7 +122,7 @@ def test_comments_between_events_are_passed_over_and_lines_still_counted(tmp_pat
         ("images/frame_1.png", png(9)[:40], "images.txt line 2"),
     ],
 )
-def test_what_is_broken_beside_the_events_is_named_and_the_events_are_not_touched(name, bad, where, tmp_path):
+def test_the_error_for_another_broken_file_names_the_line_and_the_events_stay_readable(name, bad, where, tmp_path):
     recording = open_source(put_zip(tmp_path, FILES | {name: bad}))
     with pytest.raises(BrokenRecording) as caught:
         _ = [list(recording.imu()), list(recording.frames()), recording.poses()]
@@ -130,27 +130,27 @@ def test_what_is_broken_beside_the_events_is_named_and_the_events_are_not_touche
     assert_same(read(recording), EVENTS)
 
 
-def test_a_garbled_zip_gives_what_is_whole_or_is_refused(tmp_path):
+def test_a_corrupt_zip_breaks_while_reading_or_is_refused(tmp_path):
     path = put_zip(tmp_path, FILES)
     data = bytearray(Path(path).read_bytes())
     data[200] ^= 0xFF  # within the packed events
     Path(path).write_bytes(data)
     _, error = read_broken(open_source(path))
     assert error is not None
-    for other, why in ((b"no zip", "it is no zip file"), (b"PK\5\6" + bytes(18), "no events.txt in it")):
+    for other, why in ((b"no zip", "zip file: "), (b"PK\5\6" + bytes(18), "no events.txt")):
         Path(path).write_bytes(other)
         with pytest.raises(UnknownSource, match=why):
             open_source(path)
 
 
-def test_images_without_pillow_say_what_to_install(tmp_path, monkeypatch):
+def test_the_error_without_pillow_says_how_to_install_it(tmp_path, monkeypatch):
     recording = open_source(put_zip(tmp_path, FILES))
     monkeypatch.setitem(sys.modules, "PIL", None)
     with pytest.raises(MissingExtra, match=r"pillow is not installed: pip install 'neurove\[recordings\]'"):
         next(recording.frames())
 
 
-def test_a_list_whose_images_were_left_out_is_no_stream(tmp_path):
+def test_a_list_without_its_images_is_not_a_stream(tmp_path):
     (tmp_path / "events.txt").write_bytes(b"0.1 1 2 1\n")
     (tmp_path / "images.txt").write_bytes(IMAGES)
     recording = open_source(str(tmp_path))
@@ -176,7 +176,7 @@ def test_a_list_whose_images_were_left_out_is_no_stream(tmp_path):
         ("0.0000005 1 2 1", "time runs backwards"),
     ],
 )
-def test_a_bad_line_ends_the_recording_with_its_number_and_its_text(bad, why, tmp_path):
+def test_an_invalid_line_ends_the_recording_with_its_number_and_its_text(bad, why, tmp_path):
     path = put(tmp_path, "a.txt", f"0.000001 1 2 1\n\n0.000002 3 4 0\r\n{bad}\n0.000004 1 2 1\n".encode())
     events, error = read_broken(open_source(path))
     assert_same(events, Events.from_columns([1, 2], [1, 3], [2, 4], [1, 0]))
@@ -187,7 +187,7 @@ def test_a_bad_line_ends_the_recording_with_its_number_and_its_text(bad, why, tm
     assert len(error.message) < len(path) + 200
 
 
-def test_of_several_bad_lines_the_first_is_told(tmp_path):
+def test_the_first_of_several_invalid_lines_is_reported(tmp_path):
     path = put(tmp_path, "a.txt", b"0.1 1 2 1\n0.2 999 2 1\n0.1 1 2 1\nno event\n")
     _, error = read_broken(open_source(path))
     assert error is not None
@@ -195,7 +195,7 @@ def test_of_several_bad_lines_the_first_is_told(tmp_path):
     assert "outside the sensor" in error.message
 
 
-def test_a_line_is_counted_over_all_blocks_of_a_large_file(tmp_path):
+def test_line_numbers_count_over_all_blocks_of_a_large_file(tmp_path):
     lines = ecd_text(make_events(300_000, seed=3)).splitlines()
     lines[250_000] = b"\xff\x00 no text"
     events, error = read_broken(open_source(put(tmp_path, "a.txt", b"\n".join(lines))))
@@ -205,7 +205,7 @@ def test_a_line_is_counted_over_all_blocks_of_a_large_file(tmp_path):
     assert repr("\\xff\x00 no text") in error.message
 
 
-def test_time_may_not_run_backwards_from_one_block_of_a_file_to_the_next_either(tmp_path):
+def test_time_must_not_run_backwards_between_blocks_of_a_file(tmp_path):
     block = ecd_text(make_events(150_000, seed=3, start_us=1000))
     block += b"\n" * (BLOCK_BYTES - len(block))
     events, error = read_broken(open_source(put(tmp_path, "a.txt", block + b"0.000999 1 2 1\n")))
@@ -215,35 +215,35 @@ def test_time_may_not_run_backwards_from_one_block_of_a_file_to_the_next_either(
     assert "time runs backwards: '0.000999 1 2 1'" in error.message
 
 
-def test_a_file_that_is_no_text_is_broken_at_its_first_line(tmp_path):
+def test_a_file_that_is_not_text_is_broken_at_its_first_line(tmp_path):
     events, error = read_broken(open_source(put(tmp_path, "a.txt", bytes(3 * BLOCK_BYTES))))
     assert events.n == 0
     assert error is not None
     assert error.details["where"] == "line 1"
 
 
-def test_times_in_seconds_become_the_nearest_us(tmp_path):
+def test_times_in_seconds_are_rounded_to_the_nearest_us(tmp_path):
     path = put(tmp_path, "a.txt", b"0.0000014 1 1 1\n0.0000016 1 1 1\n1.0e1 1 1 0\n1506117902.290381 1 1 0\n")
     assert read(open_source(path)).t.tolist() == [1, 2, 10_000_000, 1506117902290381]
 
 
 @pytest.mark.parametrize("empty", [b"", b"\n", b"\n \n\n"])
-def test_a_text_without_events_has_none(empty, tmp_path):
+def test_an_empty_text_has_no_events(empty, tmp_path):
     assert read(open_source(put(tmp_path, "a.txt", empty))).n == 0
 
 
 @pytest.mark.parametrize(
     "calib", ["", "1 2 3 4", "1 2 3 4 5 6 7 8 9 10", "-1 2 3 4 0 0 0 0 0", "1 2 3 4 0 0 0 0 nan", "a b c d e f g h i"]
 )
-def test_a_wrong_calibration_is_named_when_the_recording_is_opened(calib, tmp_path):
+def test_an_invalid_calibration_is_refused_at_open(calib, tmp_path):
     put(tmp_path, "events.txt", ecd_text(EVENTS))
     put(tmp_path, "calib.txt", calib.encode())
-    with pytest.raises(InvalidField, match=r"calib\.txt: calib=.* nine numbers") as caught:
+    with pytest.raises(InvalidField, match=r"calib\.txt: calib=.* expected nine numbers") as caught:
         open_source(str(tmp_path))
     assert str(tmp_path / "calib.txt") in caught.value.message
 
 
-def test_a_folder_is_called_by_its_own_name_and_given_a_sensor_takes_it(tmp_path):
+def test_a_folder_gives_the_recordings_name_and_a_given_sensor_overrides_the_default(tmp_path):
     put(tmp_path, "events.txt", ecd_text(EVENTS))
     put(tmp_path, "calib.txt", b"60 61 32 24 0 0 0 0 0\n")
     recording = open_source(str(tmp_path), SENSOR)

@@ -1,4 +1,4 @@
-"""eventVision-evbench: the real recordings, their one reliable truth, and what is refused."""
+"""eventVision-evbench: real recordings, their only reliable ground truth, and refused files."""
 
 import numpy as np
 import pytest
@@ -21,7 +21,7 @@ def put_mat(folder, name="seq_0002_e.mat", **columns) -> str:
 @pytest.mark.parametrize(
     ("name", "n", "duration_s", "w_x"), [("seq_0001_e", 132_784, 1.069, 0.142), ("seq_0002_e", 273_143, 2.140, -0.142)]
 )
-def test_a_real_recording_holds_its_known_events_and_its_flow_has_the_sign_of_its_truth(name, n, duration_s, w_x):
+def test_a_real_recording_has_its_known_events_and_its_flow_has_the_sign_of_its_truth(name, n, duration_s, w_x):
     recording = open_source(str(shared(f"evbench/{name}.mat")))
     assert recording.sensor == Sensor(240, 180)
     assert recording.streams == ("events", "twists")
@@ -33,12 +33,12 @@ def test_a_real_recording_holds_its_known_events_and_its_flow_has_the_sign_of_it
     assert twists.t.tolist() == [events.t[0], events.t[-1]]
     assert twists.twist[:, 3] == pytest.approx(w_x)
     assert np.isnan(np.delete(twists.twist, 3, axis=1)).all()
-    # a camera that turns about x, downwards axis y: what it sees moves along +y for a positive rate
+    # y points down: for a positive rate about x the image moves along +y
     assert np.sign(best_vertical_flow(events)) == np.sign(w_x)
 
 
 def best_vertical_flow(events: Events) -> float:
-    """The velocity in y [px/s] that sharpens the image of 0.3 s of these events most."""
+    """The velocity in y [px/s] that gives the sharpest image of 0.3 s of these events."""
     events = events.span(0, int(np.searchsorted(events.t, events.t[0] + 300_000)))
     hot = np.bincount(events.y.astype(int) * 240 + events.x, minlength=240 * 180) > 200
     seen = ~hot[events.y.astype(int) * 240 + events.x]
@@ -51,7 +51,7 @@ def best_vertical_flow(events: Events) -> float:
     return max(np.arange(-60.0, 61, 20), key=sharpness)
 
 
-def test_y_is_turned_over_and_truth_is_that_of_the_sequence(tmp_path):
+def test_y_is_flipped_and_the_truth_is_that_of_the_sequence(tmp_path):
     put(tmp_path, "ground-truth_3Dcam.txt", TRUTH)
     recording = open_source(put_mat(tmp_path))
     assert_same(read(recording), Events.from_columns([5, 6, 9], [1, 2, 3], [0, 179, 170], [1, 0, 1]))
@@ -61,7 +61,7 @@ def test_y_is_turned_over_and_truth_is_that_of_the_sequence(tmp_path):
     assert open_source(put_mat(tmp_path, "seq_0003_e.mat")).twists() is None
 
 
-def test_without_the_text_beside_it_there_is_no_truth(tmp_path):
+def test_a_folder_without_the_truth_file_has_no_twists(tmp_path):
     recording = open_source(put_mat(tmp_path))
     assert recording.streams == ("events",)
     assert recording.twists() is None
@@ -70,16 +70,16 @@ def test_without_the_text_beside_it_there_is_no_truth(tmp_path):
 @pytest.mark.parametrize(
     "bad", [{"x": [1, 2, 240]}, {"y": [0, 0, 180]}, {"y": [0, 0, -1]}, {"pol": [1, 1, 2]}, {"ts": [5, 6, 5]}]
 )
-def test_what_comes_before_a_bad_event_is_whole(bad, tmp_path):
+def test_events_before_an_invalid_one_are_read(bad, tmp_path):
     events, error = read_broken(open_source(put_mat(tmp_path, **bad)))
     assert events.n == 2
     assert error is not None
     assert error.details["where"] == "event 2"
 
 
-def test_what_is_no_such_file_is_refused(tmp_path):
-    with pytest.raises(UnknownSource, match="has not the columns ts, x, y, pol"):
+def test_another_file_is_refused(tmp_path):
+    with pytest.raises(UnknownSource, match="does not have the columns ts, x, y, pol"):
         open_source(put_mat(tmp_path, x=[1, 2]))
-    for data in (b"", b"no MATLAB file at all" * 20):
-        with pytest.raises(UnknownSource, match="can not be read as a MATLAB 5 file"):
+    for data in (b"", b"not a MATLAB file" * 20):
+        with pytest.raises(UnknownSource, match="cannot be read as a MATLAB 5 file"):
             open_source(put(tmp_path, "a.mat", data))

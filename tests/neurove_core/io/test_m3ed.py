@@ -1,4 +1,4 @@
-"""M3ED: its calibration, IMU and truth."""
+"""M3ED: calibration, IMU and ground truth."""
 
 import h5py
 import numpy as np
@@ -13,7 +13,7 @@ from tests.datasets import DAY_US, EVENTS, LATE, make_imu, make_poses, matrices,
 from tests.recordings import all_samples, assert_same
 
 
-def test_m3ed_gives_its_lens_imu_and_truth_in_the_cameras_frame(tmp_path):
+def test_m3ed_gives_its_lens_and_the_imu_and_truth_in_the_cameras_frame(tmp_path):
     poses, imu = make_poses(), make_imu()
     mount = rigid((0.3, -1.2, 0.5), (0.1, 0.2, 0.3))
     recording = open_source(write_m3ed(tmp_path, EVENTS, imu=imu, poses=poses, mounts={"imu": mount}))
@@ -32,7 +32,7 @@ def test_m3ed_gives_its_lens_imu_and_truth_in_the_cameras_frame(tmp_path):
     assert open_source(write_m3ed(tmp_path, EVENTS), Sensor(100, 100)).camera("cam0") is None
 
 
-def test_m3eds_matrices_are_the_inverse_of_mvsecs_and_one_motion_gives_one_truth(tmp_path):
+def test_the_same_motion_gives_the_same_truth_in_m3ed_and_mvsec(tmp_path):
     poses = make_poses(start_us=DAY_US)
     one = open_source(write_mvsec(tmp_path, LATE, poses=poses)).twists()
     other = open_source(write_m3ed(tmp_path, EVENTS, poses=poses)).twists()
@@ -41,7 +41,7 @@ def test_m3eds_matrices_are_the_inverse_of_mvsecs_and_one_motion_gives_one_truth
     np.testing.assert_allclose(one.twist, other.twist, atol=1e-9)
 
 
-def test_the_right_camera_of_m3ed_is_where_its_calibration_says(tmp_path):
+def test_the_calibration_places_the_right_camera_of_m3ed(tmp_path):
     poses, imu = make_poses(), make_imu()
     mounts = {"imu": rigid((0.3, -1.2, 0.5), (0, 0, 0)), "right": rigid((0.01, 0.02, 0.03), (0.12, 0, 0))}
     path = write_m3ed(tmp_path, EVENTS, right=EVENTS, imu=imu, poses=poses, mounts=mounts)
@@ -53,18 +53,18 @@ def test_the_right_camera_of_m3ed_is_where_its_calibration_says(tmp_path):
     np.testing.assert_allclose(all_samples(recording).gyro_rad_s, imu.gyro_rad_s @ turn.T, atol=1e-12)
 
 
-def test_samples_that_m3eds_imu_never_took_are_left_out(tmp_path):
+def test_samples_that_the_imu_of_m3ed_never_took_are_left_out(tmp_path):
     imu = make_imu()
-    holes = imu._replace(t=imu.t.copy(), accel_m_s2=imu.accel_m_s2.copy(), gyro_rad_s=imu.gyro_rad_s.copy())
-    for row in (0, 7, 8):  # as its writer leaves them: nan, and in the times what a cast makes of nan
-        holes.t[row], holes.accel_m_s2[row], holes.gyro_rad_s[row] = np.iinfo(np.int64).min, np.nan, np.nan
-    got = all_samples(open_source(write_m3ed(tmp_path, EVENTS, imu=holes)))
+    gaps = imu._replace(t=imu.t.copy(), accel_m_s2=imu.accel_m_s2.copy(), gyro_rad_s=imu.gyro_rad_s.copy())
+    for row in (0, 7, 8):  # as M3ED's writer leaves them: nan, and in the times the cast of nan
+        gaps.t[row], gaps.accel_m_s2[row], gaps.gyro_rad_s[row] = np.iinfo(np.int64).min, np.nan, np.nan
+    got = all_samples(open_source(write_m3ed(tmp_path, EVENTS, imu=gaps)))
     keep = np.setdiff1d(np.arange(imu.t.size), [0, 7, 8])
     np.testing.assert_array_equal(got.t, imu.t[keep])
     np.testing.assert_array_equal(got.gyro_rad_s, imu.gyro_rad_s[keep])
 
 
-def test_m3ed_without_calibration_is_1280x720_and_has_no_imu_in_a_frame_that_is_known(tmp_path):
+def test_m3ed_without_calibration_is_1280x720_and_gives_neither_imu_nor_poses(tmp_path):
     path = write_m3ed(tmp_path, EVENTS, imu=make_imu(), poses=make_poses())
     with h5py.File(path, "r+") as file:
         del file["prophesee/left/calib"]
@@ -90,7 +90,7 @@ def test_m3ed_without_calibration_is_1280x720_and_has_no_imu_in_a_frame_that_is_
         ("distortion_coeffs", "none", "fx fy cx cy"),
     ],
 )
-def test_a_calibration_that_is_none_is_named_when_the_file_is_opened(name, value, why, tmp_path):
+def test_an_invalid_calibration_is_refused_at_open(name, value, why, tmp_path):
     path = write_m3ed(tmp_path, EVENTS)
     with h5py.File(path, "r+") as file:
         del file[f"prophesee/left/calib/{name}"]
@@ -100,10 +100,10 @@ def test_a_calibration_that_is_none_is_named_when_the_file_is_opened(name, value
 
 
 @pytest.mark.parametrize("mount", [np.ones((4, 4)), np.full((4, 4), np.nan), np.eye(3), "none"])
-def test_a_mount_that_is_no_rigid_motion_is_named(mount, tmp_path):
+def test_a_mount_that_is_not_a_rigid_transform_is_refused_by_name(mount, tmp_path):
     path = write_m3ed(tmp_path, EVENTS)
     with h5py.File(path, "r+") as file:
         del file["prophesee/left/calib/T_to_prophesee_left"]
         file["prophesee/left/calib/T_to_prophesee_left"] = mount
-    with pytest.raises(BrokenRecording, match="T_to_prophesee_left: a rigid motion"):
+    with pytest.raises(BrokenRecording, match="T_to_prophesee_left: expected a rigid transform"):
         open_source(path)

@@ -1,4 +1,4 @@
-"""MVSEC: its events, images, IMU and truth, in the frame of its cameras."""
+"""MVSEC: events, images, IMU and ground truth in the frames of the cameras."""
 
 import itertools
 from pathlib import Path
@@ -16,7 +16,7 @@ from neurove_core.sources import open_source
 from neurove_protocol import Sensor
 from neurove_protocol.errors import InvalidField
 from tests.builders import SENSOR
-from tests.datasets import CHUNK, DAY_US, LATE, make_imu, make_poses, matrices, own_file, spoil, write_mvsec
+from tests.datasets import CHUNK, DAY_US, LATE, corrupt_chunk, make_imu, make_poses, matrices, own_file, write_mvsec
 from tests.recordings import all_samples, shared
 
 
@@ -39,7 +39,7 @@ def test_mvsec_gives_events_images_imu_and_truth(tmp_path):
     np.testing.assert_allclose(truth.twist, want.twist, atol=1e-9)
 
 
-def test_mvsecs_imu_is_turned_into_the_cameras_frame(tmp_path):
+def test_mvsecs_imu_is_rotated_to_the_cameras_frame(tmp_path):
     imu = make_imu(start_us=DAY_US)
     got = all_samples(open_source(write_mvsec(tmp_path, LATE, imu=imu)))
     turn = np.array(mvsec.CAMERA_FROM_IMU["davis/left"])
@@ -49,19 +49,19 @@ def test_mvsecs_imu_is_turned_into_the_cameras_frame(tmp_path):
     assert np.abs(got.gyro_rad_s - imu.gyro_rad_s).max() > 0.01
 
 
-def test_mvsecs_constants_are_those_of_its_calibration():
+def test_mvsecs_constants_match_its_calibration_file():
     text = shared("mvsec/camchain-imucam-indoor_flying.yaml").read_text()
     numbers = {word.strip(",[] \n") for word in text.replace("[", " ").replace("]", " ").split()}
-    told = [value for lens in mvsec.LENS_INDOOR_FLYING.values() for value in lens.distortion]
-    told += [getattr(lens, f) for lens in mvsec.LENS_INDOOR_FLYING.values() for f in ("fx", "fy", "cx", "cy")]
-    told += [value for rows in mvsec.CAMERA_FROM_IMU.values() for row in rows for value in row]
-    told += list(itertools.chain(*mvsec.RIGHT_FROM_LEFT))
-    assert [value for value in told if str(value) not in numbers] == []
+    values = [value for lens in mvsec.LENS_INDOOR_FLYING.values() for value in lens.distortion]
+    values += [getattr(lens, f) for lens in mvsec.LENS_INDOOR_FLYING.values() for f in ("fx", "fy", "cx", "cy")]
+    values += [value for rows in mvsec.CAMERA_FROM_IMU.values() for row in rows for value in row]
+    values += list(itertools.chain(*mvsec.RIGHT_FROM_LEFT))
+    assert [value for value in values if str(value) not in numbers] == []
     for turn in mvsec.CAMERA_FROM_IMU.values():
         np.testing.assert_allclose(np.array(turn) @ np.array(turn).T, np.eye(3), atol=1e-8)
 
 
-def test_mvsecs_lens_is_equidistant_and_that_of_its_sequence(tmp_path):
+def test_mvsecs_lens_is_equidistant_and_depends_on_the_sequence(tmp_path):
     indoor = open_source(write_mvsec(tmp_path, LATE)).camera("cam0")
     outdoor = open_source(write_mvsec(tmp_path, LATE, name="outdoor_day2")).camera("cam0")
     assert indoor is not None
@@ -71,7 +71,7 @@ def test_mvsecs_lens_is_equidistant_and_that_of_its_sequence(tmp_path):
     assert open_source(write_mvsec(tmp_path, LATE), SENSOR).camera("cam0") is None
 
 
-def test_the_right_camera_of_mvsec_stands_ten_centimetres_to_the_right_and_turns_as_the_left(tmp_path):
+def test_the_right_camera_of_mvsec_is_ten_centimetres_to_the_right_and_rotates_with_the_left(tmp_path):
     poses = make_poses(start_us=DAY_US)
     path = write_mvsec(tmp_path, LATE, right=LATE, poses=poses, imu=make_imu(start_us=DAY_US))
     left, right = open_source(path).poses(), open_source(path, topic="davis/right").poses()
@@ -86,7 +86,7 @@ def test_the_right_camera_of_mvsec_stands_ten_centimetres_to_the_right_and_turns
     np.testing.assert_allclose(np.linalg.norm(one.gyro_rad_s, axis=1), np.linalg.norm(other.gyro_rad_s, axis=1))
 
 
-def test_mvsec_without_truth_has_none(tmp_path):
+def test_mvsec_without_a_truth_file_has_no_poses(tmp_path):
     recording = open_source(write_mvsec(tmp_path, LATE))
     assert recording.streams == ("events",)
     assert recording.poses() is None
@@ -95,7 +95,7 @@ def test_mvsec_without_truth_has_none(tmp_path):
 
 
 @pytest.mark.parametrize(("row", "value"), [(7, np.nan), (7, np.inf), (7, 1.0)])
-def test_a_bad_imu_sample_ends_the_stream_at_its_row(row, value, tmp_path):
+def test_an_invalid_imu_sample_ends_the_stream_at_its_row(row, value, tmp_path):
     imu = make_imu(start_us=DAY_US)
     path = write_mvsec(tmp_path, LATE, imu=imu)
     with h5py.File(path, "r+") as file:
@@ -106,13 +106,13 @@ def test_a_bad_imu_sample_ends_the_stream_at_its_row(row, value, tmp_path):
         next(blocks)
 
 
-def test_images_of_another_kind_are_refused(tmp_path):
+def test_images_of_another_type_are_refused(tmp_path):
     path = write_mvsec(tmp_path, LATE, images=np.zeros((2, 260, 346)))  # type: ignore[arg-type]  # on purpose
-    with pytest.raises(BrokenRecording, match="images of uint8 are expected, not float64"):
+    with pytest.raises(BrokenRecording, match="expected images of uint8, not float64"):
         list(open_source(path).frames())
 
 
-def test_an_imu_that_can_not_be_read_on_ends_there(tmp_path):
+def test_an_unreadable_imu_chunk_ends_the_stream_at_its_first_row(tmp_path):
     path = Path(own_file(tmp_path))
     with h5py.File(path, "r+") as file:
         imu = make_imu(250, start_us=DAY_US)
@@ -120,14 +120,14 @@ def test_an_imu_that_can_not_be_read_on_ends_there(tmp_path):
             chunks = (CHUNK, *rows.shape[1:])
             file.create_dataset(f"imu/{name}", data=rows, chunks=chunks, compression=hdf5plugin.Zstd())
     with h5py.File(path) as file:
-        spoil(path, file["imu/gyro"], 1)
+        corrupt_chunk(path, file["imu/gyro"], 1)
     blocks = open_source(str(path)).imu()
     assert next(blocks).t.tolist() == imu.t[:CHUNK].tolist()
     with pytest.raises(BrokenRecording, match=f"row {CHUNK} of imu"):
         next(blocks)
 
 
-def test_images_out_of_order_are_told_by_their_row(tmp_path):
+def test_the_error_for_images_out_of_order_names_the_row(tmp_path):
     path = write_mvsec(tmp_path, LATE, images=np.zeros((4, 260, 346), np.uint8))
     with h5py.File(path, "r+") as file:
         file["davis/left/image_raw_ts"][2] = 1.0
@@ -135,7 +135,7 @@ def test_images_out_of_order_are_told_by_their_row(tmp_path):
         list(open_source(path).frames())
 
 
-def test_a_truth_that_is_no_rigid_motion_is_told_by_its_row(tmp_path):
+def test_the_error_for_a_truth_that_is_not_a_rigid_transform_names_the_row(tmp_path):
     path = write_mvsec(tmp_path, LATE, poses=make_poses(start_us=DAY_US))
     with h5py.File(tmp_path / "indoor_flying1_gt.hdf5", "r+") as file:
         file["davis/left/odometry"][5, 0, 0] = 3.0

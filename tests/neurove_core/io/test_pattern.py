@@ -20,7 +20,7 @@ def seconds(recording: Recording, duration_s: float) -> Events:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_pattern_is_the_same_for_a_seed_ordered_on_the_sensor_and_of_a_usual_rate(seed):
+def test_the_pattern_repeats_for_a_seed_and_gives_valid_events_at_a_typical_rate(seed):
     recording = open_source(f"pattern://?seed={seed}")
     assert recording.endless
     events = seconds(recording, 1.0)
@@ -34,8 +34,8 @@ def test_the_pattern_is_the_same_for_a_seed_ordered_on_the_sensor_and_of_a_usual
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_pattern_moves_as_it_says(seed):
-    """Events moved back along its path make a sharper image than where they were seen, or moved the other way."""
+def test_the_pattern_moves_along_its_stated_path(seed):
+    """Events shifted back along the path give a sharper image than unshifted events or the opposite shift."""
     events = seconds(open_source(f"pattern://?seed={seed}"), 0.2)
     path = np.array([shift_px(t) for t in events.t.tolist()])
 
@@ -62,7 +62,7 @@ def test_the_pattern_has_the_lens_of_half_a_davis346():
     assert camera.fx == camera.fy == pytest.approx(113.19)
 
 
-def test_the_pattern_fills_another_sensor_too():
+def test_the_pattern_supports_another_sensor():
     recording = open_source("pattern://?seed=1", Sensor(64, 48))
     check_events(seconds(recording, 0.1), Sensor(64, 48), 0)
     camera = recording.camera("cam0")
@@ -71,6 +71,6 @@ def test_the_pattern_fills_another_sensor_too():
 
 
 @pytest.mark.parametrize("seed", ["", "-1", "x", "1.5", "99999999999999999999"])
-def test_a_seed_is_a_whole_number(seed):
+def test_a_seed_that_is_not_a_whole_number_is_refused(seed):
     with pytest.raises(InvalidField, match="seed="):
         open_source(f"pattern://?seed={seed}")

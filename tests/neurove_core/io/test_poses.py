@@ -1,4 +1,4 @@
-"""Files of poses: what real ones hold, in which unit their times are, and what is said of bad ones."""
+"""Pose files: the content of real files, the unit of their times, and the errors for invalid ones."""
 
 import sys
 from pathlib import Path
@@ -39,7 +39,7 @@ def put(folder: Path, text: str, name: str = "poses.txt") -> Path:
         ("mvsec/outdoor_day2_odom.h5", 12_200, 1_506_119_819_827_594, 1_506_120_429_953_007),
     ],
 )
-def test_a_real_file_holds_its_known_poses(path, n, first_us, last_us):
+def test_a_real_file_has_its_known_poses(path, n, first_us, last_us):
     got = read_poses(shared(path))
     assert (got.t.size, got.t[0], got.t[-1]) == (n, first_us, last_us)
     assert (np.diff(got.t) > 0).all()
@@ -86,14 +86,14 @@ def test_times_are_seconds_or_whole_nanoseconds_by_rule(times, separator, want_u
     assert got.orientation.tolist() == [[0, 0, 0, 1]] * 2
 
 
-def test_comments_blank_lines_and_line_ends_are_passed_over(tmp_path):
+def test_comments_blank_lines_and_line_ends_are_skipped(tmp_path):
     text = f"\ufeff# t x y z qx qy qz qw\r\n\r\n  1.0 1 2 3 {LINE}\r\n# between\n2.0 4 5 6 {LINE} # after\n\n"
     got = read_poses(put(tmp_path, text))
     assert got.t.tolist() == [1_000_000, 2_000_000]
     assert got.position_m.tolist() == [[1, 2, 3], [4, 5, 6]]
 
 
-def test_a_quaternion_that_is_nearly_of_length_one_is_made_so(tmp_path):
+def test_a_quaternion_of_nearly_length_one_is_normalised(tmp_path):
     got = read_poses(put(tmp_path, "1 0 0 0 0 0 0 1.009\n2 0 0 0 0.502 -0.502 0.502 -0.502"))
     np.testing.assert_allclose(got.orientation, [[0, 0, 0, 1], [0.5, -0.5, 0.5, -0.5]], atol=1e-15)
 
@@ -101,30 +101,30 @@ def test_a_quaternion_that_is_nearly_of_length_one_is_made_so(tmp_path):
 @pytest.mark.parametrize(
     ("bad", "why"),
     [
-        ("0.5 0 0 0 0 0 0 1", r"t=500000: must be later \[us\] than the one before, 1000000"),
-        ("1.0 0 0 0 0 0 0 1", r"t=1000000: must be later \[us\] than the one before, 1000000"),
+        ("0.5 0 0 0 0 0 0 1", r"t=500000: must be later \[us\] than .*, 1000000"),
+        ("1.0 0 0 0 0 0 0 1", r"t=1000000: must be later \[us\] than .*, 1000000"),
         ("1.0000002 0 0 0 0 0 0 1", r"t=1000000: must be later"),
         ("2.0 0 0 0 0 0 0 1.02", r"\|quaternion\|=1.02: must be 1 to within 0.01"),
         ("2.0 0 0 0 0 0 0 0", r"\|quaternion\|=0.0: must be 1"),
-        ("2.0 0 nan 0 0 0 0 1", r"position_m=\[0.0, nan, 0.0\]: finite"),
-        ("2.0 0 0 inf 0 0 0 1", "position_m=.*: finite"),
-        ("2.0 0 0 0 0 0 nan 1", "quaternion=.*: finite"),
-        ("nan 0 0 0 0 0 0 1", "t=nan: a finite time"),
-        ("1e300 0 0 0 0 0 0 1", "t=.*: a finite time"),
-        ("2.0 0 0 0 0 0 1", "columns=7: 8 columns are expected: t x y z qx qy qz qw"),
-        ("2.0 0 0 0 0 0 0 1 1", "columns=9: 8 columns"),
-        ("2.0 0 zero 0 0 0 0 1", "y='zero': a number"),
-        ("2.0,0,0,0,0,0,0,1", "columns=1: 8 columns"),
+        ("2.0 0 nan 0 0 0 0 1", r"position_m=\[0.0, nan, 0.0\]: .*finite"),
+        ("2.0 0 0 inf 0 0 0 1", "position_m=.*: .*finite"),
+        ("2.0 0 0 0 0 0 nan 1", "quaternion=.*: .*finite"),
+        ("nan 0 0 0 0 0 0 1", "t=nan: .*finite time"),
+        ("1e300 0 0 0 0 0 0 1", "t=.*: .*finite time"),
+        ("2.0 0 0 0 0 0 1", "columns=7: expected 8 columns: t x y z qx qy qz qw"),
+        ("2.0 0 0 0 0 0 0 1 1", "columns=9: expected 8 columns"),
+        ("2.0 0 zero 0 0 0 0 1", "y='zero': expected a number"),
+        ("2.0,0,0,0,0,0,0,1", "columns=1: expected 8 columns"),
     ],
 )
-def test_a_bad_pose_is_told_with_its_line_field_value_and_bound(bad, why, tmp_path):
+def test_the_error_for_an_invalid_pose_gives_its_line_field_value_and_bound(bad, why, tmp_path):
     path = put(tmp_path, f"# header\n1.0 0 0 0 0 0 0 1\n\n{bad}\n9.0 0 0 0 0 0 0 1\n")
     with pytest.raises(InvalidField, match=why) as caught:
         read_poses(path)
     assert caught.value.message.startswith(f"{path}: line 4: ")
 
 
-def test_of_several_bad_poses_the_first_is_told(tmp_path):
+def test_the_first_of_several_invalid_poses_is_reported(tmp_path):
     path = put(tmp_path, "1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 5\n1 0 0 0 0 0 0 1\n3 nan 0 0 0 0 0 1\n")
     with pytest.raises(InvalidField, match="line 2: "):
         read_poses(path)
@@ -132,41 +132,39 @@ def test_of_several_bad_poses_the_first_is_told(tmp_path):
 
 @pytest.mark.parametrize("text", ["", "\n\n", "# only a comment\n"])
 def test_a_file_without_poses_is_refused(text, tmp_path):
-    with pytest.raises(InvalidField, match="poses=0: at least one line"):
+    with pytest.raises(InvalidField, match="poses=0: expected at least one line"):
         read_poses(put(tmp_path, text))
 
 
-def test_lines_are_counted_over_all_blocks_of_a_long_file(tmp_path):
+def test_line_numbers_count_over_all_blocks_of_a_long_file(tmp_path):
     lines = [f"{i}.5 0 0 0 0 0 0 1" for i in range(45_000)]
     assert read_poses(put(tmp_path, "\n".join(lines))).t.size == 45_000
     lines[41_234] = "7.0 0 0 0 0 0 0 1"
-    with pytest.raises(
-        InvalidField, match=r"line 41235: t=7000000: must be later \[us\] than the one before, 41233500"
-    ):
+    with pytest.raises(InvalidField, match=r"line 41235: t=7000000: must be later \[us\] than .*, 41233500"):
         read_poses(put(tmp_path, "\n".join(lines)))
 
 
-def test_a_unit_does_not_depend_on_where_a_long_file_is_cut(tmp_path):
-    """Whole seconds in all lines but the last: not nanoseconds."""
+def test_the_unit_of_times_does_not_depend_on_the_blocks_of_a_long_file(tmp_path):
+    """All lines but the last have whole seconds, which must not be read as nanoseconds."""
     lines = [f"{i},0,0,0,0,0,0,1" for i in range(30_000)] + ["30000.5,0,0,0,0,0,0,1"]
     assert read_poses(put(tmp_path, "\n".join(lines))).t[-1] == 30_000_500_000
 
 
-def test_more_poses_than_fit_are_refused(tmp_path, monkeypatch):
+def test_too_many_poses_are_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(pose_files, "MAX_POSES", 10)
     with pytest.raises(InvalidField, match="at most 10"):
         read_poses(put(tmp_path, "".join(f"{i} 0 0 0 0 0 0 1\n" for i in range(11))))
 
 
 @pytest.mark.parametrize("data", [bytes(200_000), b"\xff\xfe garbage", b"1 2 3 4 5 6 7 1_0\n"])
-def test_what_is_no_text_of_poses_is_refused(data, tmp_path):
+def test_a_file_that_is_not_a_text_of_poses_is_refused(data, tmp_path):
     (tmp_path / "a.txt").write_bytes(data)
     with pytest.raises(InvalidField, match="line"):
         read_poses(tmp_path / "a.txt")
 
 
 @pytest.mark.parametrize("name", ["missing.txt", "missing.h5", "."])
-def test_a_missing_file_or_a_folder_is_told(name, tmp_path):
+def test_a_missing_file_or_a_folder_is_refused(name, tmp_path):
     with pytest.raises(UnknownSource):
         read_poses(tmp_path / name)
 
@@ -175,7 +173,7 @@ def test_a_missing_file_or_a_folder_is_told(name, tmp_path):
 
 
 @pytest.mark.parametrize("layout", ["odometry", "mvsec", "m3ed"])
-def test_each_layout_of_hdf5_gives_the_same_path_of_the_camera(layout, tmp_path):
+def test_each_hdf5_layout_gives_the_same_trajectory(layout, tmp_path):
     want, events = make_poses(start_us=1_506_117_902_290_381), make_events(10)
     if layout == "odometry":
         path = tmp_path / "odom.h5"
@@ -196,12 +194,12 @@ def test_each_layout_of_hdf5_gives_the_same_path_of_the_camera(layout, tmp_path)
     ("name", "row", "value", "why"),
     [
         ("ts", 3, 0.0, "row 3: t=0: must be later"),
-        ("ts", 3, np.nan, "row 3: t=nan: a finite time"),
+        ("ts", 3, np.nan, "row 3: t=nan: .*finite time"),
         ("poss", 4, np.inf, "row 4: position_m="),
         ("rots", 5, 2.0, r"row 5: \|quaternion\|=4"),
     ],
 )
-def test_a_bad_row_is_told_with_its_number(name, row, value, why, tmp_path):
+def test_the_error_for_an_invalid_row_gives_its_number(name, row, value, why, tmp_path):
     want = make_poses(start_us=5_000_000)
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["ts"], file["poss"], file["rots"] = want.t / 1e6, want.position_m, want.orientation
@@ -210,7 +208,7 @@ def test_a_bad_row_is_told_with_its_number(name, row, value, why, tmp_path):
         read_poses(tmp_path / "a.h5")
 
 
-def test_a_matrix_that_mirrors_or_moves_the_plane_at_infinity_is_no_pose(tmp_path):
+def test_a_matrix_that_is_not_a_rigid_transform_is_not_a_pose(tmp_path):
     for index, value in (((4, 0), [-1.0, 0, 0, 0]), ((4, 3), [0.5, 0, 0, 1]), ((4, 1, 1), np.nan)):
         with h5py.File(tmp_path / "a.h5", "w") as file:
             file["Cn_T_C0"], file["ts"] = np.tile(np.eye(4), (9, 1, 1)), np.arange(9) * 10
@@ -219,7 +217,7 @@ def test_a_matrix_that_mirrors_or_moves_the_plane_at_infinity_is_no_pose(tmp_pat
             read_poses(tmp_path / "a.h5")
 
 
-def test_hdf5_without_poses_of_unequal_length_empty_or_cut_is_told(tmp_path):
+def test_hdf5_with_missing_unequal_truncated_or_empty_poses_is_refused(tmp_path):
     path = tmp_path / "a.h5"
     with h5py.File(path, "w") as file:
         file["ts"] = np.arange(5.0)
@@ -227,14 +225,14 @@ def test_hdf5_without_poses_of_unequal_length_empty_or_cut_is_told(tmp_path):
         read_poses(path)
     with h5py.File(path, "a") as file:
         file["poss"], file["rots"] = np.zeros((4, 3)), np.zeros((5, 4))
-    with pytest.raises(BrokenRecording, match=r"row 4 of ts: its columns are of unequal length: \[5, 4, 5\]"):
+    with pytest.raises(BrokenRecording, match=r"row 4 of ts: its columns have unequal lengths: \[5, 4, 5\]"):
         read_poses(path)
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(BrokenRecording, match="the file ends here"):
         read_poses(path)
     with h5py.File(path, "w") as file:
         file["ts"], file["poss"], file["rots"] = np.zeros(0), np.zeros((0, 3)), np.zeros((0, 4))
-    with pytest.raises(InvalidField, match="poses=0: at least one pose"):
+    with pytest.raises(InvalidField, match="poses=0: .*at least one pose"):
         read_poses(path)
 
 

@@ -1,4 +1,4 @@
-"""Which data set an HDF5 file of events is of: MVSEC, DSEC or M3ED."""
+"""Detection of the data set of an HDF5 file with events: MVSEC, DSEC or M3ED."""
 
 from pathlib import Path
 
@@ -22,17 +22,17 @@ _TRUTH = ("davis/left/odometry", "Cn_T_C0", "poss")
 
 
 def open_hdf5(path: Path, sensor: Sensor | None = None, topic: str | None = None) -> Recording:
-    """The recording in an HDF5 file, whose groups tell its layout.
+    """Open the recording in an HDF5 file. The names of its groups identify the layout.
 
     Args:
         path: the .h5 or .hdf5 file.
-        sensor: the pixel array; overrides what the file says, or the data set's.
-        topic: which event stream, of those that have several.
+        sensor: the pixel array; overrides that of the file or of the data set.
+        topic: the event stream to read, where the file has several.
 
     Raises:
-        UnknownSource: it has none of the layouts, or not this topic.
-        BrokenRecording: it is cut or garbled. MissingExtra: h5py or hdf5plugin is not installed.
-        InvalidField: its calibration is not what it must be.
+        UnknownSource: the file has none of the layouts, or lacks this topic.
+        BrokenRecording: the file is truncated or corrupt. MissingExtra: h5py or hdf5plugin is not installed.
+        InvalidField: its calibration is invalid.
     """
     with opened(path) as file:
         mvsec = any(has(file, f"{name}/events") for name in MVSEC_TOPICS)

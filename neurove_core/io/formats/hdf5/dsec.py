@@ -1,13 +1,13 @@
-"""DSEC's events.h5 (Gehrig 2021): a reader, and a writer for any recording.
+"""Reader of DSEC's events.h5 (Gehrig 2021). `dsec_write.py` writes any recording in this layout.
 
 Layout: `events` with `p`, `x`, `y`, `t` [us], `ms_to_idx` (the first event at or after each millisecond of t) and
-`t_offset` [us], to be added to t; it may be missing. The pixel array is not in the file: DSEC's is 640x480. Other data
-sets use the layout too (TUM-VIE, at 1280x720).
+`t_offset` [us], which is added to t and may be missing. The file does not hold the sensor size: DSEC's is 640x480.
+Other data sets use the layout too (TUM-VIE, at 1280x720).
 
-What `write_dsec` adds, and other readers of DSEC pass over: the attributes `width` and `height` [px] of `events`; and
-where the source has them, `imu` (`t`, `accel` (N, 3) [m/s2], `gyro` (N, 3) [rad/s]), `poses` (`t`, `position` (N, 3)
-[m], `orientation` (N, 4) x y z w), `twists` (`t`, `twist` (N, 6) [m/s, rad/s]) and `camera` (the lens, as attributes).
-All of their `t` [us] are of the sensor's clock: t_offset is in them already.
+`write_dsec` adds the following, which other readers of DSEC ignore: the attributes `width` and `height` [px] of
+`events`; and, where the source has them, `imu` (`t`, `accel` (N, 3) [m/s2], `gyro` (N, 3) [rad/s]), `poses` (`t`,
+`position` (N, 3) [m], `orientation` (N, 4) x y z w), `twists` (`t`, `twist` (N, 6) [m/s, rad/s]) and `camera` (the
+lens, as attributes). All of these `t` [us] are on the sensor's clock: they already include t_offset.
 
 Sources: https://dsec.ifi.uzh.ch/data-format, and uzh-rpg/DSEC, scripts/utils/eventslicer.py.
 """
@@ -29,7 +29,7 @@ from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
 
 DSEC_SENSOR: Final = Sensor(640, 480)
-"""The Prophesee Gen3.1 of the data set."""
+"""The Prophesee Gen3.1 that recorded the data set."""
 
 LENS_FIELDS: Final = ("width", "height", "lens", "fx", "fy", "cx", "cy", "distortion", "height_m")
 """Attributes of the group `camera`."""
@@ -39,22 +39,22 @@ _MAX_OFFSET_US: Final = 1 << 60
 
 @dataclass(frozen=True, slots=True)
 class DsecRecording(TableRecording):
-    """An events.h5, or what `write_dsec` wrote; see `Recording`."""
+    """An events.h5 of DSEC, or a file of `write_dsec`; see `Recording`."""
 
     offset_us: int = 0
     lens: CameraInfo | None = None
-    assumed: bool = False  # nobody told the sensor
+    assumed: bool = False  # neither the file nor the caller gives the sensor
 
     @classmethod
     def open(cls, path: Path, sensor: Sensor | None = None) -> Self:
-        """The recording in this file.
+        """Open the recording in this file.
 
         Args:
             path: the .h5 file.
-            sensor: its pixel array; by default the file's, or DSEC's where it does not say.
+            sensor: its pixel array; by default that of the file, or DSEC's if the file does not give it.
 
         Raises:
-            BrokenRecording: it is cut or garbled. MissingExtra: h5py is not installed.
+            BrokenRecording: the file is truncated or corrupt. MissingExtra: h5py is not installed.
         """
         with opened(path) as file:
             offset_us = _offset_us(path, file)
@@ -66,12 +66,12 @@ class DsecRecording(TableRecording):
         try:
             sensor = sensor or (Sensor(int(stored["width"]), int(stored["height"])) if "width" in stored else None)
         except (KeyError, TypeError, ValueError, OverflowError, InvalidField) as error:
-            raise BrokenRecording(path, "attributes of events", f"they are no sensor: {error}") from None
+            raise BrokenRecording(path, "attributes of events", f"they are not a valid sensor: {error}") from None
         which, assumed = sensor or DSEC_SENSOR, sensor is None
         return cls(path, path.name, which, "events", tuple(held), offset_us=offset_us, lens=lens, assumed=assumed)
 
     def camera(self, stream: str) -> CameraInfo | None:
-        """The lens that `write_dsec` stored; None in DSEC's own files, whose calibration is not in them."""
+        """The lens that `write_dsec` stored, or None: DSEC's own files do not hold a calibration."""
         if self.lens is None or self.lens.sensor != self.sensor:
             return None
         return CameraInfo(**(self.lens.model_dump() | {"stream": stream}))
@@ -79,11 +79,11 @@ class DsecRecording(TableRecording):
     def event_table(self, file: Any) -> EventTable:
         """The columns t, x, y, p."""
         columns = tuple(dataset(self.path, file, f"events/{name}") for name in "txyp")
-        note = ", which is DSEC's, for the file does not tell its own: give --sensor WIDTHxHEIGHT"
-        return EventTable("events", columns, _as_they_are, self.offset_us, note if self.assumed else "")
+        note = ", which is DSEC's, because the file does not give its own: give --sensor WIDTHxHEIGHT"
+        return EventTable("events", columns, _unchanged, self.offset_us, note if self.assumed else "")
 
     def since(self, t_us: int) -> Iterator[Events]:
-        """As `chunks`, from this time on, by the file's index of milliseconds."""
+        """As `chunks`, from this time on, found with the file's millisecond index."""
         with opened(self.path) as file:
             events = self.event_table(file)
             if has(file, "ms_to_idx"):
@@ -92,18 +92,18 @@ class DsecRecording(TableRecording):
                 yield from super(DsecRecording, self).since(t_us)
 
     def imu_table(self, file: Any) -> ImuTable | None:
-        """The group `imu`, in the frame in which the source gave it."""
+        """The group `imu`, in the frame that the source used."""
         if "imu" not in self.held:
             return None
         tails = {"t": (), "accel": (3,), "gyro": (3,)}
         columns = tuple(dataset(self.path, file, f"imu/{name}", *tail) for name, tail in tails.items())
-        return ImuTable("imu", columns, _as_they_are, np.eye(3))
+        return ImuTable("imu", columns, _unchanged, np.eye(3))
 
     def poses(self) -> Poses | None:
         """The group `poses`, or None.
 
         Raises:
-            BrokenRecording, InvalidField: they are not what they must be; the row is named.
+            BrokenRecording, InvalidField: the poses are invalid; the error names the row.
         """
         if "poses" not in self.held:
             return None
@@ -111,10 +111,10 @@ class DsecRecording(TableRecording):
             return stored_poses(self.path, file)
 
     def twists(self) -> Twists | None:
-        """The group `twists`; without one, from the poses; None without either.
+        """The group `twists`; without that group, twists from the poses; None without both.
 
         Raises:
-            BrokenRecording: they are not ordered by time, or can not be read; the row is named.
+            BrokenRecording: the twists are not ordered by time or cannot be read; the error names the row.
         """
         with opened(self.path) as file:
             if not has(file, "twists/t"):
@@ -132,7 +132,7 @@ def _offset_us(path: Path, file: Any) -> int:
     offset = value(path, file, "t_offset")
     try:
         if np.size(offset) != 1 or not abs(int(offset)) < _MAX_OFFSET_US:
-            raise ValueError(f"one number below {_MAX_OFFSET_US} is expected, not {offset}")
+            raise ValueError(f"expected one number below {_MAX_OFFSET_US}, not {offset}")
         return int(offset)
     except (TypeError, ValueError, OverflowError) as error:
         raise BrokenRecording(path, "t_offset", str(error)) from None
@@ -143,7 +143,7 @@ def _attributes(path: Path, file: Any, name: str) -> dict[str, Any]:
     try:
         return dict(file[name].attrs)
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
-        raise BrokenRecording(path, f"attributes of {name}", f"they can not be read: {error}") from None
+        raise BrokenRecording(path, f"attributes of {name}", f"they cannot be read: {error}") from None
 
 
 def _lens(path: Path, attributes: dict[str, Any]) -> CameraInfo:
@@ -151,9 +151,9 @@ def _lens(path: Path, attributes: dict[str, Any]) -> CameraInfo:
     try:
         fields = {name: np.asarray(attributes[name]).tolist() for name in LENS_FIELDS if name in attributes}
         return CameraInfo(stream="recording", **fields)
-    except (TypeError, ValueError, InvalidField) as error:  # pydantic's is one too
-        raise BrokenRecording(path, "attributes of camera", f"they are no lens: {error}") from None
+    except (TypeError, ValueError, InvalidField) as error:  # pydantic's error is a ValueError
+        raise BrokenRecording(path, "attributes of camera", f"they are not a valid lens: {error}") from None
 
 
-def _as_they_are(*columns: Column) -> Any:
+def _unchanged(*columns: Column) -> Any:
     return columns

@@ -1,4 +1,4 @@
-"""Any recording as HDF5 in DSEC's layout; dsec.py says what is added to it."""
+"""Writer of any recording as HDF5 in DSEC's layout. `dsec.py` describes the groups that it adds."""
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,39 +14,43 @@ from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events
 
 MAX_SPAN_S: Final = 86_400
-"""Longest recording; beyond it its times jump, for the index has an entry for each millisecond."""
+"""Longest recording. A longer span is a jump in time; the index has one entry per millisecond of it."""
 
-_ROWS: Final = 1 << 16  # per stored chunk: some 300 kB, which h5py's default cache holds
+_ROWS: Final = 1 << 16  # per stored chunk: about 300 kB, which fits h5py's default cache
 _INDEX_BLOCK: Final = 1 << 20
 _COLUMNS: Final = {"p": "u1", "x": "u2", "y": "u2", "t": "i8"}
 
 
 class Written(NamedTuple):
-    """What went into a file."""
+    """What was written to a file."""
 
     events: int
     streams: tuple[str, ...]
-    left_out: tuple[str, ...]  # streams that the recording has and the layout not
+    left_out: tuple[str, ...]  # streams of the recording that the layout cannot hold
 
 
 def write_dsec(recording: Recording, path: Path, progress: Callable[[int], None] | None = None) -> Written:
     """Write a recording as HDF5 in DSEC's layout: events, and its lens, IMU, poses and twists where it has them.
 
-    The file is whole or it is not there, and what was there before stays until it is. Memory is bounded however long
-    the recording is. Compressed by Blosc with Zstd, as DSEC's own files are: reading needs hdf5plugin.
+    The file is written atomically: an existing file stays until the new one is complete. Memory is bounded for a
+    recording of any length. The data is compressed with Blosc and Zstd, as in DSEC's own files: a reader needs
+    hdf5plugin.
 
     Args:
-        recording: what to write.
+        recording: the recording to write.
         path: the .h5 file.
-        progress: is told after each chunk how many events are written.
+        progress: called after each chunk with the number of events written so far.
+
+    Returns:
+        The number of events, the streams that were written, and those that were left out.
 
     Raises:
-        InvalidField: the recording never ends, or its times span more than MAX_SPAN_S.
-        BrokenRecording: it could not be read to its end; nothing is written.
-        MissingExtra: h5py or hdf5plugin is not installed. OSError: the file can not be written.
+        InvalidField: the recording is endless, or its times span more than MAX_SPAN_S.
+        BrokenRecording: the recording could not be read to its end; nothing is written.
+        MissingExtra: h5py or hdf5plugin is not installed. OSError: the file cannot be written.
     """
     if recording.endless:
-        raise InvalidField("write_dsec", "recording", recording.name, "one that ends is expected")
+        raise InvalidField("write_dsec", "recording", recording.name, "must not be endless")
     h5py = hdf5.library()
     with atomic_path(path) as part, h5py.File(part, "w") as file:
         n = _write_events(recording, file, progress)
@@ -55,7 +59,7 @@ def write_dsec(recording: Recording, path: Path, progress: Callable[[int], None]
 
 
 def _write_events(recording: Recording, file: Any, progress: Callable[[int], None] | None) -> int:
-    """The groups `events`, `ms_to_idx`, `t_offset` and `camera`; how many events these are."""
+    """Write the groups `events`, `ms_to_idx`, `t_offset` and `camera`; return the number of events."""
     group = file.create_group("events")
     group.attrs["width"], group.attrs["height"] = recording.sensor.width, recording.sensor.height
     lens = recording.camera("recording")
@@ -72,10 +76,10 @@ def _write_events(recording: Recording, file: Any, progress: Callable[[int], Non
         if chunk.t[-1] - offset_us > MAX_SPAN_S * 1_000_000:
             span_s = int(chunk.t[-1] - offset_us) / 1e6
             raise InvalidField("write_dsec", "span_s", span_s, f"at most {MAX_SPAN_S} s between first and last event")
-        here = chunk._replace(t=chunk.t - offset_us)
+        shifted = chunk._replace(t=chunk.t - offset_us)
         for name, column in columns.items():
-            _append(column, getattr(here, name))
-        for entries in _index_entries(here, n, int(index.shape[0])):
+            _append(column, getattr(shifted, name))
+        for entries in _index_entries(shifted, n, int(index.shape[0])):
             _append(index, entries)
         n += chunk.n
         if progress is not None:
@@ -85,12 +89,12 @@ def _write_events(recording: Recording, file: Any, progress: Callable[[int], Non
 
 
 def _index_entries(events: Events, first: int, ms: int) -> Iterator[np.ndarray[Any, Any]]:
-    """The number of the first event at or after each millisecond from `ms` to the last event's, in bounded blocks.
+    """Index of the first event at or after each millisecond, from `ms` to that of the last event, in bounded blocks.
 
     Args:
-        events: the next of a recording; none before them is at or after millisecond `ms`.
-        first: how many came before them.
-        ms: the first millisecond that has no entry yet.
+        events: the next events of a recording; all earlier ones are before millisecond `ms`.
+        first: how many events came before.
+        ms: the first millisecond without an entry.
     """
     stop = int(events.t[-1]) // 1000 + 1
     for at in range(ms, stop, _INDEX_BLOCK):
@@ -99,7 +103,7 @@ def _index_entries(events: Events, first: int, ms: int) -> Iterator[np.ndarray[A
 
 
 def _write_truth(recording: Recording, file: Any) -> Iterator[str]:
-    """The groups `poses` and `twists`; their names."""
+    """Write the groups `poses` and `twists`; yield their names."""
     poses, twists = recording.poses(), recording.twists()
     if poses is not None:
         _write_group(file, "poses", t=poses.t, position=poses.position_m, orientation=poses.orientation)
@@ -110,7 +114,7 @@ def _write_truth(recording: Recording, file: Any) -> Iterator[str]:
 
 
 def _write_imu(recording: Recording, file: Any) -> Iterator[str]:
-    """The group `imu`; its name."""
+    """Write the group `imu`; yield its name."""
     written = False
     for block in recording.imu():
         _write_group(file, "imu", t=block.t, accel=block.accel_m_s2, gyro=block.gyro_rad_s)
@@ -120,7 +124,7 @@ def _write_imu(recording: Recording, file: Any) -> Iterator[str]:
 
 
 def _write_group(file: Any, name: str, **columns: np.ndarray[Any, Any]) -> None:
-    """Append rows to a group's data sets, which come into being with the first."""
+    """Append rows to the data sets of a group; the first call creates them."""
     group = file.require_group(name)
     for key, rows in columns.items():
         _append(group[key] if key in group else _growing(group, key, rows.dtype, *rows.shape[1:]), rows)
@@ -128,9 +132,9 @@ def _write_group(file: Any, name: str, **columns: np.ndarray[Any, Any]) -> None:
 
 def _growing(group: Any, name: str, dtype: Any, *tail: int) -> Any:
     """An empty data set of shape (0, *tail) that can grow."""
-    import hdf5plugin  # late, as `hdf5.library` has it
+    import hdf5plugin  # imported late, as in `hdf5.library`
 
-    # measured on evt3.raw: 10 Mev/s and 3.5 bytes per event; level 3 5 and 3.4, gzip 2.3 and 3.3, lzf 4.4 and 4.4
+    # measured on evt3.raw [Mev/s, bytes per event]: this 10, 3.5; level 3 5, 3.4; gzip 2.3, 3.3; lzf 4.4, 4.4
     packing = hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=hdf5plugin.Blosc.SHUFFLE)
     return group.create_dataset(
         name, (0, *tail), dtype, maxshape=(None, *tail), chunks=(_ROWS, *tail), compression=packing

@@ -1,4 +1,4 @@
-"""HDF5 files: opened with the filters that event data sets use, their data sets checked, read in rows."""
+"""Access to HDF5 files: open them with the filters that event data sets use, check data sets, read rows."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -14,45 +14,45 @@ from neurove_core.extras import MissingExtra
 from neurove_core.io.errors import BrokenRecording, UnknownSource
 
 MAX_CHUNK_BYTES: Final = 64 << 20
-"""Largest chunk that a data set may be stored in: HDF5 unpacks a chunk as a whole, so this bounds the memory."""
+"""Largest stored chunk of a data set. HDF5 decompresses a chunk at once, so this limit bounds the memory."""
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
-_CACHE_BYTES = 16 << 20  # per data set; the default of 1 MiB unpacks larger chunks again for every block read
+_CACHE_BYTES = 16 << 20  # per data set; with the default of 1 MiB every block read decompresses a larger chunk again
 FAULTS = (OSError, RuntimeError, KeyError, ValueError, TypeError, MemoryError, OverflowError)
-"""What h5py raises over the bytes of a file; it has no class of its own for that."""
+"""What h5py raises for a damaged file; it has no error class of its own."""
 
 Column = NDArray[Any]
 
 
 @contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """The file for reading, as an h5py.File; the filters of hdf5plugin (Blosc, Zstd and others) are known to it.
+    """Open the file for reading, as an h5py.File with the filters of hdf5plugin (Blosc, Zstd and others).
 
     Raises:
         MissingExtra: h5py or hdf5plugin is not installed.
-        UnknownSource: it is no HDF5 file.
-        BrokenRecording: it is one, but cut or garbled.
+        UnknownSource: it is not an HDF5 file.
+        BrokenRecording: it is an HDF5 file, but truncated or corrupt.
     """
     h5py = library()
     with path.open("rb") as file:
         head = file.read(len(_MAGIC))
     if not head or not _MAGIC.startswith(head):
-        raise UnknownSource(path, "the file does not begin as HDF5 does")
+        raise UnknownSource(path, "the file does not start with the HDF5 signature")
     try:
         opened_file = h5py.File(path, "r", rdcc_nbytes=_CACHE_BYTES, locking="best-effort")
     except FAULTS as error:
-        cut = re.search(r"eof = (\d+),.*stored_eof = (\d+)", str(error))
-        where, why = (cut[1], f"the file ends here, and should at byte {cut[2]}") if cut else ("0", str(error))
+        ends = re.search(r"eof = (\d+),.*stored_eof = (\d+)", str(error))
+        where, why = (ends[1], f"the file ends here, expected {ends[2]} bytes") if ends else ("0", str(error))
         raise BrokenRecording(path, f"byte {where}", why) from None
     with opened_file as file:
         yield file
 
 
 def library() -> Any:
-    """The h5py module.
+    """Import the h5py module.
 
     Raises:
-        MissingExtra: it or hdf5plugin is not installed.
+        MissingExtra: h5py or hdf5plugin is not installed.
     """
     for name in ("hdf5plugin", "h5py"):
         try:
@@ -63,7 +63,7 @@ def library() -> Any:
 
 
 def has(file: Any, *names: str) -> bool:
-    """Whether all of these are in the file; of what is too broken to tell, no."""
+    """Whether all of these names are in the file; False where the file is too damaged to answer."""
     try:
         return all(name in file for name in names)
     except FAULTS:
@@ -71,10 +71,10 @@ def has(file: Any, *names: str) -> bool:
 
 
 def dataset(path: Path, file: Any, name: str, *tail: int) -> Any:
-    """A table of numbers: the h5py.Dataset of shape (N, *tail), its rows not yet read.
+    """The h5py.Dataset of numbers of shape (N, *tail). Its rows are not read yet.
 
     Raises:
-        BrokenRecording: it is not there, is no such table, or is stored in chunks above MAX_CHUNK_BYTES.
+        BrokenRecording: it does not exist, has another shape or type, or is stored in chunks above MAX_CHUNK_BYTES.
     """
     try:
         found = file[name]
@@ -82,24 +82,24 @@ def dataset(path: Path, file: Any, name: str, *tail: int) -> Any:
         missing = found.size and not found.is_virtual and not found.id.get_storage_size()
         chunk_bytes = int(np.prod(found.chunks or (0,), dtype=np.float64)) * width
     except (*FAULTS, AttributeError) as error:
-        raise BrokenRecording(path, name, f"it can not be read: {error}") from None
-    numbers = kind in "biu" or (kind == "f" and width in (4, 8))  # numpy's linear algebra knows no other floats
+        raise BrokenRecording(path, name, f"it cannot be read: {error}") from None
+    numbers = kind in "biu" or (kind == "f" and width in (4, 8))  # numpy's linear algebra supports no other floats
     if len(shape) != 1 + len(tail) or shape[1:] != tail or not numbers:
         want = ", ".join(["N", *map(str, tail)])
-        raise BrokenRecording(path, name, f"numbers of shape ({want}) are expected, not {found.dtype} of {shape}")
+        raise BrokenRecording(path, name, f"expected numbers of shape ({want}), not {found.dtype} of {shape}")
     if chunk_bytes > MAX_CHUNK_BYTES:
-        why = f"it is stored in chunks of {chunk_bytes} bytes; at most {MAX_CHUNK_BYTES} are read at once"
+        why = f"it is stored in chunks of {chunk_bytes} bytes; at most {MAX_CHUNK_BYTES} are allowed"
         raise BrokenRecording(path, name, why)
-    if missing:  # HDF5 would hand out zeros for as many rows as the header claims
+    if missing:  # HDF5 would return zeros for all rows that the header claims
         raise BrokenRecording(path, name, f"its {shape[0]} rows were never written")
     return found
 
 
 def value(path: Path, file: Any, name: str) -> Any:
-    """A small thing as a whole: a number, an array, or a text as str.
+    """The full value of a small data set: a number, an array, or a text as str.
 
     Raises:
-        BrokenRecording: it is not there, can not be read, or is not small.
+        BrokenRecording: it does not exist, cannot be read, or has more than 1000 entries.
     """
     try:
         found = file[name]
@@ -107,14 +107,14 @@ def value(path: Path, file: Any, name: str) -> Any:
             raise ValueError(f"it has {found.size} entries")
         got = found[()]
     except (*FAULTS, AttributeError) as error:
-        raise BrokenRecording(path, name, f"it can not be read: {error}") from None
+        raise BrokenRecording(path, name, f"it cannot be read: {error}") from None
     return got.decode("utf-8", "backslashreplace") if isinstance(got, bytes) else got
 
 
 def read_rows(columns: Sequence[Any], first: int, stop: int) -> tuple[list[Column], str]:
-    """Rows [first, stop) of all columns, or those before the first that can not be read, and why it can not.
+    """Rows [first, stop) of all columns, or the rows before the first unreadable one and its error text.
 
-    By halves: h5py tells neither which row failed nor what it had read by then.
+    Finds that row by bisection: h5py reports neither which row failed nor what it read before.
     """
     try:
         return [column[first:stop] for column in columns], ""
@@ -130,15 +130,15 @@ def read_rows(columns: Sequence[Any], first: int, stop: int) -> tuple[list[Colum
 
 
 def all_rows(path: Path, name: str, columns: Sequence[Any]) -> list[Column]:
-    """All rows of columns that are one table of a known small size.
+    """All rows of the columns of one table of known small size.
 
     Raises:
-        BrokenRecording: a row can not be read, or the columns are not of one length.
+        BrokenRecording: a row cannot be read, or the columns differ in length.
     """
     lengths = [int(column.shape[0]) for column in columns]
     rows, why = read_rows(columns, 0, min(lengths))
     if why:
         raise BrokenRecording(path, f"row {len(rows[0])} of {name}", why)
     if max(lengths) > min(lengths):
-        raise BrokenRecording(path, f"row {min(lengths)} of {name}", f"its columns are of unequal length: {lengths}")
+        raise BrokenRecording(path, f"row {min(lengths)} of {name}", f"its columns have unequal lengths: {lengths}")
     return rows

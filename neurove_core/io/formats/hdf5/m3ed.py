@@ -1,9 +1,9 @@
-"""M3ED (Chaney 2023) in HDF5: FILE_data.h5 with events, IMU and calibration, FILE_pose_gt.h5 beside it with the truth.
+"""Reader of M3ED (Chaney 2023) in HDF5: FILE_data.h5 with events, IMU, calibration; FILE_pose_gt.h5 with ground truth.
 
 Layout: prophesee/left and prophesee/right with `x` u2, `y` u2, `t` i8 [us], `p` i1, `ms_map_idx` (the first event at or
 after each millisecond) and `calib`: `intrinsics` (fx fy cx cy), `distortion_coeffs`, `distortion_model`, `resolution`
 (width, height), `T_to_prophesee_left`; ovc/imu with `accel` (N, 3) [m/s2], `omega` (N, 3) [rad/s], `ts` i8 [us] and
-`calib/T_to_prophesee_left`. The images are of other cameras, and are not read.
+`calib/T_to_prophesee_left`. The images are from other cameras and are not read.
 
 Source: daniilidis-group/m3ed, build_system/bag_processing/rosbag2hdf5.py.
 """
@@ -27,7 +27,7 @@ from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
 
 EVK4: Final = Sensor(1280, 720)
-"""Both cameras, where the file has no calibration."""
+"""Sensor of both cameras, for a file without calibration."""
 
 TOPICS: Final = ("prophesee/left", "prophesee/right")
 _IMU: Final = ("ovc/imu/ts", "ovc/imu/accel", "ovc/imu/omega")
@@ -41,23 +41,23 @@ _LENS_OF_MODEL: Final[dict[str, Literal["pinhole", "equidistant"]]] = {
 
 @dataclass(frozen=True, slots=True)
 class M3edRecording(TableRecording):
-    """One camera of an M3ED FILE_data.h5; see `Recording`. Times begin with the recording."""
+    """One camera of an M3ED FILE_data.h5; see `Recording`. Times are relative to the start of the recording."""
 
     lens: CameraInfo | None = None
-    to_left: tuple[tuple[float, ...], ...] = ()  # 3x4, a point in this camera's frame to the left one's [m]
+    to_left: tuple[tuple[float, ...], ...] = ()  # 3x4, from this camera's frame to the left camera's [m]
 
     @classmethod
     def open(cls, path: Path, sensor: Sensor | None = None, topic: str | None = None) -> Self:
-        """The recording in this file.
+        """Open the recording in this file.
 
         Args:
             path: the FILE_data.h5.
-            sensor: its pixel array; overrides the file's.
+            sensor: its pixel array; overrides that of the file.
             topic: `prophesee/left`, the default, or `prophesee/right`.
 
         Raises:
-            UnknownSource: it has no such camera. InvalidField: its calibration is not what it must be.
-            BrokenRecording: it is cut or garbled. MissingExtra: h5py is not installed.
+            UnknownSource: the file has no such camera. InvalidField: its calibration is invalid.
+            BrokenRecording: the file is truncated or corrupt. MissingExtra: h5py is not installed.
         """
         with opened(path) as file:
             topics = tuple(name for name in TOPICS if has(file, *(f"{name}/{column}" for column in "txyp")))
@@ -67,14 +67,14 @@ class M3edRecording(TableRecording):
             held = ["events"]
             if _transform(path, file, _IMU_MOUNT) is not None and to_left is not None and has(file, *_IMU):
                 held.append("imu")
-        if to_left is not None and truth_beside(path).is_file():
+        if to_left is not None and truth_path(path).is_file():
             held += ["poses", "twists"]
         sensor = sensor or (lens.sensor if lens else EVK4)
-        known = () if to_left is None else tuple(map(tuple, to_left.tolist()))
-        return cls(path, f"{path.name} ({topic})", sensor, topic, tuple(held), lens=lens, to_left=known)
+        transform = () if to_left is None else tuple(map(tuple, to_left.tolist()))
+        return cls(path, f"{path.name} ({topic})", sensor, topic, tuple(held), lens=lens, to_left=transform)
 
     def camera(self, stream: str) -> CameraInfo | None:
-        """The lens of the file's calibration; None without one, or for another sensor."""
+        """The lens of the file's calibration; None without a calibration, or for another sensor size."""
         if self.lens is None or self.lens.sensor != self.sensor:
             return None
         return CameraInfo(**(self.lens.model_dump() | {"stream": stream}))
@@ -82,10 +82,10 @@ class M3edRecording(TableRecording):
     def event_table(self, file: Any) -> EventTable:
         """The columns t, x, y, p."""
         columns = tuple(dataset(self.path, file, f"{self.topic}/{name}") for name in "txyp")
-        return EventTable(self.topic, columns, _as_they_are)
+        return EventTable(self.topic, columns, _unchanged)
 
     def since(self, t_us: int) -> Iterator[Events]:
-        """As `chunks`, from this time on, by the file's index of milliseconds."""
+        """As `chunks`, from this time on, found with the file's millisecond index."""
         with opened(self.path) as file:
             table, name = self.event_table(file), f"{self.topic}/ms_map_idx"
             if has(file, name):
@@ -94,21 +94,21 @@ class M3edRecording(TableRecording):
                 yield from super(M3edRecording, self).since(t_us)
 
     def imu_table(self, file: Any) -> ImuTable | None:
-        """The unit of the OVC, 400 Hz; samples that were never taken are nan in the file, and are left out."""
+        """The IMU of the OVC, 400 Hz. Samples that were never taken are nan in the file and are left out."""
         mount = _transform(self.path, file, _IMU_MOUNT)
         if "imu" not in self.held or mount is None:
             return None
         t, accel, omega = (dataset(self.path, file, name, *tail) for name, tail in zip(_IMU, _TAILS, strict=True))
         rotation = np.array(self.to_left)[:, :3].T @ mount[:, :3]
-        return ImuTable("ovc/imu", (t, accel, omega), _as_they_are, rotation, may_miss=True)
+        return ImuTable("ovc/imu", (t, accel, omega), _unchanged, rotation, may_miss=True)
 
     def poses(self) -> Poses | None:
-        """The truth of FILE_pose_gt.h5, at the lidar's 10 Hz, in the world of the left camera's first pose; or None.
+        """Poses of FILE_pose_gt.h5 at the lidar's 10 Hz, in the world of the left camera's first pose; or None.
 
         Raises:
-            BrokenRecording, InvalidField: the truth is not what it must be; the row is named.
+            BrokenRecording, InvalidField: the poses are invalid; the error names the row.
         """
-        truth = truth_beside(self.path)
+        truth = truth_path(self.path)
         if "poses" not in self.held:
             return None
         with opened(truth) as file:
@@ -119,16 +119,16 @@ class M3edRecording(TableRecording):
         return Poses(left.t, left.position_m + offset_m, rotations.product(left.orientation, q))
 
 
-def truth_beside(path: Path) -> Path:
-    """Where the truth of a FILE_data.h5 lies."""
+def truth_path(path: Path) -> Path:
+    """Path of the ground truth of a FILE_data.h5."""
     return path.with_name(f"{path.stem.removesuffix('_data')}_pose_gt{path.suffix}")
 
 
 def read_lens(path: Path, file: Any, topic: str) -> CameraInfo:
-    """The lens that a camera's `calib` describes, as Kalibr writes it.
+    """The lens in a camera's `calib` group, in the format of Kalibr.
 
     Raises:
-        BrokenRecording: it can not be read. InvalidField: it is no lens that is known here.
+        BrokenRecording: the group cannot be read. InvalidField: the lens model is not supported or invalid.
     """
     names = ("intrinsics", "distortion_coeffs", "resolution", "distortion_model", "camera_model")
     intrinsics, distortion, resolution, model, camera = (value(path, file, f"{topic}/calib/{name}") for name in names)
@@ -151,25 +151,27 @@ def read_lens(path: Path, file: Any, topic: str) -> CameraInfo:
         )
     except (TypeError, ValueError, OverflowError, InvalidField) as error:
         got = f"{intrinsics}, {distortion}, {resolution}"
-        raise InvalidField(what, "intrinsics", got, f"fx fy cx cy, four coefficients, a size: {error}") from None
+        raise InvalidField(
+            what, "intrinsics", got, f"expected fx fy cx cy, four coefficients and a size: {error}"
+        ) from None
 
 
 def _transform(path: Path, file: Any, name: str) -> NDArray[np.float64] | None:
-    """The upper rows (3, 4) of a rigid motion, or None where there is none of this name.
+    """The upper rows (3, 4) of a rigid transform, or None if the file does not have this name.
 
     Raises:
-        BrokenRecording: it is there and no rigid motion.
+        BrokenRecording: the value is not a rigid transform.
     """
     if not has(file, name):
         return None
     try:
         matrix = np.asarray(value(path, file, name), np.float64)
-    except (TypeError, ValueError):  # a text, say
+    except (TypeError, ValueError):  # for example a text
         matrix = np.empty(0)
     if matrix.shape != (4, 4) or not np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-2):
-        raise BrokenRecording(path, name, "a rigid motion of shape (4, 4) is expected")
+        raise BrokenRecording(path, name, "expected a rigid transform of shape (4, 4)")
     return matrix[:3]
 
 
-def _as_they_are(*columns: Column) -> Any:
+def _unchanged(*columns: Column) -> Any:
     return columns

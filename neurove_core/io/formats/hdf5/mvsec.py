@@ -1,9 +1,9 @@
-"""MVSEC (Zhu 2018) in HDF5: FILE_data.hdf5 with events, images and IMU, and FILE_gt.hdf5 beside it with the truth.
+"""Reader of MVSEC (Zhu 2018) in HDF5: FILE_data.hdf5 with events, images and IMU; FILE_gt.hdf5 with ground truth.
 
-Layout, of davis/left and davis/right alike: `events` (N, 4) float64 of x, y, t [unix s] and p (-1 or 1); `image_raw`
+Layout of both davis/left and davis/right: `events` (N, 4) float64 of x, y, t [unix s] and p (-1 or 1); `image_raw`
 (N, 260, 346) with `image_raw_ts` (N,) [s]; `imu` (N, 6) of accelerometer [m/s2], then gyroscope [rad/s], with `imu_ts`.
 
-Sources: https://daniilidis-group.github.io/mvsec (download, data format), and the calibration that comes with it.
+Sources: https://daniilidis-group.github.io/mvsec (download, data format), and the calibration files of the data set.
 """
 
 from collections.abc import Iterator
@@ -25,7 +25,7 @@ from neurove_protocol.camera import CameraInfo
 from neurove_protocol.events import Sensor
 
 DAVIS346: Final = Sensor(346, 260)
-"""Both cameras."""
+"""Sensor of both cameras."""
 
 TOPICS: Final = ("davis/left", "davis/right")
 
@@ -62,7 +62,7 @@ LENS_OUTDOOR_DAY: Final = {
         *(-0.033904378348448685, -0.01537260902537579, -0.022284741346941413, 0.0069204143687187645),
     ),
 }
-"""Source: MVSEC, camchain-imucam-outdoor_day.yaml, cam0, as public readers of the data set quote it."""
+"""Source: MVSEC, camchain-imucam-outdoor_day.yaml, cam0, as quoted by public readers of the data set."""
 
 CAMERA_FROM_IMU: Final = {
     "davis/left": (
@@ -83,7 +83,7 @@ RIGHT_FROM_LEFT: Final = (
     (-0.011042817783611191, 0.9998887260774646, 0.01002953830336461, -0.0003927067773089277),
     (0.004578560319692358, -0.009979483987103495, 0.9999397215256256, 1.8880107752680777e-06),
 )
-"""T_cn_cnm1 of cam1: a point in the left camera's frame to the right's [m]. Source: as above."""
+"""T_cn_cnm1 of cam1: from the left camera's frame to the right camera's [m]. Source: as above."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,31 +92,32 @@ class MvsecRecording(TableRecording):
 
     @classmethod
     def open(cls, path: Path, sensor: Sensor | None = None, topic: str | None = None) -> Self:
-        """The recording in this file.
+        """Open the recording in this file.
 
         Args:
             path: the FILE_data.hdf5.
-            sensor: its pixel array; by default a DAVIS346's.
+            sensor: its pixel array; by default that of a DAVIS346.
             topic: `davis/left`, the default, or `davis/right`.
 
         Raises:
-            UnknownSource: it has no such camera. BrokenRecording: it is cut or garbled. MissingExtra: h5py is not here.
+            UnknownSource: the file has no such camera. BrokenRecording: the file is truncated or corrupt.
+            MissingExtra: h5py is not installed.
         """
         with opened(path) as file:
             topics = tuple(name for name in TOPICS if has(file, f"{name}/events"))
             topic = chosen_topic(path, topics, topic)
-            there = {"imu": "davis/left/imu", "frames": f"{topic}/image_raw"}
-            held = ["events", *(stream for stream, name in there.items() if has(file, name, f"{name}_ts"))]
-        if truth_beside(path).is_file():
+            optional = {"imu": "davis/left/imu", "frames": f"{topic}/image_raw"}
+            held = ["events", *(stream for stream, name in optional.items() if has(file, name, f"{name}_ts"))]
+        if truth_path(path).is_file():
             held += ["poses", "twists"]
         return cls(path, f"{path.name} ({topic})", sensor or DAVIS346, topic, tuple(held))
 
     def camera(self, stream: str) -> CameraInfo | None:
         """The equidistant lens of the sequence's calibration.
 
-        Of sequences other than outdoor_day it is indoor_flying's: the same cameras, whose calibrations differ by 1 % in
-        focal length and 6 px in the centre. None for another sensor, and for the right camera of outdoor_day, of which
-        no calibration is known here.
+        Sequences other than outdoor_day use that of indoor_flying: the cameras are the same, and the two calibrations
+        differ by 1 % in focal length and 6 px in the centre. None for another sensor size, and for the right camera of
+        outdoor_day, because its calibration is not included here.
         """
         lenses = LENS_OUTDOOR_DAY if self.path.name.startswith("outdoor_day") else LENS_INDOOR_FLYING
         lens = lenses.get(self.topic)
@@ -130,7 +131,7 @@ class MvsecRecording(TableRecording):
         return EventTable(name, (dataset(self.path, file, name, 4),), _txyp)
 
     def imu_table(self, file: Any) -> ImuTable | None:
-        """The left camera's unit for both cameras: it is the one whose mounting was calibrated."""
+        """The left camera's IMU for both cameras: only its mounting was calibrated."""
         name = "davis/left/imu"
         if not has(file, name, f"{name}_ts"):
             return None
@@ -141,7 +142,7 @@ class MvsecRecording(TableRecording):
         """All images of this camera, ordered by time.
 
         Raises:
-            BrokenRecording: one can not be read, or its time is earlier than that of the one before.
+            BrokenRecording: an image cannot be read, or its time is before that of the previous image.
         """
         if "frames" not in self.held:
             return
@@ -150,12 +151,12 @@ class MvsecRecording(TableRecording):
             images = dataset(self.path, file, name, DAVIS346.height, DAVIS346.width)
             times = dataset(self.path, file, f"{name}_ts")
             if images.dtype != np.uint8:
-                raise BrokenRecording(self.path, name, f"images of uint8 are expected, not {images.dtype}")
+                raise BrokenRecording(self.path, name, f"expected images of uint8, not {images.dtype}")
             last_s = -np.inf
             for i in range(min(images.shape[0], times.shape[0])):
                 (image, t_s), why = read_rows((images, times), i, i + 1)
                 if not why and not (last_s <= t_s[0] < 1e12):
-                    why = f"t={t_s[0]} s is no time, or earlier than t={last_s} s before it"
+                    why = f"t={t_s[0]} s is not a valid time, or is before the previous t={last_s} s"
                 if why:
                     raise BrokenRecording(self.path, f"row {i} of {name}", why)
                 last_s = float(t_s[0])
@@ -165,18 +166,18 @@ class MvsecRecording(TableRecording):
         """The odometry of FILE_gt.hdf5, at the lidar's 20 Hz; None without that file.
 
         Raises:
-            BrokenRecording, InvalidField: the truth is not what it must be; the row is named.
+            BrokenRecording, InvalidField: the poses are invalid; the error names the row.
         """
-        truth = truth_beside(self.path)
+        truth = truth_path(self.path)
         if not truth.is_file():
             return None
         with opened(truth) as file:
             left = mvsec_odometry(truth, file)
-        return left if self.topic == "davis/left" else _seen_from_the_right(left)
+        return left if self.topic == "davis/left" else _poses_of_right_camera(left)
 
 
-def truth_beside(path: Path) -> Path:
-    """Where the truth of a FILE_data.hdf5 lies."""
+def truth_path(path: Path) -> Path:
+    """Path of the ground truth of a FILE_data.hdf5."""
     return path.with_name(f"{path.stem.removesuffix('_data')}_gt{path.suffix}")
 
 
@@ -188,11 +189,11 @@ def _sample(t: Column, rows: Column) -> tuple[Column, Column, Column]:
     return t * 1e6, rows[:, :3], rows[:, 3:]
 
 
-def _seen_from_the_right(left: Poses) -> Poses:
-    """Poses of the right camera, which is fixed to the left one."""
+def _poses_of_right_camera(left: Poses) -> Poses:
+    """Poses of the right camera, which is rigidly fixed to the left one."""
     rigid: NDArray[np.float64] = np.array(RIGHT_FROM_LEFT)
-    back = rigid[:, :3].T  # from the right camera's axes to the left's
-    offset_m = -back @ rigid[:, 3]
-    turned = rotations.turn(left.orientation, np.broadcast_to(offset_m, left.position_m.shape))
-    q = np.broadcast_to(rotations.quaternion_of(back), left.orientation.shape)
-    return Poses(left.t, left.position_m + turned, rotations.product(left.orientation, q))
+    to_left = rigid[:, :3].T  # from the right camera's axes to the left's
+    offset_m = -to_left @ rigid[:, 3]
+    rotated_m = rotations.turn(left.orientation, np.broadcast_to(offset_m, left.position_m.shape))
+    q = np.broadcast_to(rotations.quaternion_of(to_left), left.orientation.shape)
+    return Poses(left.t, left.position_m + rotated_m, rotations.product(left.orientation, q))

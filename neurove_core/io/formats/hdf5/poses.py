@@ -1,4 +1,4 @@
-"""Poses in the HDF5 layouts of MVSEC, M3ED and our own files."""
+"""Readers of poses in the HDF5 layouts of MVSEC, M3ED and `write_dsec`."""
 
 from pathlib import Path
 from typing import Any
@@ -12,23 +12,23 @@ from neurove_protocol.errors import InvalidField
 
 
 def table(path: Path, file: Any, names: tuple[str, ...], *tails: tuple[int, ...]) -> list[NDArray[Any]]:
-    """The data sets of these names as a whole, of shapes (N, *tail) with one N.
+    """All rows of the data sets of these names, of shapes (N, *tail) with the same N.
 
     Raises:
-        BrokenRecording: one is not there, of another shape, or can not be read.
+        BrokenRecording: a data set does not exist, has another shape, or cannot be read.
         InvalidField: there are more than MAX_POSES rows.
     """
     columns = [hdf5.dataset(path, file, name, *tail) for name, tail in zip(names, tails, strict=True)]
     n = min(int(column.shape[0]) for column in columns)
     if n > MAX_POSES:
-        raise InvalidField(str(path), names[0], n, f"at most {MAX_POSES} rows are read")
+        raise InvalidField(str(path), names[0], n, f"at most {MAX_POSES} rows are allowed")
     return hdf5.all_rows(path, names[0], columns)
 
 
 def mvsec_odometry(path: Path, file: Any) -> Poses:
     """Poses of the left camera in an MVSEC FILE_gt.hdf5: LOAM's odometry, world from camera.
 
-    Not davis/left/pose: that is Cartographer's, which has loops closed and does not optimise the height.
+    It is not davis/left/pose: that comes from Cartographer, which closes loops and does not optimise the height.
     Source: https://daniilidis-group.github.io/mvsec/data_format.
 
     Raises:
@@ -42,7 +42,7 @@ def mvsec_odometry(path: Path, file: Any) -> Poses:
 def m3ed_poses(path: Path, file: Any) -> Poses:
     """Poses of the left Prophesee camera in an M3ED FILE_pose_gt.h5, in the world of its first pose.
 
-    Cn_T_C0 takes a point from the first camera's frame into the present one's: the inverse of MVSEC's convention.
+    Cn_T_C0 maps a point from the first camera frame to the current one: the inverse of MVSEC's convention.
     Source: daniilidis-group/m3ed, build_system/lidar_depth/fasterlio_gt.py.
 
     Raises:
@@ -53,7 +53,7 @@ def m3ed_poses(path: Path, file: Any) -> Poses:
 
 
 def stored_poses(path: Path, file: Any) -> Poses:
-    """Poses as `dsec.write_dsec` writes them.
+    """Poses that `dsec_write.write_dsec` wrote.
 
     Raises:
         InvalidField, BrokenRecording: as `read_poses`.
