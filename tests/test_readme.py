@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from neurove_service.cli.commands import build_parser
+from tests.service.cli.test_language import PRIVATE
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(
@@ -77,3 +78,15 @@ def test_a_command_of_a_page_exists_with_its_flags(page: Path, command: str) -> 
     except SystemExit as error:
         if error.code:
             pytest.fail(f"{page.name}: {command}")
+
+
+@pytest.mark.parametrize(
+    "page",
+    # results/ holds what `neurove reproduce` wrote; CHANGELOG names fields
+    [page for page in PAGES if page.name != "CHANGELOG.md" and page.parent.name != "results"],
+    ids=lambda page: str(page.relative_to(ROOT)),
+)
+def test_a_page_has_no_private_word(page: Path) -> None:
+    prose = re.sub(r"```.*?```|`[^`]*`", "", page.read_text(), flags=re.DOTALL)
+    found = sorted({match[0] for match in PRIVATE.finditer(prose)})
+    assert found == []

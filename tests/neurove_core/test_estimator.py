@@ -309,7 +309,7 @@ def test_windows_after_a_gap_are_followed_from_the_zero_state(estimator):
     ],
     ids=["bins", "duration", "grid", "field_of_view"],
 )
-def test_models_with_other_windows_or_another_camera_are_told_apart(estimator, change):
+def test_models_with_other_windows_or_another_camera_are_distinguished(estimator, change):
     assert not Estimator(make_bundle(seed=3, **change)).has_same_windows(estimator)
 
 

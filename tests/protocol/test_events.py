@@ -99,7 +99,7 @@ def test_sensor_time_may_be_negative_and_long(t0_us: int) -> None:
     assert decode_packet(encode_packet(packet)).events.t.tolist() == [t0_us, t0_us + 65_535]
 
 
-def test_the_columns_of_a_packet_can_not_be_written_to_by_accident() -> None:
+def test_the_columns_of_a_packet_are_read_only() -> None:
     x = decode_packet(EVENT_PACKET.bytes()).events.x
     with pytest.raises(ValueError, match="read-only"):
         x[0] = 1
@@ -229,7 +229,7 @@ def test_an_event_outside_the_sensor_is_not_sent() -> None:
 
 
 @pytest.mark.parametrize(("blob_format", "span_us"), [("soa6", 1 << 16), ("soa8", 1 << 32), (None, 1 << 32)])
-def test_a_span_that_the_format_can_not_hold_is_not_sent(blob_format: str | None, span_us: int) -> None:
+def test_a_span_too_long_for_the_format_is_refused(blob_format: str | None, span_us: int) -> None:
     with pytest.raises(InvalidField) as caught:
         encode_packet(packet_of([0, span_us]), blob_format)
     assert str(span_us) in caught.value.message

@@ -325,7 +325,7 @@ def test_nonzero_reports_only_losses_above_zero() -> None:
     assert Losses(gap_packets=2, late_events=1).nonzero() == {"gap_packets": 2, "late_events": 1}
 
 
-def test_a_message_can_not_be_changed_after_it_was_checked() -> None:
+def test_a_checked_message_is_immutable() -> None:
     estimate = TwistEstimate.decode(BY_NAME["TwistEstimate"].bytes())
     with pytest.raises(ValueError, match="frozen"):
         estimate.seq = 2  # type: ignore[misc]  # wrong on purpose
