@@ -28,7 +28,7 @@ class _Connection(NamedTuple):
 
 
 class _BadRecord(Exception):
-    """A record is truncated or corrupt; a message without text means truncated."""
+    """A record is truncated or corrupt. Without a text it is truncated."""
 
 
 class _Record(NamedTuple):
@@ -176,7 +176,7 @@ def _read_exactly(stream: Any, size: int) -> bytes:
 
 
 def _read_record(stream: Any) -> _Record:
-    """Read the header of the next record; the stream then stands at its data."""
+    """Read the header of the next record; its data is next in the stream."""
     length = int.from_bytes(_read_exactly(stream, 4), "little")
     if length > MAX_HEADER_BYTES:
         raise _BadRecord(f"a record header has {length} bytes; the limit is {MAX_HEADER_BYTES}")

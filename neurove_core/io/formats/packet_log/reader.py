@@ -213,5 +213,5 @@ def _accepts(path: Path) -> bool:
 
 
 FORMAT = Format(
-    "FILE.mcap (our own, from `neurove record` and `neurove convert`)", McapRecording.open, (".mcap",), _accepts
+    "FILE.mcap (NeuroVE, from `neurove record` and `neurove convert`)", McapRecording.open, (".mcap",), _accepts
 )

@@ -31,14 +31,14 @@ Progress = Callable[[int, int], None]
 class PacketWriter:
     """Writes one recording atomically: the file gets its name when it is closed, complete.
 
-    Use it in a `with` block: an error in the block removes the partial file. Memory holds one chunk, and about 100 bytes
-    of index for each chunk written.
+    Use it in a `with` block: an error in the block removes the partial file. Memory holds one chunk, and about 100
+    bytes of index for each chunk written.
 
     Args:
         path: the file, with suffix .mcap; an existing file of this name is replaced.
 
     Raises:
-        InvalidField: the file cannot be written; every method may raise this. MissingExtra: mcap is not installed.
+        InvalidField: the file cannot be written; also raised while writing. MissingExtra: mcap is not installed.
     """
 
     def __init__(self, path: Path) -> None:

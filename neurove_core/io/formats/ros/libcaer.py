@@ -43,7 +43,7 @@ class LibcaerState(NamedTuple):
 @compiled
 def signed(word: np.unsignedinteger[Any]) -> int:  # pragma: no cover (machine code)
     """Return the number as a signed integer, which other integers can be combined with."""
-    return np.int64(word)  # type: ignore[return-value]  # in numba int() stays unsigned; with signed integers that gives floats
+    return np.int64(word)  # type: ignore[return-value]  # numba keeps int() unsigned, and mixes it to float
 
 
 @compiled

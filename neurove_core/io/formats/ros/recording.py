@@ -113,7 +113,7 @@ class RosbagRecording(EventsOnly):
             "poses": self._nearest_topic(*POSE_TYPES) is not None,
             "twists": self._nearest_topic(*POSE_TYPES) is not None,
         }
-        return ("events", *(name for name, here in present.items() if here))
+        return ("events", *(name for name, found in present.items() if found))
 
     def chunks(self) -> Iterator[Events]:
         """Yield all events from the beginning; see `Recording`.
