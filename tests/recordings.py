@@ -1,4 +1,4 @@
-"""Recordings for tests: real ones where this machine has them, and small ones written here."""
+"""Recordings for tests: real recordings, if they are available, and small generated ones."""
 
 import struct
 from collections.abc import Sequence
@@ -17,20 +17,20 @@ SHARED = Path(__file__).resolve().parents[1].parent / "shared/data"
 
 
 def shared(path: str) -> Path:
-    """A real recording beside the project; the test is skipped where it is absent."""
+    """Return a real recording from shared/data, or skip the test if it is missing."""
     if not (SHARED / path).exists():
-        pytest.skip(f"the recording shared/data/{path} is not on this machine")
+        pytest.skip(f"the recording shared/data/{path} is not available")
     return SHARED / path
 
 
 def put(folder: Path, name: str, data: bytes) -> str:
-    """A file of these bytes, and its path as a source."""
+    """Write a file and return its path as a source."""
     (folder / name).write_bytes(data)
     return str(folder / name)
 
 
 def read(recording: Recording) -> Events:
-    """All of it, after checking what every recording promises of its chunks."""
+    """Return all events of a recording, and check the guarantees for its chunks."""
     last_us, parts = None, []
     for chunk in recording.chunks():
         assert 0 < chunk.n <= CHUNK_EVENTS
@@ -43,11 +43,11 @@ def read(recording: Recording) -> Events:
 
 
 def read_broken(recording: Recording) -> tuple[Events, BrokenRecording | None]:
-    """What is whole, and what ended it."""
+    """Return the valid events and the error that ended the recording, or None."""
     parts = []
     try:
         for chunk in recording.chunks():
-            parts.append(chunk)  # noqa: PERF402 what came before the error counts
+            parts.append(chunk)  # noqa: PERF402  # keeps the chunks before the error
     except BrokenRecording as error:
         return Events.join(parts), error
     return Events.join(parts), None
@@ -68,23 +68,23 @@ def assert_same(got: Events, want: Events) -> None:
 
 
 def ecd_text(events: Events) -> bytes:
-    """Lines `t[s] x y p` with nine decimals, as the Event Camera Dataset has them."""
+    """Return lines `t[s] x y p` with nine decimals, as in the Event Camera Dataset."""
     rows = zip(*(column.tolist() for column in events), strict=True)
     return "".join(f"{t // 1_000_000}.{t % 1_000_000:06d}000 {x} {y} {p}\n" for t, x, y, p in rows).encode()
 
 
 class Aedat4(NamedTuple):
     data: bytes
-    starts: list[int]  # byte where each packet of events begins
-    stops: list[int]  # byte after each packet of events
-    end: int  # byte after the last packet of any stream
+    starts: list[int]  # offset of each event packet [bytes]
+    stops: list[int]  # end of each event packet [bytes]
+    end: int  # end of the last packet of any stream [bytes]
 
 
 def aedat4(packets: Sequence[Events], sensor: Sensor, *, finished: bool = True) -> Aedat4:
-    """An uncompressed .aedat4 file with a packet of triggers after each packet of events.
+    """Return an uncompressed .aedat4 file with a packet of triggers after each packet of events.
 
-    A finished one says in its header where the packets end and has a table after them; that of a recorder which was
-    killed does neither.
+    The header of a finished file gives the end of the packets, and a table follows them. The file of a killed recorder
+    has neither.
     """
     streams = _stream(0, "EVTS", sensor) + _stream(1, "TRIG")
     xml = f'<dv version="2.0"><node name="outInfo" path="/o/">{streams}</node></dv>'.encode()
@@ -96,7 +96,7 @@ def aedat4(packets: Sequence[Events], sensor: Sensor, *, finished: bool = True) 
         starts.append(at)
         stops.append(at + len(events))
         at += len(events) + len(triggers)
-    # a flatbuffer by hand: root, identifier, table of offsets, the table itself, the string
+    # a hand-written flatbuffer: root, identifier, table of offsets, table, string
     table = struct.pack("<iiqI", 12, 0, at if finished else -1, 4)
     header = struct.pack("<I4sHHHHHxx", 20, b"IOHE", 10, 20, 4, 8, 16) + table + struct.pack("<I", len(xml)) + xml
     data = b"#!AER-DAT4.0\r\n" + struct.pack("<I", len(header) + 1) + header + b"\0"

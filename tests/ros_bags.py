@@ -1,4 +1,4 @@
-"""Bags for tests, written by the rosbags package: events in the layouts of the drivers, and what is recorded beside."""
+"""Bags for tests, written by the rosbags package: events in driver layouts, IMU samples, poses and lenses."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -25,7 +25,7 @@ _OWN = {
 
 
 class Store:
-    """Messages of one ROS generation."""
+    """Message types of one ROS version: 1 or 2."""
 
     def __init__(self, ros: int) -> None:
         self.ros = ros
@@ -59,7 +59,7 @@ def packet(
 
 
 def dvs(store: Store, events: Events, sensor: Sensor = SENSOR) -> Any:
-    """Events with times in us since 1970."""
+    """A dvs_msgs/EventArray of events with unix times [us]."""
     rows = [
         store.of("dvs_msgs/msg/Event", x, y, store.time(t * 1000), bool(p))
         for t, x, y, p in zip(*(column.tolist() for column in events), strict=True)
@@ -70,7 +70,7 @@ def dvs(store: Store, events: Events, sensor: Sensor = SENSOR) -> Any:
 def write_bag(
     path: Path, store: Store, messages: Iterable[tuple[str, int, Any]], *, compression: str = "", mcap: bool = False
 ) -> Path:
-    """A bag of (topic, log time [ns], message); the folder or file that it became."""
+    """Write a bag of (topic, log time [ns], message); return its file or folder."""
     if store.ros == 1:
         writer: Any = Writer1(path)
         if compression:

@@ -1,4 +1,4 @@
-"""What stands beside the packets in our own recordings: tables of columns and images, and what is none."""
+"""Tables and images in NeuroVE recordings: valid messages and invalid messages."""
 
 import msgpack
 import numpy as np
@@ -21,7 +21,7 @@ def with_field(data, **fields):
 @pytest.mark.parametrize(
     ("kind", "table"), [("imu", IMU), ("twists", Twists(np.arange(2, dtype=np.int64), RNG.normal(size=(2, 6))))]
 )
-def test_a_table_comes_back_to_the_last_bit(kind, table):
+def test_a_table_is_read_back_bit_for_bit(kind, table):
     back = unpack_columns(kind, pack_columns(kind, table))
     assert type(back) is type(table)
     for a, b in zip(back, table, strict=True):
@@ -30,7 +30,7 @@ def test_a_table_comes_back_to_the_last_bit(kind, table):
 
 
 @pytest.mark.parametrize("shape", [(3, 4), (3, 4, 3), (0, 4)])
-def test_an_image_comes_back_grey_or_in_colour(shape):
+def test_a_grey_or_colour_image_is_read_back(shape):
     image = RNG.integers(0, 256, shape, np.uint8)
     back = unpack_frame(pack_frame(Frame(-5, image)))
     assert back.t_us == -5
@@ -40,17 +40,17 @@ def test_an_image_comes_back_grey_or_in_colour(shape):
 @pytest.mark.parametrize(
     ("fields", "why"),
     [
-        ({"n": -1}, "n=-1 is no number of rows"),
-        ({"n": True}, "n=True is no number of rows"),
-        ({"n": None}, "n=None is no number of rows"),
+        ({"n": -1}, "n=-1 is not a number of rows"),
+        ({"n": True}, "n=True is not a number of rows"),
+        ({"n": None}, "n=None is not a number of rows"),
         ({"n": 4}, "column t does not have 4 rows"),
         ({"t": None}, "column t does not have 3 rows"),
         ({"gyro_rad_s": "a text"}, "column gyro_rad_s does not have 3 rows"),
         ({"gyro_rad_s": b"12"}, "column gyro_rad_s does not have 3 rows"),
-        ({"v": 2}, "no table of version 1"),
+        ({"v": 2}, "not a map of version 1"),
     ],
 )
-def test_a_table_that_is_none_is_told_by_what_is_wrong(fields, why):
+def test_an_invalid_table_is_rejected_with_the_reason(fields, why):
     with pytest.raises(BadColumns, match=why):
         unpack_columns("imu", with_field(TABLE, **fields))
 
@@ -58,21 +58,21 @@ def test_a_table_that_is_none_is_told_by_what_is_wrong(fields, why):
 @pytest.mark.parametrize(
     ("fields", "why"),
     [
-        ({"t_us": 1.5}, "no image"),
-        ({"height": None}, "no image"),
-        ({"image": "a text"}, "no image"),
-        ({"channels": 2, "width": 2}, "no image of 2x3x2"),
-        ({"width": 5}, "12 bytes are no image of 5x3x1"),
-        ({"height": -3, "width": -4}, "no image of -4x-3x1"),
+        ({"t_us": 1.5}, "not an image"),
+        ({"height": None}, "not an image"),
+        ({"image": "a text"}, "not an image"),
+        ({"channels": 2, "width": 2}, "not an image of 2x3x2"),
+        ({"width": 5}, "12 bytes are not an image of 5x3x1"),
+        ({"height": -3, "width": -4}, "not an image of -4x-3x1"),
     ],
 )
-def test_an_image_that_is_none_is_told_by_what_is_wrong(fields, why):
+def test_an_invalid_image_is_rejected_with_the_reason(fields, why):
     with pytest.raises(BadColumns, match=why):
         unpack_frame(with_field(IMAGE, **fields))
 
 
 @pytest.mark.parametrize("unpack", [unpack_frame, lambda data: unpack_columns("imu", data)])
 @pytest.mark.parametrize("data", [b"", b"\xc1", b"\x93\x01\x02\x03", TABLE[:-1], b"\x81\x80\x01"])
-def test_what_is_no_message_at_all_is_refused(unpack, data):
+def test_bytes_that_are_not_a_message_are_rejected(unpack, data):
     with pytest.raises(BadColumns):
         unpack(data)

@@ -1,4 +1,4 @@
-"""Our own recordings: packets bit for bit, and any recording written as ours."""
+"""NeuroVE recordings: packets bit for bit, and conversion of other recordings."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def write(path, payloads, camera=None):
 
 
 class Rich(EventsOnly):
-    """A recording that holds a little of everything."""
+    """A recording that holds every kind of data."""
 
     name, sensor, endless = "rich", SENSOR, False
 
@@ -66,7 +66,7 @@ class Rich(EventsOnly):
         yield from self.images
 
 
-def test_packets_come_back_bit_for_bit_even_those_that_are_none(tmp_path):
+def test_packets_are_read_back_bit_for_bit_including_invalid_ones(tmp_path):
     payloads = [("b", encode_packet(packet)) for packet in make_packets(40, n=500)]
     payloads[3:3] = [("a", b"no packet at all"), ("a", b""), ("b", payloads[0][1])]
     path = write(tmp_path / "a.mcap", payloads, CAMERA)
@@ -74,10 +74,10 @@ def test_packets_come_back_bit_for_bit_even_those_that_are_none(tmp_path):
     assert [(stream, payload) for stream, payload, _ in recording.packets()] == payloads
     assert [payload for _, payload, _ in recording.packets("a")] == [b"no packet at all", b""]
     assert [log_ns for *_, log_ns in recording.packets()] == [10**18 + i for i in range(len(payloads))]
-    assert recording.cameras() == {}  # of a stream that has no packets
+    assert recording.cameras() == {}  # the camera's stream has no packets
 
 
-def test_a_written_recording_reads_as_the_one_that_it_was_made_of(tmp_path):
+def test_a_converted_recording_equals_its_source(tmp_path):
     rich = Rich(make_events(30_000, duration_us=900_000))
     path = tmp_path / "a.mcap"
     assert write_mcap(rich, path, "left") == 30_000
@@ -99,7 +99,7 @@ def test_a_written_recording_reads_as_the_one_that_it_was_made_of(tmp_path):
     assert McapRecording.open(path).file.metadata["neurove"] == {"source": "rich", "stream": "left", "events": "30000"}
 
 
-def test_packets_are_cut_as_the_driver_cuts_them(tmp_path):
+def test_packets_are_split_as_the_driver_splits_them(tmp_path):
     rich = Rich(make_events(5000, duration_us=100_000))
     write_mcap(rich, tmp_path / "a.mcap")
     packets = [decode_packet(payload) for _, payload, _ in McapRecording.open(tmp_path / "a.mcap").packets()]
@@ -119,7 +119,7 @@ def test_since_gives_exactly_the_later_events(tmp_path):
 
 
 @pytest.mark.parametrize("path", ["rosbag/test_events_2", "ecd/shapes_rotation", "aedat4/dvxplorer.aedat4"])
-def test_a_real_recording_survives_the_way_through_ours(tmp_path, path):
+def test_a_converted_real_recording_equals_its_source(tmp_path, path):
     source = open_source(str(shared(path)))
     write_mcap(source, tmp_path / "a.mcap")
     recording = open_source(str(tmp_path / "a.mcap"))
@@ -127,7 +127,7 @@ def test_a_real_recording_survives_the_way_through_ours(tmp_path, path):
     assert recording.camera("cam0") == source.camera("cam0")
 
 
-def test_of_several_streams_one_is_picked_by_name(tmp_path):
+def test_one_of_several_streams_is_selected_by_name(tmp_path):
     payloads = [(name, encode_packet(make_packet(seed=i, stream=name))) for i, name in enumerate(("right", "left"))]
     path = str(write(tmp_path / "a.mcap", payloads))
     assert open_source(path).name == "a.mcap (left, the first of 2 streams)"
@@ -137,14 +137,14 @@ def test_of_several_streams_one_is_picked_by_name(tmp_path):
         open_source(path, topic="up")
 
 
-def test_a_recording_that_was_cut_before_its_first_packet_holds_no_stream(tmp_path):
+def test_a_recording_truncated_before_its_first_packet_has_no_stream(tmp_path):
     packets = [("cam0", encode_packet(make_packet()))]
-    (tmp_path / "cut.mcap").write_bytes(write(tmp_path / "a.mcap", packets).read_bytes()[:200])
-    with pytest.raises(UnknownSource, match="it holds no stream"):
-        open_source(str(tmp_path / "cut.mcap"))
+    (tmp_path / "truncated.mcap").write_bytes(write(tmp_path / "a.mcap", packets).read_bytes()[:200])
+    with pytest.raises(UnknownSource, match="the file has no stream of events"):
+        open_source(str(tmp_path / "truncated.mcap"))
 
 
-def test_nothing_stands_under_the_name_until_the_recording_is_whole(tmp_path):
+def test_the_file_gets_its_name_only_when_the_recording_is_complete(tmp_path):
     path = tmp_path / "a.mcap"
     with PacketWriter(path) as writer:
         writer.write("cam0", b"1", 0)
@@ -155,7 +155,7 @@ def test_nothing_stands_under_the_name_until_the_recording_is_whole(tmp_path):
     class Broken(Rich):
         def chunks(self):
             yield self.events
-            raise BrokenRecording(path, "byte 7", "cut")
+            raise BrokenRecording(path, "byte 7", "truncated")
 
     with pytest.raises(BrokenRecording, match="byte 7"):
         write_mcap(Broken(make_events(100)), path)
@@ -163,47 +163,47 @@ def test_nothing_stands_under_the_name_until_the_recording_is_whole(tmp_path):
     assert path.read_bytes() == before
 
 
-def test_what_a_killed_recorder_left_can_be_read_once_it_is_renamed(tmp_path):
+def test_the_partial_file_of_a_killed_recorder_can_be_read_after_a_rename(tmp_path):
     packets = make_packets(300, n=4000)
     writer = PacketWriter(tmp_path / "a.mcap")
     for packet in packets:
         writer.write("cam0", encode_packet(packet), 0)
-    (tmp_path / "left.mcap").write_bytes((tmp_path / "a.mcap.part").read_bytes())
+    (tmp_path / "renamed.mcap").write_bytes((tmp_path / "a.mcap.part").read_bytes())
     writer.abandon()
-    events, error = read_broken(open_source(str(tmp_path / "left.mcap")))
+    events, error = read_broken(open_source(str(tmp_path / "renamed.mcap")))
     assert error is not None
     assert 600_000 < events.n < 1_200_000
     assert_same(events, Events.join([packet.events for packet in packets]).span(0, events.n))
 
 
-def test_a_recording_that_was_cut_is_not_written_over(tmp_path):
-    (tmp_path / "a.mcap.part").write_bytes(b"what a killed recorder left")
-    with pytest.raises(NeuroVEError, match=r"a\.mcap\.part.*cut short"):
+def test_an_incomplete_recording_is_not_overwritten(tmp_path):
+    (tmp_path / "a.mcap.part").write_bytes(b"a partial file")
+    with pytest.raises(NeuroVEError, match=r"a\.mcap\.part.*an incomplete recording"):
         PacketWriter(tmp_path / "a.mcap")
-    assert (tmp_path / "a.mcap.part").read_bytes() == b"what a killed recorder left"
+    assert (tmp_path / "a.mcap.part").read_bytes() == b"a partial file"
 
 
 @pytest.mark.parametrize(("name", "why"), [("a.h5", "must end in .mcap"), ("nowhere/a.mcap", "No such file")])
-def test_a_file_that_can_not_be_written_is_told(tmp_path, name, why):
+def test_a_file_that_cannot_be_written_is_reported(tmp_path, name, why):
     with pytest.raises(NeuroVEError, match=why):
         PacketWriter(tmp_path / name)
 
 
-def test_an_endless_source_is_refused(tmp_path):
+def test_an_endless_source_is_rejected(tmp_path):
     with pytest.raises(NeuroVEError, match="it has no end"):
         write_mcap(open_source("pattern://"), tmp_path / "a.mcap")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_wherever_it_is_cut_what_is_whole_comes_and_the_rest_is_told(tmp_path):
+def test_a_truncated_file_gives_its_complete_packets_and_then_an_error(tmp_path):
     events = make_events(3000, duration_us=100_000)
     write_mcap(Rich(events), tmp_path / "a.mcap")
     data, counts = (tmp_path / "a.mcap").read_bytes(), set()
     for size in range(0, len(data), 4001):
-        cut = tmp_path / "cut.mcap"
-        cut.write_bytes(data[:size])
+        truncated = tmp_path / "truncated.mcap"
+        truncated.write_bytes(data[:size])
         try:
-            got, error = read_broken(open_source(str(cut)))
+            got, error = read_broken(open_source(str(truncated)))
         except (UnknownSource, BrokenRecording):
             continue
         assert_same(got, events.span(0, got.n))
@@ -220,11 +220,11 @@ def test_wherever_it_is_cut_what_is_whole_comes_and_the_rest_is_told(tmp_path):
         ([encode_packet(make_packet(t0_us=0, seq=1))], "time"),
         (
             [encode_packet(make_packet(t0_us=9000, sensor=Sensor(80, 60)))],
-            "a sensor 80x60, after those of 64x48",
+            "a packet has sensor 80x60, but the first packet has 64x48",
         ),
     ],
 )
-def test_a_bad_packet_ends_the_events_with_its_place_but_not_the_packets(tmp_path, payloads, why):
+def test_an_invalid_packet_ends_the_events_with_its_place_but_not_the_packets(tmp_path, payloads, why):
     good = make_packet(t0_us=5000)
     path = write(tmp_path / "a.mcap", [("cam0", one) for one in (encode_packet(good), *payloads, b"last")])
     recording = McapRecording.open(path)

@@ -1,4 +1,4 @@
-"""ROS bags: the real ones, every encoding and container as the rosbags package writes them, and broken ones."""
+"""ROS bags: real bags, every encoding and container as the rosbags package writes them, and damaged bags."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def mono(events: Events, base_ns: int = 0) -> bytes:
 
 
 def in_packets(store, events, per=400, encoding="mono"):
-    """(topic, log time, message) of all events, cut into packets."""
+    """Yield (topic, log time, message) of all events, split into packets."""
     for seq, first in enumerate(range(0, events.n, per)):
         part = events.span(first, min(first + per, events.n))
         base_ns = int(part.t[0]) * 1000
@@ -34,7 +34,7 @@ def in_packets(store, events, per=400, encoding="mono"):
         yield TOPIC, ns, message
 
 
-# --- real ones ------------------------------------------------------------------------------------------------------
+# --- real bags ------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -57,7 +57,7 @@ def test_a_real_bag_holds_its_known_events(path, sensor, on, off, first_us, last
     assert (events.t[0], events.t[-1]) == (first_us, last_us)
 
 
-def test_event_and_trigger_times_add_up_to_what_the_public_decoder_gives():
+def test_the_sum_of_event_and_trigger_times_equals_that_of_the_public_decoder():
     recording = open_source(str(shared("rosbag/test_events_1")))
     triggers = list(recording.triggers())
     t = np.concatenate([part.t for part in triggers])
@@ -77,15 +77,15 @@ def test_since_gives_exactly_the_later_events_of_a_real_bag(path):
         assert_same(later, events.span(int(np.searchsorted(events.t, t_us)), events.n))
 
 
-def test_half_a_real_bag_gives_its_first_half_and_says_where_it_ends(tmp_path):
+def test_the_first_half_of_a_real_bag_gives_its_events_and_an_error_with_the_place(tmp_path):
     for name in ("test_events_1.bag", "test_events_2/test_events_2_0.mcap", "test_events_1/test_events_1.db3"):
         path = shared(f"rosbag/{name}")
-        cut = tmp_path / path.name
-        cut.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-        whole = read(open_source(str(path)))
-        events, error = read_broken(open_source(str(cut)))
-        assert 0.2 * whole.n < events.n < 0.8 * whole.n
-        assert_same(events, whole.span(0, events.n))
+        truncated = tmp_path / path.name
+        truncated.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+        complete = read(open_source(str(path)))
+        events, error = read_broken(open_source(str(truncated)))
+        assert 0.2 * complete.n < events.n < 0.8 * complete.n
+        assert_same(events, complete.span(0, events.n))
         assert error is not None
         assert ("byte" if path.suffix != ".db3" else "message") in error.details["where"]
 
@@ -94,7 +94,7 @@ def test_half_a_real_bag_gives_its_first_half_and_says_where_it_ends(tmp_path):
 
 
 @pytest.mark.parametrize("container", ["bag", "bag bz2", "bag lz4", "db3", "mcap"])
-def test_events_come_back_from_every_container(tmp_path, container):
+def test_events_are_read_unchanged_from_every_container(tmp_path, container):
     events = make_events(5000, duration_us=500_000)
     name, _, compression = container.partition(" ")
     store = ros_bags.Store(1 if name == "bag" else 2)
@@ -108,7 +108,7 @@ def test_events_come_back_from_every_container(tmp_path, container):
 
 @pytest.mark.parametrize("ros", [1, 2])
 @pytest.mark.parametrize("n", [0, 1, 2, 777])
-def test_dvs_msgs_have_their_events_in_both_layouts(tmp_path, ros, n):
+def test_dvs_msgs_are_read_in_both_layouts(tmp_path, ros, n):
     store = ros_bags.Store(ros)
     events = make_events(n, start_us=STAMP_NS // 1000)
     closing = make_events(3, start_us=STAMP_NS // 1000 + 200_000)
@@ -117,9 +117,9 @@ def test_dvs_msgs_have_their_events_in_both_layouts(tmp_path, ros, n):
     assert_same(read(open_source(str(path))), Events.join([events, closing]))
 
 
-def test_split_files_of_a_folder_are_read_in_the_order_of_their_numbers(tmp_path):
+def test_the_files_of_a_folder_are_read_in_the_order_of_their_numbers(tmp_path):
     store, events = ros_bags.Store(2), make_events(3000, duration_us=300_000)
-    folder = tmp_path / "whole"
+    folder = tmp_path / "folder"
     folder.mkdir()
     packets = list(in_packets(store, events, 250))
     for part in range(12):
@@ -141,22 +141,22 @@ def evt3_bag(tmp_path, parts, *, seqs=None, stamps_us=None):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_evt3_words_do_not_depend_on_how_they_are_cut_into_messages(tmp_path, seed):
-    events = make_events(4000, seed=seed, start_us=16_700_000, duration_us=300_000)  # over the wrap of 24 bits
+def test_evt3_events_do_not_depend_on_how_the_words_are_split_into_messages(tmp_path, seed):
+    events = make_events(4000, seed=seed, start_us=16_700_000, duration_us=300_000)  # includes a wrap of 24 bits
     written = write_evt3(events)
-    cuts = np.sort(np.random.default_rng(seed).integers(0, written.words.size, 9))
-    got = read(open_source(str(evt3_bag(tmp_path, np.split(written.words, cuts)))))
+    splits = np.sort(np.random.default_rng(seed).integers(0, written.words.size, 9))
+    got = read(open_source(str(evt3_bag(tmp_path, np.split(written.words, splits)))))
     assert_same(got, events)
 
 
-def test_after_lost_messages_evt3_time_goes_on_where_the_stamps_say_even_past_a_wrap(tmp_path):
+def test_after_lost_messages_evt3_time_follows_the_stamps_across_a_wrap(tmp_path):
     before, after = make_events(50, start_us=1_000_000, duration_us=1000), make_events(60, start_us=40_000_000)
     stamps = [1_000_000, 40_000_000 + 3_000]
     path = evt3_bag(tmp_path, [write_evt3(before).words, write_evt3(after).words], seqs=[0, 7], stamps_us=stamps)
     assert_same(read(open_source(str(path))), Events.join([before, after]))
 
 
-def test_rows_of_before_a_gap_are_not_used_after_it(tmp_path):
+def test_a_row_from_before_a_gap_is_not_used_after_the_gap(tmp_path):
     first = evt3((TIME_HIGH, 1), (ADDR_Y, 5), (ADDR_X, 3))
     path = evt3_bag(tmp_path, [first, evt3((TIME_HIGH, 2), (ADDR_X, 4)), evt3((ADDR_X, 9))], seqs=[0, 2, 3])
     assert read(open_source(str(path))).n == 1
@@ -168,7 +168,7 @@ def test_triggers_have_the_time_level_and_channel_of_their_words(tmp_path):
     assert [(list(t), list(c), list(level)) for t, c, level in triggers] == [([8199], [6], [1]), ([8201], [3], [0])]
 
 
-def test_triggers_keep_to_the_clock_of_the_events_over_a_gap(tmp_path):
+def test_triggers_stay_on_the_clock_of_the_events_after_a_gap(tmp_path):
     words = [evt3((TIME_HIGH, 2), (ADDR_Y, 0), (ADDR_X, 1), (TRIGGER, 1)), evt3((TIME_HIGH, 4), (TRIGGER, 0))]
     path = evt3_bag(tmp_path, words, seqs=[0, 9], stamps_us=[8_192, (1 << 24) + 16_384 + 500])
     triggers = list(open_source(str(path)).triggers())
@@ -179,7 +179,7 @@ def libcaer(low, x, y, p, valid=1):
     return np.array([(valid | p << 1 | y << 2 | x << 17, low)], [("data", "<u4"), ("t", "<i4")]).tobytes()
 
 
-def test_libcaer_time_is_carried_over_its_wrap_and_invalid_events_are_left_out(tmp_path):
+def test_libcaer_time_is_unwrapped_and_invalid_events_are_skipped(tmp_path):
     store = ros_bags.Store(2)
     data = libcaer((1 << 31) - 2, 1, 2, 1) + libcaer((1 << 31) - 1, 9, 9, 0, valid=0) + libcaer(3, 4, 5, 0)
     message = ros_bags.packet(store, data, ns=STAMP_NS, seq=0, base_ns=7_000, encoding="libcaer")
@@ -189,7 +189,7 @@ def test_libcaer_time_is_carried_over_its_wrap_and_invalid_events_are_left_out(t
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_libcaer_cmp_and_its_plain_reference_agree(seed):
+def test_libcaer_cmp_agrees_with_its_reference_implementation(seed):
     rng = np.random.default_rng(seed)
     kinds = rng.choice(6 if seed % 2 else 7, 500, p=None if seed % 2 else [1 / 6] * 5 + [0.16, 1 / 6 - 0.16])
     words = (kinds << 12 | rng.integers(0, 1 << 12, 500) & rng.choice([0x81F, 0xFFF], 500, p=[0.98, 0.02])).astype(
@@ -210,17 +210,17 @@ def test_libcaer_cmp_and_its_plain_reference_agree(seed):
         state = got
 
 
-# --- beside the events ----------------------------------------------------------------------------------------------
+# --- IMU, poses and lens --------------------------------------------------------------------------------------------
 
 
-def beside(store, i):
+def imu_and_pose(store, i):
     of, ns = store.of, STAMP_NS + i * 10**6
     point = of("geometry_msgs/msg/Point", float(i), 2.0, 3.0)
-    turn = of("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.6, 0.8)
+    rotation = of("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.6, 0.8)
     zeros = np.zeros(9)
     gyro, accel = of("geometry_msgs/msg/Vector3", 0.1, 0.2, float(i)), of("geometry_msgs/msg/Vector3", 1.0, 2.0, 9.8)
-    yield "/cam/imu", ns, of(ros_bags.IMU, store.header(ns, "imu"), turn, zeros, gyro, zeros, accel, zeros)
-    yield "/cam/pose", ns, of(ros_bags.POSE, store.header(ns, "w"), of("geometry_msgs/msg/Pose", point, turn))
+    yield "/cam/imu", ns, of(ros_bags.IMU, store.header(ns, "imu"), rotation, zeros, gyro, zeros, accel, zeros)
+    yield "/cam/pose", ns, of(ros_bags.POSE, store.header(ns, "w"), of("geometry_msgs/msg/Pose", point, rotation))
 
 
 def camera_message(store, sensor, model="plumb_bob"):
@@ -231,13 +231,13 @@ def camera_message(store, sensor, model="plumb_bob"):
 
 
 @pytest.mark.parametrize("ros", [1, 2])
-def test_imu_poses_and_lens_are_read_on_the_events_clock(tmp_path, ros):
+def test_imu_poses_and_lens_are_read_on_the_clock_of_the_events(tmp_path, ros):
     store, events = ros_bags.Store(ros), make_events(100, start_us=2_000_000, duration_us=1000)
     base_ns = int(events.t[0]) * 1000
     packet = ros_bags.packet(store, mono(events, base_ns), ns=STAMP_NS, seq=0, base_ns=base_ns, encoding="mono")
     messages = [(TOPIC, STAMP_NS, packet), ("/cam/camera_info", STAMP_NS, camera_message(store, SENSOR))]
     messages += [("/other/camera_info", STAMP_NS, camera_message(store, Sensor(9, 9)))]
-    messages += [one for i in range(5000) for one in beside(store, i)]
+    messages += [one for i in range(5000) for one in imu_and_pose(store, i)]
     recording = open_source(str(ros_bags.write_bag(tmp_path / "a.bag", store, messages)))
     assert recording.streams == ("events", "imu", "poses", "twists")
     parts = list(recording.imu())
@@ -250,7 +250,7 @@ def test_imu_poses_and_lens_are_read_on_the_events_clock(tmp_path, ros):
     np.testing.assert_array_equal(poses.t, t)
     np.testing.assert_allclose(poses.position_m[7], (7, 2, 3))
     np.testing.assert_allclose(poses.orientation[7], (0, 0, 0.6, 0.8))
-    twists = recording.twists()  # 1 m of x each ms, seen from a body turned by 73.7 degrees about z
+    twists = recording.twists()  # 1 m in x per ms, in the frame of a body rotated by 73.7 degrees about z
     assert twists is not None
     np.testing.assert_allclose(twists.twist[2500], (280, -960, 0, 0, 0, 0), atol=1e-6)
     camera = recording.camera("cam3")
@@ -268,12 +268,17 @@ def test_imu_poses_and_lens_are_read_on_the_events_clock(tmp_path, ros):
     ("second", "why"),
     [((STAMP_NS - 1, 1.0), "time runs backwards"), ((STAMP_NS + 10**6, 2.0), "are not a pose")],
 )
-def test_a_pose_that_can_not_be_is_refused_and_one_that_came_twice_is_kept_once(tmp_path, second, why):
+def test_an_invalid_pose_is_rejected_and_a_repeated_pose_is_kept_once(tmp_path, second, why):
     store, of = ros_bags.Store(2), ros_bags.Store(2).of
     messages = list(in_packets(store, make_events(10)))
     for ns, w in ((STAMP_NS, 1.0), (STAMP_NS, 1.0), second):
-        turn, point = of("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, w), of("geometry_msgs/msg/Point", 1.0, 2.0, 3.0)
-        messages.append(("/pose", ns, of(ros_bags.POSE, store.header(ns), of("geometry_msgs/msg/Pose", point, turn))))
+        rotation, point = (
+            of("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, w),
+            of("geometry_msgs/msg/Point", 1.0, 2.0, 3.0),
+        )
+        messages.append(
+            ("/pose", ns, of(ros_bags.POSE, store.header(ns), of("geometry_msgs/msg/Pose", point, rotation)))
+        )
     with pytest.raises(BrokenRecording, match=f"message 4.*{why}"):
         open_source(str(ros_bags.write_bag(tmp_path / "bad", store, messages))).poses()
     poses = open_source(str(ros_bags.write_bag(tmp_path / "good", store, messages[:-1]))).poses()
@@ -281,15 +286,15 @@ def test_a_pose_that_can_not_be_is_refused_and_one_that_came_twice_is_kept_once(
     assert poses.t.size == 1
 
 
-def test_odometry_gives_poses_too(tmp_path):
+def test_odometry_gives_poses(tmp_path):
     store, of = ros_bags.Store(2), ros_bags.Store(2).of
     pose = of(
         "geometry_msgs/msg/Pose",
         of("geometry_msgs/msg/Point", 1.0, 2.0, 3.0),
         of("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0),
     )
-    still = of("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
-    twist = of("geometry_msgs/msg/TwistWithCovariance", of("geometry_msgs/msg/Twist", still, still), np.zeros(36))
+    zero = of("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
+    twist = of("geometry_msgs/msg/TwistWithCovariance", of("geometry_msgs/msg/Twist", zero, zero), np.zeros(36))
     odometry = of(
         ros_bags.ODOMETRY,
         store.header(STAMP_NS),
@@ -303,10 +308,10 @@ def test_odometry_gives_poses_too(tmp_path):
     assert list(poses.position_m[0]) == [1, 2, 3]
 
 
-# --- what is wrong --------------------------------------------------------------------------------------------------
+# --- selection and errors -------------------------------------------------------------------------------------------
 
 
-def test_of_several_topics_the_first_is_taken_or_the_one_asked_for(tmp_path):
+def test_the_first_topic_or_the_given_topic_is_read(tmp_path):
     store, left, right = ros_bags.Store(2), make_events(50, seed=1), make_events(60, seed=2)
     messages = [("/right/events", ns, message) for _, ns, message in in_packets(store, right)]
     messages += [("/left/events", ns, message) for _, ns, message in in_packets(store, left)]
@@ -321,23 +326,23 @@ def test_of_several_topics_the_first_is_taken_or_the_one_asked_for(tmp_path):
         open_source(path, topic="/nowhere")
 
 
-def test_a_bag_without_events_says_what_it_has(tmp_path):
+def test_the_error_for_a_bag_without_events_lists_its_topics(tmp_path):
     store = ros_bags.Store(2)
-    path = ros_bags.write_bag(tmp_path / "a", store, beside(store, 0))
+    path = ros_bags.write_bag(tmp_path / "a", store, imu_and_pose(store, 0))
     with pytest.raises(UnknownSource, match="no topic has events; it has /cam/imu, /cam/pose"):
         open_source(str(path))
 
 
 @pytest.mark.parametrize("name", ["a.bag", "a.db3", "a.mcap"])
 @pytest.mark.parametrize("data", [b"", b"no bag at all, but some text" * 20])
-def test_what_is_no_bag_is_refused(tmp_path, name, data):
+def test_a_file_that_is_not_a_bag_is_rejected(tmp_path, name, data):
     (tmp_path / name).write_bytes(data)
     with pytest.raises(UnknownSource):
         open_source(str(tmp_path / name))
 
 
 @pytest.mark.parametrize("container", ["bag", "bag lz4", "mcap"])
-def test_wherever_a_bag_is_cut_what_is_whole_comes_and_the_rest_is_told(tmp_path, container):
+def test_a_truncated_bag_gives_its_complete_messages_and_then_an_error(tmp_path, container):
     events = make_events(600, duration_us=60_000)
     name, _, compression = container.partition(" ")
     store = ros_bags.Store(1 if name == "bag" else 2)
@@ -346,30 +351,30 @@ def test_wherever_a_bag_is_cut_what_is_whole_comes_and_the_rest_is_told(tmp_path
     path = path / "a.mcap" if path.is_dir() else path
     data, counts = path.read_bytes(), set()
     for size in range(0, len(data), 211):
-        (tmp_path / f"cut.{name}").write_bytes(data[:size])
+        (tmp_path / f"truncated.{name}").write_bytes(data[:size])
         try:
-            got, error = read_broken(RosbagRecording.open(tmp_path / f"cut.{name}"))
+            got, error = read_broken(RosbagRecording.open(tmp_path / f"truncated.{name}"))
         except (UnknownSource, BrokenRecording):
             continue
         assert_same(got, events.span(0, got.n))
         assert error is not None or got.n == events.n
         counts.add(got.n)
-    assert len(counts) > (0 if compression else 5)  # one block of lz4 is whole or nothing
+    assert len(counts) > (0 if compression else 5)  # an lz4 block is read completely or not at all
 
 
 @pytest.mark.parametrize("container", ["bag", "db3", "mcap"])
-def test_garbled_bytes_never_end_in_anything_but_our_errors(tmp_path, container):
+def test_corrupt_bytes_raise_only_recording_errors(tmp_path, container):
     events, store = make_events(600, duration_us=60_000), ros_bags.Store(1 if container == "bag" else 2)
     path = tmp_path / ("a.bag" if container == "bag" else "a")
     ros_bags.write_bag(path, store, in_packets(store, events, 50), mcap=container == "mcap")
     path = path / f"a.{container}" if path.is_dir() else path
     rng, data = np.random.default_rng(0), path.read_bytes()
     for _ in range(150):
-        garbled = np.frombuffer(data, np.uint8).copy()
-        garbled[rng.integers(0, garbled.size, 20)] = rng.integers(0, 256, 20)
-        (tmp_path / f"bad.{container}").write_bytes(garbled.tobytes())
+        corrupt = np.frombuffer(data, np.uint8).copy()
+        corrupt[rng.integers(0, corrupt.size, 20)] = rng.integers(0, 256, 20)
+        (tmp_path / f"corrupt.{container}").write_bytes(corrupt.tobytes())
         try:
-            recording = RosbagRecording.open(tmp_path / f"bad.{container}", SENSOR)
+            recording = RosbagRecording.open(tmp_path / f"corrupt.{container}", SENSOR)
         except (UnknownSource, BrokenRecording):
             continue
         read_broken(recording)
@@ -378,19 +383,19 @@ def test_garbled_bytes_never_end_in_anything_but_our_errors(tmp_path, container)
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        ({"encoding": "evt9"}, "its encoding is 'evt9'; known are evt3, libcaer, libcaer_cmp, mono"),
-        ({"data": b"\0" * 9}, "its 9 bytes are no multiple of 8"),
+        ({"encoding": "evt9"}, "unknown encoding 'evt9'; supported: evt3, libcaer, libcaer_cmp, mono"),
+        ({"data": b"\0" * 9}, "9 bytes are not a multiple of 8"),
         ({"data": mono(Events.from_columns([1], [64], [0], [1]))}, "lies outside the sensor 64x48"),
         ({"data": mono(Events.from_columns([1], [0], [0], [1]))}, "time"),
         (
             {"encoding": "evt3", "data": evt3((TIME_HIGH, 1), (1, 0)).tobytes()},
-            "its word 1, 0x1000, is of no known type",
+            "word 1 (0x1000) has an unknown type",
         ),
-        ({"encoding": "libcaer_cmp", "data": b"\0\xf0"}, "its word 0, 0xf000, is of no known type"),
-        ({"encoding": "libcaer", "data": libcaer(-1, 0, 0, 0)}, "a time is below 0"),
+        ({"encoding": "libcaer_cmp", "data": b"\0\xf0"}, "word 0 (0xf000) has an unknown type"),
+        ({"encoding": "libcaer", "data": libcaer(-1, 0, 0, 0)}, "an event has a negative time"),
     ],
 )
-def test_a_bad_message_ends_the_recording_with_its_place_and_reason(tmp_path, change, why):
+def test_an_invalid_message_ends_the_recording_with_its_place_and_reason(tmp_path, change, why):
     store, events = ros_bags.Store(2), make_events(800, start_us=10, duration_us=10_000)
     fields = {"data": b"", "ns": STAMP_NS, "seq": 2, "encoding": "mono"} | change
     messages = [*in_packets(store, events), (TOPIC, STAMP_NS, ros_bags.packet(store, **fields))]

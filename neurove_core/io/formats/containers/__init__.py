@@ -1,1 +1,1 @@
-"""Containers of messages: ROS 1 and ROS 2 bags, MCAP."""
+"""Message containers: ROS 1 bags, ROS 2 bags and MCAP files."""

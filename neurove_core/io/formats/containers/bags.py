@@ -1,7 +1,7 @@
-"""Bag files: messages as bytes in the order they were recorded, of ROS 2 SQLite files and of folders of several files.
+"""Bag files: messages as bytes, in recorded order. This module reads ROS 2 SQLite files and folders of several files.
 
-`mcap_file.py` and `ros1_file.py` give the same for the other two containers. No library reads the files: those there
-are open a file only as a whole, so of a broken one they give nothing.
+`mcap.py` and `ros1.py` read the other two containers. The package does not use the existing bag libraries: they open
+only complete files and read nothing from a damaged one.
 """
 
 import re
@@ -18,47 +18,47 @@ T = TypeVar("T")
 
 ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 MAX_RECORD_BYTES: Final = 64 << 20
-"""Cap of one message or chunk, before and after it is decompressed."""
+"""Maximum size of one message or chunk [bytes], compressed and decompressed."""
 
 
 class BagMessage(NamedTuple):
-    """One message, not decoded."""
+    """One message that is not decoded."""
 
     topic: str
-    log_ns: int  # when it was recorded: the recorder's clock [ns]
-    where: str  # in the file, for people
+    log_ns: int  # record time on the recorder's clock [ns]
+    where: str  # readable position in the file
     data: bytes
 
 
 class BagFile(Protocol):
-    """What every container answers."""
+    """Interface of every container."""
 
     @property
     def path(self) -> Path:
-        """Where it lies."""
+        """Path of the file or folder."""
 
     @property
     def topics(self) -> dict[str, str]:
-        """Type of each topic, as `package/Name`."""
+        """Message type of each topic, as `package/Name`."""
 
     @property
     def cdr(self) -> bool:
-        """Whether messages are CDR, as in ROS 2, or ROS 1."""
+        """True for CDR messages (ROS 2), False for ROS 1 messages."""
 
     def messages(self, topics: Collection[str], since_ns: int | None = None) -> Iterator[BagMessage]:
-        """The messages of these topics, in the order recorded.
+        """Yield the messages of these topics in recorded order.
 
         Args:
-            topics: which.
-            since_ns: messages logged before this may be left out, where the container has an index.
+            topics: names of the topics.
+            since_ns: log time [ns]. A container with an index may skip messages before it.
 
         Raises:
-            BrokenRecording: after everything whole was handed out.
+            BrokenRecording: the file is damaged. It is raised after all complete messages.
         """
 
 
 def type_name(ros: str) -> str:
-    """A message type without the `msg` that ROS 2 puts in its middle.
+    """Return a message type without the `msg` part that ROS 2 adds.
 
     >>> type_name("sensor_msgs/msg/Imu")
     'sensor_msgs/Imu'
@@ -68,7 +68,7 @@ def type_name(ros: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class SqliteBag:
-    """A .db3 file of rosbag2."""
+    """A .db3 file written by rosbag2."""
 
     path: Path
     topics: dict[str, str]
@@ -76,22 +76,25 @@ class SqliteBag:
 
     @classmethod
     def open(cls, path: Path) -> "SqliteBag":
-        """The bag in this file.
+        """Open the bag in this file.
 
         Raises:
-            UnknownSource: it is no such file.
+            UnknownSource: the file is not a ROS 2 bag.
         """
         try:
-            with _connected(path) as connection:
+            with _ReadConnection(path) as connection:
                 rows = connection.execute("SELECT name, type FROM topics").fetchall()
         except sqlite3.Error as error:
             raise UnknownSource(path, f"not a ROS 2 bag: {error}") from None
         return cls(path, {str(name): type_name(str(kind)) for name, kind in rows})
 
     def messages(self, topics: Collection[str], since_ns: int | None = None) -> Iterator[BagMessage]:
-        """See `BagFile`. By row, not by the index of times, which lies at the end and is lost when the file is cut."""
-        first, done = 0, 0
-        with _connected(self.path) as connection:
+        """See `BagFile`.
+
+        Rows are read by number. The index of times is at the end of the file and is missing in a truncated file.
+        """
+        first, last = 0, 0
+        with _ReadConnection(self.path) as connection:
             if since_ns is not None:
                 query = "SELECT min(id) FROM messages WHERE timestamp >= ?"
                 (found,) = _checked(
@@ -103,23 +106,23 @@ class SqliteBag:
                 f"WHERE m.id >= ? AND t.name IN ({','.join('?' * len(topics))}) ORDER BY m.id"
             )
             rows = _checked(self.path, 0, lambda: connection.execute(query, (first, *topics)))
-            while (row := _checked(self.path, done, rows.fetchone)) is not None:
+            while (row := _checked(self.path, last, rows.fetchone)) is not None:
                 number, topic, log_ns, data = row
-                done = int(number)
+                last = int(number)
                 where = f"message {number}"
                 if not isinstance(data, bytes) or not isinstance(log_ns, int):
-                    raise BrokenRecording(self.path, where, "it is no message")
-                yield BagMessage(topic, log_ns, where, unpacked(self.path, where, data))
+                    raise BrokenRecording(self.path, where, "this row is not a message")
+                yield BagMessage(topic, log_ns, where, decompressed(self.path, where, data))
 
 
-class _connected:  # noqa: N801  # reads as the verb that it is
-    """A connection for reading, closed with the block."""
+class _ReadConnection:
+    """A read-only connection that closes at the end of the block."""
 
     def __init__(self, path: Path) -> None:
-        # a file on a disk that can not be written must be told immutable, but then changes in its log are not seen
-        alone = "" if path.with_name(path.name + "-wal").exists() else "&immutable=1"
-        self._connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro{alone}", uri=True)
-        self._connection.execute("PRAGMA writable_schema=ON")  # else SQLite gives nothing at all of a file that was cut
+        # SQLite opens a file on a read-only disk only as immutable, but then it ignores the write-ahead log
+        immutable = "" if path.with_name(path.name + "-wal").exists() else "&immutable=1"
+        self._connection = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro{immutable}", uri=True)
+        self._connection.execute("PRAGMA writable_schema=ON")  # without it SQLite reads nothing from a truncated file
 
     def __enter__(self) -> sqlite3.Connection:
         return self._connection
@@ -128,20 +131,22 @@ class _connected:  # noqa: N801  # reads as the verb that it is
         self._connection.close()
 
 
-def _checked(path: Path, done: int, call: Callable[[], T]) -> T:
+def _checked(path: Path, last: int, call: Callable[[], T]) -> T:
+    """Run an SQLite call; `last` is the number of the last message that was read."""
     try:
         return call()
     except sqlite3.Error as error:
-        raise BrokenRecording(path, f"the message after message {done}", str(error)) from None
+        raise BrokenRecording(path, f"the message after message {last}", str(error)) from None
 
 
-def unpacked(path: Path, where: str, data: bytes) -> bytes:
-    """A message that rosbag2 compressed by itself, as it was before; others as they are.
+def decompressed(path: Path, where: str, data: bytes) -> bytes:
+    """Decompress a message that rosbag2 compressed on its own; return any other message unchanged.
 
-    CDR begins with a zero and ROS 1 with a small number, so that the first bytes of zstd are neither.
+    CDR begins with a zero and ROS 1 begins with a small number. Neither matches the first bytes of zstd.
 
     Raises:
-        BrokenRecording: it can not be decompressed. MissingExtra: the library for it is not here.
+        BrokenRecording: the message cannot be decompressed, or it is larger than `MAX_RECORD_BYTES`.
+        MissingExtra: zstandard is not installed.
     """
     if not data.startswith(ZSTD_MAGIC):
         return data
@@ -155,13 +160,13 @@ def unpacked(path: Path, where: str, data: bytes) -> bytes:
     except zstandard.ZstdError as error:
         raise BrokenRecording(path, where, str(error)) from None
     if len(plain) > MAX_RECORD_BYTES:
-        raise BrokenRecording(path, where, f"a message has at most {MAX_RECORD_BYTES} bytes")
+        raise BrokenRecording(path, where, f"the message has more than {MAX_RECORD_BYTES} bytes")
     return plain
 
 
 @dataclass(frozen=True, slots=True)
 class BagFolder:
-    """A folder of rosbag2: one file after the other."""
+    """A rosbag2 folder, read one file after the other."""
 
     path: Path
     files: tuple[BagFile, ...]
@@ -184,16 +189,21 @@ class BagFolder:
 
 
 def in_recorded_order(folder: Path) -> list[Path]:
-    """The .db3 or .mcap files of a rosbag2 folder, by the number that the recorder put at the end of their names.
+    """Return the .db3 or .mcap files of a rosbag2 folder, sorted by the number at the end of their names.
 
-    Not by metadata.yaml, which is missing where the recorder was killed and wrong where a file was renamed.
+    The recorder writes that number. metadata.yaml is not used: it is missing if the recorder was killed, and it is
+    wrong if a file was renamed.
 
     Raises:
-        UnknownSource: there are none.
+        UnknownSource: the folder has no such file.
     """
     files = [path for path in folder.iterdir() if path.suffix in (".db3", ".mcap")]
     if not files:
-        packed = any(path.suffix == ".zstd" for path in folder.iterdir())
-        why = "its files are compressed as a whole: `zstd -d` them" if packed else "the folder has no .db3 or .mcap"
+        compressed = any(path.suffix == ".zstd" for path in folder.iterdir())
+        why = (
+            "its files are compressed: decompress them with `zstd -d`"
+            if compressed
+            else "the folder has no .db3 or .mcap file"
+        )
         raise UnknownSource(folder, why)
     return sorted(files, key=lambda path: (int((re.findall(r"_(\d+)$", path.stem) or [-1])[0]), path.name))

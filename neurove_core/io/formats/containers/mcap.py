@@ -1,7 +1,7 @@
-"""MCAP files: messages as bytes, of files that are whole or cut. Source: mcap.dev/spec.
+"""MCAP files: messages as bytes, from complete and from truncated files. Source: mcap.dev/spec.
 
-The records are walked here, for the `mcap` package reads a file without an end from memory, or not at all, and does not
-say at which byte it failed; the few records of the index are parsed by it.
+This module reads the records itself. The `mcap` package reads a file without an end from memory or not at all, and it
+does not report the byte at which it failed. The package parses only the few records of the index.
 """
 
 import zlib
@@ -13,7 +13,7 @@ from typing import Any, BinaryIO, NamedTuple, Self
 
 from neurove_core.extras import MissingExtra
 from neurove_core.io.errors import BrokenRecording, UnknownSource
-from neurove_core.io.formats.containers.bags import MAX_RECORD_BYTES, BagMessage, type_name, unpacked
+from neurove_core.io.formats.containers.bags import MAX_RECORD_BYTES, BagMessage, decompressed, type_name
 from neurove_core.io.formats.containers.mcap_records import (
     CHANNEL,
     CHUNK,
@@ -29,22 +29,22 @@ from neurove_core.io.formats.containers.mcap_records import (
     SCHEMA,
     Channel,
     ChunkIndex,
-    Found,
+    Definitions,
     NoSummary,
-    bad_record,
+    add_definition,
     length_at,
-    note,
+    record_errors,
     summary,
 )
 
 
 class Record(NamedTuple):
-    """One message and where it stands."""
+    """One message and its position in the file."""
 
     channel: Channel
-    log_ns: int
-    publish_ns: int
-    where: str
+    log_ns: int  # record time [ns]
+    publish_ns: int  # publish time [ns]
+    where: str  # readable position in the file
     data: bytes
 
 
@@ -55,19 +55,20 @@ class McapFile:
     path: Path
     profile: str
     channels: dict[int, Channel]
-    chunks: tuple[ChunkIndex, ...]  # in the order recorded; empty where the file has no index
+    chunks: tuple[ChunkIndex, ...]  # in recorded order; empty if the file has no index
     metadata: dict[str, dict[str, str]]
 
     @classmethod
     def open(cls, path: Path) -> Self:
-        """The file; where it has no index at its end, it is read once to learn of its channels.
+        """Open the file. A file without an index is read once to find its channels.
 
         Raises:
-            UnknownSource: it is no MCAP file. MissingExtra: the package that parses its index is not here.
+            UnknownSource: the file is not an MCAP file.
+            MissingExtra: mcap, or the library of the file's compression, is not installed.
         """
         with path.open("rb") as file:
             if file.read(len(MAGIC)) != MAGIC:
-                raise UnknownSource(path, "the file does not begin as MCAP does")
+                raise UnknownSource(path, "the file does not begin with the MCAP signature")
             head = RECORD.unpack(file.read(RECORD.size).ljust(RECORD.size, b"\0"))
             if head[0] != HEADER or not 4 <= head[1] <= 1 << 16:
                 raise UnknownSource(path, "the file has no MCAP header")
@@ -76,13 +77,13 @@ class McapFile:
             try:
                 found, chunks, metadata = summary(file)
             except NoSummary:
-                found, chunks, metadata = Found(), (), {}
+                found, chunks, metadata = Definitions(), (), {}
         if not found.channels:
             self = cls(path, profile, {}, (), {})
             try:
                 for _ in self._walk(found, frozenset(), metadata):
                     pass
-            except BrokenRecording:  # told when it is read
+            except BrokenRecording:  # reading the messages raises it again
                 pass
         return cls(path, profile, found.channels, chunks, metadata)
 
@@ -93,7 +94,7 @@ class McapFile:
 
     @property
     def cdr(self) -> bool:
-        """Whether messages are CDR; else ROS 1's."""
+        """True for CDR messages (ROS 2), False for ROS 1 messages."""
         return not any(channel.encoding == "ros1" for channel in self.channels.values())
 
     def messages(self, topics: Collection[str], since_ns: int | None = None) -> Iterator[BagMessage]:
@@ -103,18 +104,18 @@ class McapFile:
             while skip < len(self.chunks) and self.chunks[skip].end_ns < since_ns:
                 skip += 1
         for record in self.records(topics, skip):
-            data = unpacked(self.path, record.where, record.data)
+            data = decompressed(self.path, record.where, record.data)
             yield BagMessage(record.channel.topic, record.log_ns, record.where, data)
 
     def records(self, topics: Collection[str], first_chunk: int = 0) -> Iterator[Record]:
-        """The messages of these topics, in the order recorded.
+        """Yield the messages of these topics in recorded order.
 
         Args:
-            topics: which.
-            first_chunk: number in `chunks` of the one to begin with.
+            topics: names of the topics.
+            first_chunk: number in `chunks` of the first chunk to read.
 
         Raises:
-            BrokenRecording: after everything whole was handed out; it names the byte.
+            BrokenRecording: the file is damaged at the named byte. It is raised after all complete messages.
         """
         wanted = frozenset(topics)
         start = len(MAGIC)
@@ -123,23 +124,23 @@ class McapFile:
             start = self.path.stat().st_size if last else self.chunks[first_chunk].start
             if last:
                 return
-        return (yield from self._walk(Found(dict(self.channels)), wanted, {}, start))
+        return (yield from self._walk(Definitions(dict(self.channels)), wanted, {}, start))
 
     def first_in_chunk(self, topic: str, chunk: int) -> Record | None:
-        """The first message of a topic in one chunk of the index."""
+        """Return the first message of a topic in one chunk of the index, or None if the chunk has none."""
         with self.path.open("rb") as file:
             at = self.chunks[chunk].start
             file.seek(at + RECORD.size)
-            body, whole = _body(self.path, file, at, length_at(file, at))
-            return next(_in_chunk(self.path, at, body, Found(dict(self.channels)), {topic}, whole), None)
+            body, complete = _body(self.path, file, at, length_at(file, at))
+            return next(_in_chunk(self.path, at, body, Definitions(dict(self.channels)), {topic}, complete), None)
 
     def chunks_of(self, topic: str) -> list[int]:
-        """Numbers of the chunks that hold messages of a topic; all, where the index does not tell."""
+        """Return the numbers of the chunks that hold messages of a topic or whose index lists no channels."""
         ids = {key for key, channel in self.channels.items() if channel.topic == topic}
         return [i for i, chunk in enumerate(self.chunks) if not chunk.channels or ids & chunk.channels]
 
     def _walk(
-        self, found: Found, wanted: Collection[str], metadata: dict[str, dict[str, str]], start: int = len(MAGIC)
+        self, found: Definitions, wanted: Collection[str], metadata: dict[str, dict[str, str]], start: int = len(MAGIC)
     ) -> Iterator[Record]:
         with self.path.open("rb") as file:
             size = file.seek(0, 2)
@@ -147,17 +148,19 @@ class McapFile:
             while True:
                 head = file.read(RECORD.size)
                 if len(head) < RECORD.size:
-                    raise BrokenRecording(self.path, f"byte {at}", "the file ends before its records do")
+                    raise BrokenRecording(self.path, f"byte {at}", "the file has no end record")
                 opcode, length = RECORD.unpack(head)
                 if opcode in (DATA_END, FOOTER):
                     return
                 if opcode in (CHUNK, MESSAGE, SCHEMA, CHANNEL, METADATA):
-                    body, whole = _body(self.path, file, at, length)
+                    body, complete = _body(self.path, file, at, length)
                     if opcode == CHUNK:
-                        yield from _in_chunk(self.path, at, body, found, wanted, whole)
-                    elif whole and (record := _taken(self.path, f"byte {at}", opcode, body, found, wanted, metadata)):
+                        yield from _in_chunk(self.path, at, body, found, wanted, complete)
+                    elif complete and (
+                        record := _message_of(self.path, f"byte {at}", opcode, body, found, wanted, metadata)
+                    ):
                         yield record
-                    if not whole:
+                    if not complete:
                         raise BrokenRecording(self.path, f"byte {at}", "the file ends within this record")
                 after = at + RECORD.size + length
                 if after > size:
@@ -166,49 +169,51 @@ class McapFile:
 
 
 def _body(path: Path, file: BinaryIO, at: int, length: int) -> tuple[bytes, bool]:
-    """What of a record's bytes the file has, and whether that is all of them."""
+    """Return the bytes of a record that the file holds, and whether the record is complete."""
     if length > MAX_RECORD_BYTES:
-        raise BrokenRecording(path, f"byte {at}", f"a record of {length} bytes; at most {MAX_RECORD_BYTES} are read")
+        raise BrokenRecording(path, f"byte {at}", f"a record has {length} bytes; the limit is {MAX_RECORD_BYTES}")
     body = file.read(length)
     return body, len(body) == length
 
 
-def _in_chunk(path: Path, at: int, body: bytes, found: Found, wanted: Collection[str], whole: bool) -> Iterator[Record]:
-    """The messages of one chunk; of one that was cut, those that are whole."""
+def _in_chunk(
+    path: Path, at: int, body: bytes, found: Definitions, wanted: Collection[str], complete: bool
+) -> Iterator[Record]:
+    """Yield the messages of one chunk; of a truncated chunk, the complete messages."""
     where = f"byte {at}"
     if len(body) < CHUNK_HEAD.size:
-        raise BrokenRecording(path, where, "the file ends within this chunk's head")
+        raise BrokenRecording(path, where, "the file ends within the header of this chunk")
     _, _, size, crc, name = CHUNK_HEAD.unpack_from(body)
     start = CHUNK_HEAD.size + name + 8
     compression = body[CHUNK_HEAD.size : start - 8].decode("ascii", "replace")
     if size > MAX_RECORD_BYTES:
-        raise BrokenRecording(path, where, f"a chunk of {size} bytes; at most {MAX_RECORD_BYTES} are read")
-    data, why = _plain(compression, body[start:], size)
-    if not why and len(data) != size and whole:
+        raise BrokenRecording(path, where, f"a chunk has {size} bytes; the limit is {MAX_RECORD_BYTES}")
+    data, why = _decompressed_chunk(compression, body[start:], size)
+    if not why and len(data) != size and complete:
         why = f"this chunk holds {len(data)} bytes instead of {size}"
-    if not why and whole and crc and zlib.crc32(data) != crc:
-        why = "this chunk's checksum is wrong"  # which of its messages is bad nobody knows
+    if not why and complete and crc and zlib.crc32(data) != crc:
+        why = "this chunk's checksum is wrong"  # any of its messages may be corrupt
         data = b""
     inside = 0
     while inside + RECORD.size <= len(data):
         opcode, length = RECORD.unpack_from(data, inside)
         stop = inside + RECORD.size + length
         if stop > len(data):
-            why = why or "a record reaches over the end of this chunk"
+            why = why or "a record extends past the end of this chunk"
             break
         place = f"byte {inside} of the chunk at {where}"
-        record = _taken(path, place, opcode, data[inside + RECORD.size : stop], found, wanted, {})
+        record = _message_of(path, place, opcode, data[inside + RECORD.size : stop], found, wanted, {})
         if record:
             yield record
         inside = stop
-    if not whole:
+    if not complete:
         why = "the file ends within this chunk"
     if why:
         raise BrokenRecording(path, where, why)
 
 
-def _plain(compression: str, data: bytes, size: int) -> tuple[bytes, str]:
-    """What a chunk's bytes decompress to, as far as they do, and what is wrong where they do not."""
+def _decompressed_chunk(compression: str, data: bytes, size: int) -> tuple[bytes, str]:
+    """Decompress a chunk up to the first fault; return the data and the fault, which is empty if there is none."""
     if compression == "":
         return data, ""
     try:
@@ -224,48 +229,48 @@ def _plain(compression: str, data: bytes, size: int) -> tuple[bytes, str]:
                 return _read(reader, size)
     except ModuleNotFoundError as error:
         raise MissingExtra(str(error.name).partition(".")[0], "recordings") from None
-    return b"", f"compression {compression!r} is not known; zstd and lz4 are"
+    return b"", f"unknown compression {compression!r}; supported: zstd, lz4"
 
 
 def _read(reader: Any, size: int) -> tuple[bytes, str]:
-    """At most this many bytes, piece by piece: what came before a fault is kept."""
+    """Read at most `size` bytes in parts, so that the data before a fault is kept."""
     parts, left = [], size
     try:
         while left and (part := reader.read(min(left, 1 << 16))):
             parts.append(part)
             left -= len(part)
     except (RuntimeError, EOFError, OSError, ValueError) as error:
-        return b"".join(parts), f"this chunk can not be decompressed: {error}"
-    except Exception as error:  # zstandard's own has no other base
+        return b"".join(parts), f"cannot decompress this chunk: {error}"
+    except Exception as error:  # ZstdError has no other base class
         if type(error).__name__ != "ZstdError":
             raise
-        return b"".join(parts), f"this chunk can not be decompressed: {error}"
+        return b"".join(parts), f"cannot decompress this chunk: {error}"
     return b"".join(parts), ""
 
 
-def _taken(
+def _message_of(
     path: Path,
     where: str,
     opcode: int,
     body: bytes,
-    found: Found,
+    found: Definitions,
     wanted: Collection[str],
     metadata: dict[str, dict[str, str]],
 ) -> Record | None:
-    """The message of this record, if it is one of a wanted topic; of another kind what it tells is noted."""
+    """Return the message of this record if its topic is wanted; add a schema, channel or metadata record to `found`."""
     if opcode == MESSAGE:
         if len(body) < MESSAGE_HEAD.size:
-            raise BrokenRecording(path, where, "a message without a head")
+            raise BrokenRecording(path, where, "a message has no header")
         number, _, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(body)
         channel = found.channels.get(number)
         if channel is None:
-            raise BrokenRecording(path, where, f"a message of channel {number}, which was never described")
+            raise BrokenRecording(path, where, f"a message refers to channel {number}, which no record defines")
         if channel.topic not in wanted:
             return None
         return Record(channel, log_ns, publish_ns, where, body[MESSAGE_HEAD.size :])
     if opcode in (SCHEMA, CHANNEL, METADATA):
         try:
-            note(opcode, body, found, metadata)
-        except bad_record() as error:
-            raise BrokenRecording(path, where, f"this record can not be read: {error}") from None
+            add_definition(opcode, body, found, metadata)
+        except record_errors() as error:
+            raise BrokenRecording(path, where, f"cannot read this record: {error}") from None
     return None

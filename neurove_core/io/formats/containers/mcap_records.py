@@ -1,6 +1,6 @@
-"""Records of MCAP files that describe others: schemas, channels, metadata, and the index at the end.
+"""MCAP records that describe other records: schemas, channels, metadata, and the index at the end of the file.
 
-The `mcap` package parses them; they are few. Source: mcap.dev/spec.
+The `mcap` package parses them. A file has few of them. Source: mcap.dev/spec.
 """
 
 import struct
@@ -13,31 +13,31 @@ from neurove_core.io.formats.containers.bags import MAX_RECORD_BYTES
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, _CHUNK_INDEX, METADATA, DATA_END = 1, 2, 3, 4, 5, 6, 8, 0xC, 15
-RECORD = struct.Struct("<BQ")  # opcode, length of what follows
+RECORD = struct.Struct("<BQ")  # opcode, length of the content [bytes]
 MESSAGE_HEAD = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time [ns]
-CHUNK_HEAD = struct.Struct("<QQQII")  # first and last log time [ns], size [bytes], crc, length of compression's name
+CHUNK_HEAD = struct.Struct("<QQQII")  # first and last log time [ns], size [bytes], CRC, length of compression name
 _FOOTER_BYTES = RECORD.size + 20 + len(MAGIC)
 
 
 class Channel(NamedTuple):
-    """What the messages of one channel are."""
+    """Topic, schema and encoding of one channel."""
 
     topic: str
     schema: str
-    encoding: str  # of messages, such as `cdr`
+    encoding: str  # of the messages, for example `cdr`
 
 
 class ChunkIndex(NamedTuple):
-    """One chunk, as the index at the end of the file tells it."""
+    """One chunk, as the index at the end of the file lists it."""
 
-    start: int  # byte of its record
-    end_ns: int  # last log time in it
+    start: int  # byte offset of its record
+    end_ns: int  # last log time in the chunk [ns]
     channels: frozenset[int]
 
 
 @dataclass(slots=True)
-class Found:
-    """What a walk has learned so far."""
+class Definitions:
+    """Channels and schemas that were read so far."""
 
     channels: dict[int, Channel] = field(default_factory=dict)
     schemas: dict[int, str] = field(default_factory=dict)
@@ -48,13 +48,17 @@ class NoSummary(Exception):
 
 
 def length_at(file: BinaryIO, at: int) -> int:
-    """How many bytes follow the head of the record at this byte; the file then stands at the first of them."""
+    """Return the content length [bytes] of the record at this offset, and move the file to its first content byte."""
     file.seek(at)
     return int(RECORD.unpack(file.read(RECORD.size))[1])
 
 
-def note(opcode: int, body: bytes, found: Found, metadata: dict[str, dict[str, str]]) -> None:
-    """Take in what a schema, channel or metadata record tells; see `bad_record` for what this raises."""
+def add_definition(opcode: int, body: bytes, found: Definitions, metadata: dict[str, dict[str, str]]) -> None:
+    """Add the content of a schema or channel record to `found`, or that of a metadata record to `metadata`.
+
+    Raises:
+        Any of `record_errors()`: the record is corrupt. MissingExtra: mcap is not installed.
+    """
     records, stream = _parser(body)
     if opcode == SCHEMA:
         schema = records.Schema.read(stream)
@@ -77,18 +81,21 @@ def _parser(body: bytes) -> tuple[Any, Any]:
     return records, ReadDataStream(BytesIO(body))
 
 
-def bad_record() -> tuple[type[Exception], ...]:
-    """What the package raises over records that are garbled."""
+def record_errors() -> tuple[type[Exception], ...]:
+    """Return the errors that the `mcap` package raises for corrupt records."""
     from mcap.exceptions import McapError
 
     return (McapError, struct.error, ValueError, IndexError, OSError, OverflowError)
 
 
-def summary(file: BinaryIO) -> tuple[Found, tuple[ChunkIndex, ...], dict[str, dict[str, str]]]:
-    """What the index at the end of the file tells.
+def summary(file: BinaryIO) -> tuple[Definitions, tuple[ChunkIndex, ...], dict[str, dict[str, str]]]:
+    """Read the index at the end of the file.
+
+    Returns:
+        Definitions, chunks in recorded order, and metadata by name.
 
     Raises:
-        NoSummary: there is none, or it is garbled.
+        NoSummary: the file has no index, or the index is corrupt.
     """
     size = file.seek(0, 2)
     file.seek(max(0, size - _FOOTER_BYTES))
@@ -101,7 +108,7 @@ def summary(file: BinaryIO) -> tuple[Found, tuple[ChunkIndex, ...], dict[str, di
         raise NoSummary
     file.seek(start)
     data = file.read(stop - start)
-    found, chunks, metadata = Found(), [], []
+    found, chunks, offsets = Definitions(), [], []
     at = 0
     while at + RECORD.size <= len(data):
         opcode, length = RECORD.unpack_from(data, at)
@@ -109,7 +116,7 @@ def summary(file: BinaryIO) -> tuple[Found, tuple[ChunkIndex, ...], dict[str, di
         at += RECORD.size + length
         try:
             if opcode in (SCHEMA, CHANNEL):
-                note(opcode, body, found, {})
+                add_definition(opcode, body, found, {})
             elif opcode == _CHUNK_INDEX:
                 records, stream = _parser(body)
                 chunk = records.ChunkIndex.read(stream)
@@ -117,21 +124,21 @@ def summary(file: BinaryIO) -> tuple[Found, tuple[ChunkIndex, ...], dict[str, di
                 chunks.append(ChunkIndex(chunk.chunk_start_offset, chunk.message_end_time, ids))
             elif opcode == METADATA + 1:
                 records, stream = _parser(body)
-                metadata.append(records.MetadataIndex.read(stream).offset)
-        except bad_record():
+                offsets.append(records.MetadataIndex.read(stream).offset)
+        except record_errors():
             raise NoSummary from None
     if any(chunk.start >= start for chunk in chunks):
         raise NoSummary
-    return found, tuple(sorted(chunks)), _metadata(file, metadata)
+    return found, tuple(sorted(chunks)), _metadata(file, offsets)
 
 
-def _metadata(file: BinaryIO, places: list[int]) -> dict[str, dict[str, str]]:
-    told: dict[str, dict[str, str]] = {}
-    for at in places:
+def _metadata(file: BinaryIO, offsets: list[int]) -> dict[str, dict[str, str]]:
+    metadata: dict[str, dict[str, str]] = {}
+    for at in offsets:
         try:
             length = length_at(file, at)
             if length <= MAX_RECORD_BYTES:
-                note(METADATA, file.read(length), Found(), told)
-        except bad_record():
+                add_definition(METADATA, file.read(length), Definitions(), metadata)
+        except record_errors():
             raise NoSummary from None
-    return told
+    return metadata

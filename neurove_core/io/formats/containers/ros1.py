@@ -1,7 +1,8 @@
-"""ROS 1 bags, version 2.0: messages as bytes, of files that are whole or cut. Source: wiki.ros.org/Bags/Format/2.0.
+"""ROS 1 bags of version 2.0: messages as bytes, from complete and from truncated files.
 
-Messages lie in chunks, in the order recorded; the index at the end tells which chunk has which time. The records are
-walked here: the `rosbags` package opens only files that have their index, which a killed recorder never wrote.
+Messages are stored in chunks, in recorded order. The index at the end of the file gives the times of each chunk. This
+module reads the records itself: the `rosbags` package opens only files with an index, and a recorder that was killed
+did not write one. Source: wiki.ros.org/Bags/Format/2.0.
 """
 
 import bz2
@@ -26,15 +27,15 @@ class _Connection(NamedTuple):
     type: str
 
 
-class _Cut(Exception):
-    """The bytes end within a record."""
+class _BadRecord(Exception):
+    """A record is truncated or corrupt. Without a text it is truncated."""
 
 
 class _Record(NamedTuple):
     op: int
     header: dict[str, bytes]
-    head: int  # of all before the data [bytes]
-    size: int  # of the data that follows [bytes]
+    head: int  # size of everything before the data [bytes]
+    size: int  # size of the data [bytes]
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,26 +44,26 @@ class Ros1Bag:
 
     path: Path
     connections: dict[int, _Connection]
-    chunk_ends: tuple[tuple[int, int], ...]  # byte of each chunk and the last time in it [ns]; empty without an index
+    chunk_ends: tuple[tuple[int, int], ...]  # offset [bytes] and last time [ns] of each chunk; empty without an index
     cdr: bool = False
 
     @classmethod
     def open(cls, path: Path) -> Self:
-        """The bag in this file; where it has no index, it is read once to learn of its topics.
+        """Open the bag in this file. A file without an index is read once to find its topics.
 
         Raises:
-            UnknownSource: it is no ROS 1 bag of version 2.0.
+            UnknownSource: the file is not a ROS 1 bag of version 2.0. MissingExtra: lz4 is not installed.
         """
         with path.open("rb") as file:
             if file.read(len(MAGIC)) != MAGIC:
-                raise UnknownSource(path, "the file does not begin as a ROS 1 bag of version 2.0 does")
+                raise UnknownSource(path, "the file does not begin with the signature of a ROS 1 bag of version 2.0")
             connections, chunk_ends = _index(file)
         if not connections:
             self = cls(path, connections, ())
             try:
                 for _ in self._walk(frozenset(), len(MAGIC)):
                     pass
-            except BrokenRecording:  # told when it is read
+            except BrokenRecording:  # reading the messages raises it again
                 pass
         return cls(path, connections, chunk_ends)
 
@@ -93,43 +94,42 @@ class Ros1Bag:
                     if record.op == _CHUNK:
                         yield from self._in_chunk(file, record, at, wanted)
                     elif record.op == _CONNECTION:
-                        self._note(record.header, _exactly(file, record.size))
-                    elif record.op == _CHUNK_INFO:  # from here on there is the index alone
+                        self._add_connection(record.header, _read_exactly(file, record.size))
+                    elif record.op == _CHUNK_INFO:  # only the index follows
                         return
-                except _Cut as cut:
-                    raise BrokenRecording(
-                        self.path, f"byte {at}", str(cut) or "the file ends within a record"
-                    ) from None
+                except _BadRecord as error:
+                    why = str(error) or "the file ends within a record"
+                    raise BrokenRecording(self.path, f"byte {at}", why) from None
                 if after > size:
                     raise BrokenRecording(self.path, f"byte {at}", "the file ends within this record")
                 at = file.seek(after)
 
     def _in_chunk(self, file: BinaryIO, chunk: _Record, at: int, wanted: frozenset[str]) -> Iterator[BagMessage]:
-        """The messages of one chunk, read one by one: a chunk is as large as its recorder liked."""
-        stream, stop, inside = _plain(file, chunk), _number(chunk.header, "size"), 0
+        """Yield the messages of one chunk. They are read one by one, because a chunk may have any size."""
+        stream, stop, inside = _decompressed_chunk(file, chunk), _integer(chunk.header, "size"), 0
         while inside < stop:
             record = _read_record(stream)
-            data = _exactly(stream, record.size)
+            data = _read_exactly(stream, record.size)
             if record.op == _CONNECTION:
-                self._note(record.header, data)
+                self._add_connection(record.header, data)
             elif record.op == _MESSAGE:
-                connection = self.connections.get(_number(record.header, "conn"))
+                connection = self.connections.get(_integer(record.header, "conn"))
                 if connection is None:
-                    raise _Cut("a message of a connection that was never described")
+                    raise _BadRecord("a message refers to a connection that no record defines")
                 if connection.topic in wanted:
                     seconds, nanoseconds = struct.unpack("<II", record.header.get("time", b"").ljust(8, b"\0")[:8])
                     where = f"byte {inside} of the chunk at byte {at}"
                     yield BagMessage(connection.topic, seconds * 1_000_000_000 + nanoseconds, where, data)
             inside += record.head + record.size
 
-    def _note(self, header: dict[str, bytes], data: bytes) -> None:
+    def _add_connection(self, header: dict[str, bytes], data: bytes) -> None:
         kind = _fields(data).get("type", b"").decode("utf-8", "replace")
         topic = header.get("topic", b"").decode("utf-8", "replace")
-        self.connections.setdefault(_number(header, "conn"), _Connection(topic, kind))
+        self.connections.setdefault(_integer(header, "conn"), _Connection(topic, kind))
 
 
-class _Span(RawIOBase):
-    """The next bytes of a file, and no more."""
+class _LimitedStream(RawIOBase):
+    """Stream of the next `size` bytes of a file."""
 
     def __init__(self, file: BinaryIO, size: int) -> None:
         self._file, self._left = file, size
@@ -144,43 +144,44 @@ class _Span(RawIOBase):
         return len(data)
 
 
-def _plain(file: BinaryIO, chunk: _Record) -> Any:
-    """A chunk's data as a stream of what it was before it was compressed."""
-    span = BufferedReader(_Span(file, chunk.size))
+def _decompressed_chunk(file: BinaryIO, chunk: _Record) -> Any:
+    """Return the decompressed data of a chunk as a stream."""
+    limited = BufferedReader(_LimitedStream(file, chunk.size))
     match compression := chunk.header.get("compression", b"none"):
         case b"none":
-            return span
+            return limited
         case b"bz2":
-            return bz2.BZ2File(span)
+            return bz2.BZ2File(limited)
         case b"lz4":
             try:
                 import lz4.frame
             except ModuleNotFoundError:
                 raise MissingExtra("lz4", "recordings") from None
-            return lz4.frame.LZ4FrameFile(span)
+            return lz4.frame.LZ4FrameFile(limited)
         case _:
-            raise _Cut(f"compression {compression!r} is not known; none, bz2 and lz4 are")
+            raise _BadRecord(f"unknown compression {compression!r}; supported: none, bz2, lz4")
 
 
-def _exactly(stream: Any, size: int) -> bytes:
+def _read_exactly(stream: Any, size: int) -> bytes:
+    """Read `size` bytes or raise _BadRecord."""
     if size > MAX_RECORD_BYTES:
-        raise _Cut(f"a record of {size} bytes; at most {MAX_RECORD_BYTES} are read")
+        raise _BadRecord(f"a record has {size} bytes; the limit is {MAX_RECORD_BYTES}")
     try:
         data = bytes(stream.read(size)) if size else b""
-    except (OSError, EOFError, RuntimeError, ValueError) as error:  # what the decompressors raise
-        raise _Cut(f"the chunk can not be decompressed: {error}") from None
+    except (OSError, EOFError, RuntimeError, ValueError) as error:  # errors of the decompressors
+        raise _BadRecord(f"cannot decompress the chunk: {error}") from None
     if len(data) < size:
-        raise _Cut
+        raise _BadRecord
     return data
 
 
 def _read_record(stream: Any) -> _Record:
-    """The head of the next record; its data is the next to be read."""
-    length = int.from_bytes(_exactly(stream, 4), "little")
+    """Read the header of the next record; its data is next in the stream."""
+    length = int.from_bytes(_read_exactly(stream, 4), "little")
     if length > MAX_HEADER_BYTES:
-        raise _Cut(f"a header of {length} bytes")
-    header = _fields(_exactly(stream, length))
-    size = int.from_bytes(_exactly(stream, 4), "little")
+        raise _BadRecord(f"a record header has {length} bytes; the limit is {MAX_HEADER_BYTES}")
+    header = _fields(_read_exactly(stream, length))
+    size = int.from_bytes(_read_exactly(stream, 4), "little")
     return _Record(header.get("op", b"\0")[0], header, 8 + length, size)
 
 
@@ -191,37 +192,40 @@ def _fields(data: bytes) -> dict[str, bytes]:
         name, equals, value = data[at + 4 : at + 4 + length].partition(b"=")
         at += 4 + length
         if not equals or at > len(data):
-            raise _Cut("a record's header is garbled")
+            raise _BadRecord("a record header is corrupt")
         fields[name.decode("ascii", "replace")] = value
     if fields.get("op") == b"":
-        raise _Cut("a record's header is garbled")
+        raise _BadRecord("a record header is corrupt")
     return fields
 
 
-def _number(header: dict[str, bytes], name: str) -> int:
+def _integer(header: dict[str, bytes], name: str) -> int:
     return int.from_bytes(header.get(name, b""), "little")
 
 
 def _index(file: BinaryIO) -> tuple[dict[int, _Connection], tuple[tuple[int, int], ...]]:
-    """What the index at the end tells: connections, and where each chunk is and when it ends; nothing without one."""
+    """Read the index at the end of the file: connections, and offset [bytes] and last time [ns] of each chunk.
+
+    Both are empty if the file has no index or the index is corrupt.
+    """
     connections: dict[int, _Connection] = {}
     ends: list[tuple[int, int]] = []
     try:
         bag = _read_record(file)
-        at, size = _number(bag.header, "index_pos"), file.seek(0, 2)
+        at, size = _integer(bag.header, "index_pos"), file.seek(0, 2)
         if bag.op != _BAG or not 0 < at < size:
             return {}, ()
         file.seek(at)
         while file.tell() < size:
             record = _read_record(file)
-            data = _exactly(file, record.size)
+            data = _read_exactly(file, record.size)
             if record.op == _CONNECTION:
                 topic, kind = record.header.get("topic", b""), _fields(data).get("type", b"")
                 names = _Connection(topic.decode("utf-8", "replace"), kind.decode("utf-8", "replace"))
-                connections[_number(record.header, "conn")] = names
+                connections[_integer(record.header, "conn")] = names
             elif record.op == _CHUNK_INFO:
                 seconds, nanoseconds = struct.unpack("<II", record.header.get("end_time", b"").ljust(8, b"\0")[:8])
-                ends.append((_number(record.header, "chunk_pos"), seconds * 1_000_000_000 + nanoseconds))
-    except _Cut:
+                ends.append((_integer(record.header, "chunk_pos"), seconds * 1_000_000_000 + nanoseconds))
+    except _BadRecord:
         return {}, ()
     return connections, tuple(sorted(ends))

@@ -1,1 +1,1 @@
-"""Our own recordings: MCAP files that hold the packets of a stream."""
+"""NeuroVE recordings: MCAP files that hold the packets of event streams."""

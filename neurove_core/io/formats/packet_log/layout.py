@@ -1,21 +1,22 @@
-"""Our own recordings: MCAP with the profile `neurove`, which every MCAP tool can list and cut.
+"""Layout of NeuroVE recordings: MCAP files with the profile `neurove`. Every MCAP tool can list and split them.
 
-A stream has up to seven channels, named `<stream>/<kind>`, message encoding `msgpack`:
+A stream has up to seven channels with the name `<stream>/<kind>` and the message encoding `msgpack`:
 
-| kind | schema | a message |
+| kind | schema | content of a message |
 | --- | --- | --- |
-| events | neurove.events.1 | an EventPacket, bit for bit as it was published |
-| camera | neurove.camera.1 | a CameraInfo, bit for bit as it was published |
+| events | neurove.events.1 | an EventPacket, the published bytes |
+| camera | neurove.camera.1 | a CameraInfo, the published bytes |
 | imu | neurove.imu.1 | up to 4096 samples: columns `t`, `accel_m_s2`, `gyro_rad_s` |
 | triggers | neurove.triggers.1 | edges: `t`, `channel`, `level` |
 | poses | neurove.poses.1 | `t`, `position_m`, `orientation` |
 | twists | neurove.twists.1 | `t`, `twist` |
-| frames | neurove.frames.1 | one image: `t_us`, `height`, `width`, `channels`, `image` (bytes, row by row) |
+| frames | neurove.frames.1 | one image: `t_us`, `height`, `width`, `channels`, `image` (bytes, row-major) |
 
-Columns are those of the types of the same names in `recording` and `geometry`, units and all: a msgpack map of `v` (1),
-`n` (rows) and, for each column, its numbers as bytes, little-endian, row by row. The log time of what was recorded live
-is when it was received [unix ns]; of what was converted it is the sensor's own time [ns]. Metadata `neurove` tells what
-was recorded and from where.
+Columns have the names and units of the types in `neurove_core.io.recording` and `neurove_core.geometry.motion`. A table
+is a msgpack map of `v` (1), `n` (number of rows) and the columns. A column is bytes: little-endian numbers, row-major.
+
+The log time of a live recording is the receive time [unix ns]. The log time of a converted recording is the sensor time
+[ns]. The metadata record `neurove` describes the content and the source of the recording.
 """
 
 from collections.abc import Mapping
@@ -31,15 +32,15 @@ from neurove_protocol import camera, events
 PROFILE: Final = "neurove"
 VERSION: Final = 1
 ROWS: Final = 4096
-"""Most rows of columns in one message."""
+"""Maximum number of rows in one message."""
 
 
 class Column(NamedTuple):
-    """How one column is stored."""
+    """Storage of one column."""
 
     name: str
     dtype: str
-    width: int  # numbers in a row
+    width: int  # numbers per row
 
 
 _T = Column("t", "<i8", 1)
@@ -58,11 +59,11 @@ TYPES: Final[dict[str, type[Imu] | type[Triggers] | type[Poses] | type[Twists]]]
 
 
 class BadColumns(Exception):
-    """A message does not hold the columns that it should."""
+    """A message does not hold a valid table or image."""
 
 
 def schema_of(kind: str) -> tuple[str, str]:
-    """Name and message encoding of a kind's channel: for packets those of the wire.
+    """Return schema name and message encoding of a kind. For `events` and `camera` they are those of the wire.
 
     >>> schema_of("events")
     ('neurove.events.1', 'msgpack')
@@ -73,7 +74,7 @@ def schema_of(kind: str) -> tuple[str, str]:
 
 
 def pack_columns(kind: str, table: Imu | Triggers | Poses | Twists) -> bytes:
-    """One message of a table's rows."""
+    """Encode a table as one message."""
     fields: dict[str, Any] = {"v": VERSION, "n": int(table.t.size)}
     for column in COLUMNS[kind]:
         fields[column.name] = np.ascontiguousarray(getattr(table, column.name), column.dtype).tobytes()
@@ -81,15 +82,15 @@ def pack_columns(kind: str, table: Imu | Triggers | Poses | Twists) -> bytes:
 
 
 def unpack_columns(kind: str, data: bytes) -> Any:
-    """The table that a message holds.
+    """Decode the table of a message.
 
     Raises:
-        BadColumns: it does not.
+        BadColumns: the message does not hold a valid table of this kind.
     """
     fields = _fields(data)
     n = fields.get("n")
     if type(n) is not int or n < 0:
-        raise BadColumns(f"n={n!r} is no number of rows")
+        raise BadColumns(f"n={n!r} is not a number of rows")
     columns = []
     for name, dtype, width in COLUMNS[kind]:
         blob = fields.get(name)
@@ -101,7 +102,7 @@ def unpack_columns(kind: str, data: bytes) -> Any:
 
 
 def pack_frame(frame: Frame) -> bytes:
-    """One message of an image."""
+    """Encode an image as one message."""
     height, width, *channels = frame.image.shape
     image = np.ascontiguousarray(frame.image, np.uint8).tobytes()
     shape = {"height": height, "width": width, "channels": channels[0] if channels else 1}
@@ -109,19 +110,22 @@ def pack_frame(frame: Frame) -> bytes:
 
 
 def unpack_frame(data: bytes) -> Frame:
-    """The image that a message holds.
+    """Decode the image of a message.
+
+    Returns:
+        A frame whose image has shape (height, width) or (height, width, 3), uint8.
 
     Raises:
-        BadColumns: it does not.
+        BadColumns: the message does not hold a valid image.
     """
     fields = _fields(data)
     numbers = [fields.get(name) for name in ("t_us", "height", "width", "channels")]
     image = fields.get("image")
     if not all(type(number) is int for number in numbers) or not isinstance(image, bytes):
-        raise BadColumns("it is no image")
+        raise BadColumns("the message is not an image")
     t_us, height, width, channels = (int(number or 0) for number in numbers)
     if channels not in (1, 3) or min(height, width) < 0 or len(image) != height * width * channels:
-        raise BadColumns(f"its {len(image)} bytes are no image of {width}x{height}x{channels}")
+        raise BadColumns(f"{len(image)} bytes are not an image of {width}x{height}x{channels}")
     shape = (height, width) if channels == 1 else (height, width, channels)
     return Frame(t_us, np.frombuffer(image, np.uint8).reshape(shape))
 
@@ -132,5 +136,5 @@ def _fields(data: bytes) -> Mapping[str, Any]:
     except (ValueError, TypeError, msgpack.UnpackException) as error:
         raise BadColumns(str(error) or type(error).__name__) from None
     if not isinstance(fields, dict) or fields.get("v") != VERSION:
-        raise BadColumns("it is no table of version 1")
+        raise BadColumns("the message is not a map of version 1")
     return fields

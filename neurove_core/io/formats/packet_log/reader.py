@@ -1,4 +1,4 @@
-"""Reading our own recordings: as events, and as the packets that they hold."""
+"""Reader of NeuroVE recordings: it gives events, or the packets as published."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -20,22 +20,22 @@ from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.events import EventPacket, Events, PacketLimits, Sensor, decode_packet
 
 LIMITS: Final = PacketLimits(max_events=16_000_000, max_side_px=1 << 15)
-"""Caps on packets: those of the wire are the service's to set, and a recording may come from any."""
+"""Limits for packets. Each service sets its own wire limits, and a recording may come from any service."""
 
 T = TypeVar("T")
 
 
 class RecordedPacket(NamedTuple):
-    """One event packet as it was published."""
+    """One event packet, as published."""
 
     stream: str
     payload: bytes
-    log_ns: int  # when it was received [unix ns]; where it was converted, the sensor's time [ns]
+    log_ns: int  # receive time [unix ns]; in a converted recording the sensor time [ns]
 
 
 @dataclass(frozen=True, slots=True)
 class McapRecording(EventsOnly):
-    """One stream of a recording of ours; see `Recording`. Times are as in its packets."""
+    """One stream of a NeuroVE recording; see `Recording`. Event times are those of the packets."""
 
     path: Path
     name: str
@@ -46,22 +46,27 @@ class McapRecording(EventsOnly):
 
     @classmethod
     def open(cls, path: Path, sensor: Sensor | None = None, topic: str | None = None) -> Self:
-        """One stream of the file.
+        """Open one stream of the file.
 
         Args:
             path: the .mcap file.
-            sensor: the pixel array; overrides the packets'.
-            topic: name of the stream; by default the first one by name, and the recording's name tells which.
+            sensor: the pixel array; overrides the one in the packets.
+            topic: name of the stream. The default is the first stream by name; if the file has several, the recording's
+                name gives the one that is read.
 
         Raises:
-            UnknownSource: it is no recording of ours, or has no such stream or no packet of it.
-            BrokenRecording: not even its first packet is whole.
+            UnknownSource: the file is not a NeuroVE recording, or it has no such stream, or the stream has no packet.
+            BrokenRecording: the first packet is incomplete or invalid.
         """
         file = McapFile.open(path)
         streams = _streams(file)
         wanted = topic.removesuffix("/events") if topic is not None else None
         if not streams or wanted not in (None, *streams):
-            why = f"no stream {wanted!r}; its streams are {', '.join(streams)}" if streams else "it holds no stream"
+            why = (
+                f"no stream {wanted!r}; its streams are {', '.join(streams)}"
+                if streams
+                else "the file has no stream of events"
+            )
             raise UnknownSource(path, why)
         name = path.name if wanted is None else f"{path.name} ({wanted})"
         if wanted is None and len(streams) > 1:
@@ -69,29 +74,29 @@ class McapRecording(EventsOnly):
         stream = wanted or streams[0]
         first = next(file.records((f"{stream}/events",)), None)
         if first is None:
-            raise UnknownSource(path, f"its stream {stream} has no packet")
+            raise UnknownSource(path, f"stream {stream} has no packet")
         return cls(path, name, sensor or _decoded(path, first).sensor, stream, file)
 
     @property
     def streams(self) -> tuple[str, ...]:
-        """Events, and what else the file has of this stream."""
+        """Names of the data that the file holds for this stream; the first is `events`."""
         kinds = ("imu", "frames", "triggers", "poses", "twists")
         return ("events", *(kind for kind in kinds if self._topic(kind) in self.file.topics))
 
     def chunks(self) -> Iterator[Events]:
-        """All events from the beginning; see `Recording`.
+        """Yield all events from the beginning; see `Recording`.
 
         Raises:
-            BrokenRecording: the file is cut or garbled, or a packet is not what it must be, of another sensor than the
-                first, or earlier than the one before it; it names the byte.
+            BrokenRecording: the file is truncated or corrupt, or a packet is invalid, has another sensor than the first
+                packet, or is earlier than the packet before it. The error names the byte.
         """
         return checked(self.path, self._pieces(0), self.sensor)
 
     def since(self, t_us: int) -> Iterator[Events]:
-        """As `chunks`, from this time on; by bisection of the file's index."""
+        """Yield the events from this time [us] on, as `chunks` does. Bisects the index of the file."""
         chunks = self.file.chunks_of(self._topic("events"))
         low, high = 0, len(chunks)
-        while high - low > 1:  # the last chunk that begins before that time
+        while high - low > 1:  # find the last chunk that begins before that time
             middle = (low + high) // 2
             first = self.file.first_in_chunk(self._topic("events"), chunks[middle])
             if first is None or _begins_us(_decoded(self.path, first)) < t_us:
@@ -106,15 +111,18 @@ class McapRecording(EventsOnly):
             packet = _decoded(self.path, record)
             first = first or packet
             if packet.sensor != first.sensor:
-                why = f"a packet of a sensor {packet.sensor}, after those of {first.sensor}"
+                why = f"a packet has sensor {packet.sensor}, but the first packet has {first.sensor}"
                 raise BrokenRecording(self.path, record.where, why)
             yield record.where, packet.events
 
     def packets(self, stream: str | None = None) -> Iterator[RecordedPacket]:
-        """The packets of all streams, or of one, in the order recorded, bit for bit and not looked at.
+        """Yield the packets of one stream, or of all streams, in recorded order. They are not decoded or checked.
+
+        Args:
+            stream: name of the stream; None for all streams.
 
         Raises:
-            BrokenRecording: the file is cut or garbled; after everything whole was handed out.
+            BrokenRecording: the file is truncated or corrupt. It is raised after all complete packets.
         """
         streams = _streams(self.file) if stream is None else [stream]
         for record in self.file.records([f"{name}/events" for name in streams]):
@@ -123,39 +131,43 @@ class McapRecording(EventsOnly):
 
     @property
     def all_streams(self) -> tuple[str, ...]:
-        """Names of all streams in the file that have packets."""
+        """Names of all event streams in the file."""
         return tuple(_streams(self.file))
 
     def cameras(self) -> dict[str, bytes]:
-        """The last CameraInfo of each stream that has one, bit for bit."""
+        """Return the last CameraInfo of each stream that has one, as published bytes."""
         topics = [f"{name}/camera" for name in _streams(self.file)]
         present = [topic for topic in topics if topic in self.file.topics]
         found = self.file.records(present) if present else ()
         return {record.channel.topic.removesuffix("/camera"): record.data for record in found}
 
     def camera(self, stream: str) -> CameraInfo | None:
-        """The lens as the stream's driver told it, or None where it did not."""
+        """Return the lens that the driver of the stream published, or None.
+
+        Args:
+            stream: stream name for the result.
+        """
         payload = self.cameras().get(self.stream)
         return (payload and CameraInfo(**(CameraInfo.decode(payload).model_dump() | {"stream": stream}))) or None
 
     def imu(self) -> Iterator[Imu]:
-        """Samples of the inertial unit, as the converted recording had them."""
+        """Yield the IMU samples of the converted recording."""
         return self._tables("imu")
 
     def triggers(self) -> Iterator[Triggers]:
-        """Trigger edges, as the converted recording had them."""
+        """Yield the trigger edges of the converted recording."""
         return self._tables("triggers")
 
     def frames(self) -> Iterator[Frame]:
-        """Images, as the converted recording had them."""
+        """Yield the images of the converted recording."""
         return self._messages("frames", layout.unpack_frame)
 
     def poses(self) -> Poses | None:
-        """Poses, as the converted recording had them."""
+        """Return the poses of the converted recording, or None."""
         return self._joined("poses", Poses)
 
     def twists(self) -> Twists | None:
-        """Twists, as the converted recording had them."""
+        """Return the twists of the converted recording, or None."""
         return self._joined("twists", Twists)
 
     def _topic(self, kind: str) -> str:
@@ -196,10 +208,10 @@ def _begins_us(packet: EventPacket) -> int:
 
 
 def _accepts(path: Path) -> bool:
-    """Whether this is an .mcap file with our profile."""
+    """Return whether the path is an MCAP file with the profile `neurove`."""
     return path.is_file() and McapFile.open(path).profile == PROFILE
 
 
 FORMAT = Format(
-    "FILE.mcap (our own, from `neurove record` and `neurove convert`)", McapRecording.open, (".mcap",), _accepts
+    "FILE.mcap (NeuroVE, from `neurove record` and `neurove convert`)", McapRecording.open, (".mcap",), _accepts
 )

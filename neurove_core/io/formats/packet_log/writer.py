@@ -1,4 +1,4 @@
-"""Writing our own recordings: packets as they were published, or any recording cut into packets."""
+"""Writer of NeuroVE recordings: packets as published, or any recording split into packets."""
 
 import contextlib
 import os
@@ -19,26 +19,26 @@ from neurove_protocol.events import EventPacket, encode_packet
 from neurove_protocol.keys import check_name
 
 CHUNK_BYTES: Final = 1 << 20
-"""So much is compressed at once, and lost at most where the machine fails."""
+"""Size of one compressed chunk [bytes]; at most this much is lost if the machine fails."""
 
 PART: Final = ".part"
-"""What a file's name ends in until it is whole."""
+"""Suffix of the file name until the file is complete."""
 
 Progress = Callable[[int, int], None]
-"""Events written so far, and the sensor time that was reached [us]."""
+"""Called with the number of events written so far and the sensor time reached [us]."""
 
 
 class PacketWriter:
-    """Writes one recording; it appears under its name when it is closed, whole, and not before.
+    """Writes one recording atomically: the file gets its name when it is closed, complete.
 
-    Use it in a `with` block: an error inside leaves nothing behind. Memory holds one chunk, and of each chunk written
-    its place in the index, some 100 bytes.
+    Use it in a `with` block: an error in the block removes the partial file. Memory holds one chunk, and about 100
+    bytes of index for each chunk written.
 
     Args:
-        path: the file, ending in .mcap; one of the same name is replaced.
+        path: the file, with suffix .mcap; an existing file of this name is replaced.
 
     Raises:
-        InvalidField: here or while writing: the file can not be written. MissingExtra: the mcap package is not here.
+        InvalidField: the file cannot be written; also raised while writing. MissingExtra: mcap is not installed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -49,11 +49,11 @@ class PacketWriter:
         if path.suffix != ".mcap":
             raise InvalidField("recording", "FILE", str(path), "its name must end in .mcap")
         self.path, self._part = path, path.with_name(path.name + PART)
-        with self._told():
+        with self._os_errors_as_invalid():
             try:
                 self._file = self._part.open("xb")
             except FileExistsError:
-                why = "a recording that was cut short lies there, or is being written: rename or remove it"
+                why = "an incomplete recording, or one that is being written, has this name: rename or remove it"
                 raise InvalidField("recording", "FILE", str(self._part), why) from None
         self._writer: Any = Writer(self._file, CHUNK_BYTES, CompressionType.ZSTD)
         self._writer.start(layout.PROFILE, "neurove")
@@ -73,26 +73,37 @@ class PacketWriter:
             self.abandon()
 
     def write(self, stream: str, payload: bytes, received_ns: int) -> None:
-        """Add an event packet as it was published.
+        """Add an event packet, as published.
 
         Args:
-            stream: whose it is.
-            payload: its bytes, not looked at.
-            received_ns: when it came [unix ns].
+            stream: name of the stream.
+            payload: bytes of the packet; they are not checked.
+            received_ns: receive time [unix ns].
         """
         self.add(stream, "events", payload, received_ns)
 
     def camera(self, payload: bytes, received_ns: int = 0) -> None:
-        """Add a CameraInfo as it was published; it names its own stream.
+        """Add a CameraInfo, as published. Its stream is the one in the payload.
+
+        Args:
+            payload: bytes of the CameraInfo.
+            received_ns: receive time [unix ns].
 
         Raises:
-            NeuroVEError: it is none.
+            NeuroVEError: the payload is not a valid CameraInfo.
         """
         self.add(CameraInfo.decode(payload).stream, "camera", payload, received_ns)
 
     def add(self, stream: str, kind: str, payload: bytes, log_ns: int) -> None:
-        """Add a message of any kind of `mcap_layout`."""
-        with self._told():
+        """Add a message of any kind in `layout`.
+
+        Args:
+            stream: name of the stream.
+            kind: one of the kinds in the table of `layout`.
+            payload: bytes of the message; they are not checked.
+            log_ns: log time [ns]; a negative time is stored as 0.
+        """
+        with self._os_errors_as_invalid():
             topic = f"{check_name('stream', stream)}/{kind}"
             if topic not in self._channels:
                 self._channels[topic] = self._registered(topic, kind)
@@ -107,20 +118,20 @@ class PacketWriter:
             self._schemas[name] = self._writer.register_schema(name, "", b"")
         return int(self._writer.register_channel(topic, encoding, self._schemas[name]))
 
-    def about(self, **told: object) -> None:
-        """Note what was recorded, and from where, as text."""
-        with self._told():
-            self._writer.add_metadata(layout.PROFILE, {name: str(value) for name, value in told.items()})
+    def about(self, **entries: object) -> None:
+        """Add a metadata record that describes the recording; values are stored as text."""
+        with self._os_errors_as_invalid():
+            self._writer.add_metadata(layout.PROFILE, {name: str(value) for name, value in entries.items()})
 
     @property
     def bytes_written(self) -> int:
-        """How long the file is by now."""
+        """Current size of the file [bytes]."""
         return self._file.tell()
 
     def close(self) -> None:
-        """Finish the file and give it its name."""
+        """Complete the file and rename it to its final name."""
         try:
-            with self._told():
+            with self._os_errors_as_invalid():
                 self._writer.finish()
                 self._file.flush()
                 os.fsync(self._file.fileno())
@@ -131,13 +142,14 @@ class PacketWriter:
             raise
 
     def abandon(self) -> None:
-        """Leave nothing behind."""
+        """Close and remove the incomplete file."""
         with contextlib.suppress(OSError):
             self._file.close()
         self._part.unlink(missing_ok=True)
 
     @contextlib.contextmanager
-    def _told(self) -> Iterator[None]:
+    def _os_errors_as_invalid(self) -> Iterator[None]:
+        """Raise InvalidField instead of OSError in the block."""
         try:
             yield
         except OSError as error:
@@ -145,20 +157,20 @@ class PacketWriter:
 
 
 def write_mcap(recording: Recording, path: Path, stream: str = "cam0", progress: Progress | None = None) -> int:
-    """Write a recording as ours: packets as the driver would send them, and all that lies beside the events.
+    """Write a recording as a NeuroVE recording: packets as a driver sends them, and all other data of the recording.
 
     Args:
-        recording: what to write; it must have an end.
-        path: the file, ending in .mcap.
-        stream: what to call it.
-        progress: told after each packet.
+        recording: the recording to write; it must have an end.
+        path: the file, with suffix .mcap.
+        stream: name of the stream in the file.
+        progress: called after each packet.
 
     Returns:
-        how many events were written.
+        Number of events written.
 
     Raises:
-        InvalidField: the recording is endless, or the file can not be written.
-        BrokenRecording: the recording is broken; nothing is left under the path.
+        InvalidField: the recording is endless, or the file cannot be written.
+        BrokenRecording: the recording is damaged; no new file is left at the path.
     """
     if recording.endless:
         raise InvalidField("recording", "source", recording.name, "it has no end")
@@ -173,12 +185,12 @@ def write_mcap(recording: Recording, path: Path, stream: str = "cam0", progress:
             events += piece.events.n
             if progress:
                 progress(events, piece.end_us)
-        _write_beside(recording, stream, writer)
+        _write_other_data(recording, stream, writer)
         writer.about(source=recording.name, stream=stream, events=events)
     return events
 
 
-def _write_beside(recording: Recording, stream: str, writer: PacketWriter) -> None:
+def _write_other_data(recording: Recording, stream: str, writer: PacketWriter) -> None:
     for imu in recording.imu():
         _write_rows(writer, stream, "imu", imu)
     for triggers in recording.triggers():

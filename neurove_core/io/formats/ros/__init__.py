@@ -1,1 +1,1 @@
-"""Event cameras in ROS 1 and ROS 2 bags."""
+"""Event camera recordings in ROS 1 and ROS 2 bags."""

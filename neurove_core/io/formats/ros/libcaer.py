@@ -1,18 +1,18 @@
-"""The compressed words of ROS's libcaer driver -> events: a kernel beside its plain reference, as in `kernels`.
+"""Compressed words of the ROS libcaer driver -> events: a compiled decoder and its reference implementation.
 
-Little-endian words of 16 bits, the type in the upper four:
+The words are little-endian and have 16 bits. The upper four bits are the type:
 
 | type | meaning of the lower twelve bits |
 | --- | --- |
 | 0 TIME_HIGH | time since the packet's time base, in units of 4096 us |
-| 1 TIME_LOW | the same, rest of it [us] |
-| 2 ADDR_X | bits 0-10: column of what follows [px] |
-| 3 ADDR_Y | bits 0-10: row [px], bit 11: polarity; an event |
-| 4 VECT_BASE_Y | as ADDR_Y, but only the base of the vectors that follow |
-| 5 VECT_8 | bits 0-7: an event in each of the 8 rows from the base on whose bit is set; the base moves on by 8 |
+| 1 TIME_LOW | the same time modulo 4096 us [us] |
+| 2 ADDR_X | bits 0-10: column of the next events [px] |
+| 3 ADDR_Y | an event; bits 0-10: row [px], bit 11: polarity |
+| 4 VECT_BASE_Y | no event; base row and polarity of the next vectors, bits as in ADDR_Y |
+| 5 VECT_8 | bits 0-7: an event for each set bit, in the 8 rows from the base; then the base increases by 8 |
 
-It is EVT3 with rows and columns exchanged. A packet carries no state into the next one but the column and the base.
-Source: event_camera_codecs of ros-event-camera, where it is `libcaer_cmp`.
+The format is EVT3 with rows and columns exchanged. Only the column and the base (row and polarity) carry over from one
+packet to the next. Source: event_camera_codecs of ros-event-camera, encoding `libcaer_cmp`.
 """
 
 from typing import Any, Final, NamedTuple
@@ -25,44 +25,44 @@ from neurove_core.io.formats.prophesee.evt import ILLEGAL, OK, OUTSIDE
 from neurove_protocol.events import Events
 
 WORD_EVENTS: Final = 8
-"""Most events that one word makes: `out` needs this many places a word."""
+"""Maximum events of one word: `out` needs this many rows for each word."""
 
 _TIME_HIGH, _TIME_LOW, _ADDR_X, _ADDR_Y, _BASE_Y, _VECT_8 = range(6)
 
 
 class LibcaerState(NamedTuple):
-    """What goes from word to word; the default is the start of a recording or what follows a gap."""
+    """State between words. The default applies at the start of a recording and after a gap."""
 
-    x: int = -1  # column [px], -1 before the first one
-    base_y: int = -1  # row of the next vector [px], -1 before the first one
-    p: int = 0  # polarity of the vectors
-    high: int = 0  # TIME_HIGH [us]; a packet begins at 0
-    low: int = 0  # TIME_LOW [us]; a packet begins at 0
+    x: int = -1  # column [px], -1 before the first word that sets it
+    base_y: int = -1  # row of the next vector [px], -1 before the first word that sets it
+    p: int = 0  # polarity of the next vectors
+    high: int = 0  # TIME_HIGH [us]; 0 at the start of a packet
+    low: int = 0  # TIME_LOW [us]; 0 at the start of a packet
 
 
 @compiled
 def signed(word: np.unsignedinteger[Any]) -> int:  # pragma: no cover (machine code)
-    """The same number as a signed integer, which mixes with others."""
-    return np.int64(word)  # type: ignore[return-value]  # int() would stay unsigned in numba, and mix to float
+    """Return the number as a signed integer, which other integers can be combined with."""
+    return np.int64(word)  # type: ignore[return-value]  # numba keeps int() unsigned, and mixes it to float
 
 
 @compiled
 def libcaer_decode(
     words: NDArray[np.uint16], state: LibcaerState, base_us: int, width: int, height: int, out: Events
 ) -> tuple[LibcaerState, int, int, int]:  # pragma: no cover (machine code)
-    """Decode words of one packet, up to the first that can not be used.
+    """Decode words of one packet, up to the first invalid word.
 
     Args:
-        words: (N,) words of the packet, all or some of them.
-        state: of the words before these.
+        words: (N,) uint16; all words of the packet or some of them.
+        state: state after the words before these.
         base_us: the packet's time base [us].
-        width: of the sensor [px].
-        height: of the sensor [px].
-        out: columns of at least WORD_EVENTS * N places to write events into; times are as the words have them.
+        width: sensor width [px].
+        height: sensor height [px].
+        out: output columns with at least WORD_EVENTS * N rows; times are not checked.
 
     Returns:
-        The state after the words, how many words were read, how many events lie in `out`, and kernels.OK, ILLEGAL or
-        OUTSIDE; in the last case the event that is outside lies in `out`, after the good ones.
+        State after the words, number of words read, number of valid events n in `out`, and OK, ILLEGAL or OUTSIDE. For
+        OUTSIDE, row n of `out` holds the event that is outside the sensor.
     """
     x, base_y, p, high, low = state
     n = 0
@@ -101,7 +101,7 @@ def libcaer_decode(
 def libcaer_reference(
     words: NDArray[np.uint16], state: LibcaerState, base_us: int, width: int, height: int
 ) -> tuple[LibcaerState, int, Events, int]:
-    """The plain twin of `libcaer_decode`: state, words read, events, verdict."""
+    """Reference implementation of `libcaer_decode`: state, words read, events, verdict."""
     s = state._asdict()
     events: list[tuple[int, int, int, int]] = []
 

@@ -1,7 +1,7 @@
-"""ROS messages -> values: the few types that a recording of an event camera holds, in ROS 1 and in CDR (ROS 2) layout.
+"""ROS messages -> values: the types in event camera recordings, in the ROS 1 layout and the CDR (ROS 2) layout.
 
-Both layouts are sequences of plain fields; CDR begins with four bytes that name the byte order, aligns every number to
-its own size, and ends every string with a zero. Sources: wiki.ros.org/msg, OMG DDS-XTypes (plain CDR), and the .msg
+Both layouts are sequences of plain fields. CDR begins with four bytes that give the byte order, aligns each number to
+its own size, and ends each string with a zero. Sources: wiki.ros.org/msg, OMG DDS-XTypes (plain CDR), and the .msg
 files of event_camera_msgs, event_array_msgs, dvs_msgs, sensor_msgs, geometry_msgs and nav_msgs.
 """
 
@@ -16,30 +16,30 @@ from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events
 
 MAX_MESSAGE_BYTES: Final = 64 << 20
-"""A message larger than this is none; an event camera's are some 10 kB to some MB."""
+"""Maximum size of a message [bytes]. Typical event messages have 10 kB to several MB."""
 
 _LENSES = {"plumb_bob": "pinhole", "radtan": "pinhole", "equidistant": "equidistant", "fisheye": "equidistant"}
-_SENSOR = "recording"  # a stream's name that every CameraInfo must have, replaced when it is asked for
+_SENSOR = "recording"  # placeholder: CameraInfo requires a stream name, and the caller replaces it
 
 
 class BadMessage(Exception):
-    """The bytes are not a message of the type that they should be."""
+    """The bytes are not a valid message of the expected type."""
 
 
 class EventMessage(NamedTuple):
-    """Events of one message, still in the layout that the driver gave them."""
+    """Events of one message, in the layout of the driver."""
 
     stamp_ns: int  # header.stamp: host clock [ns]
     width: int  # [px]
     height: int  # [px]
-    seq: int  # counts messages; -1 where the type has no such field
+    seq: int  # message counter; -1 if the type has no such field
     time_base_ns: int  # meaning depends on the encoding [ns]
     encoding: str
     data: memoryview
 
 
 class ImuSample(NamedTuple):
-    """One sample of an inertial unit."""
+    """One IMU sample."""
 
     stamp_ns: int
     gyro_rad_s: tuple[float, float, float]
@@ -47,7 +47,7 @@ class ImuSample(NamedTuple):
 
 
 class PoseSample(NamedTuple):
-    """One pose: position [m] and orientation x y z w."""
+    """One pose: position [m] and orientation quaternion (x, y, z, w)."""
 
     stamp_ns: int
     position_m: tuple[float, float, float]
@@ -55,14 +55,14 @@ class PoseSample(NamedTuple):
 
 
 class Fields:
-    """A message's fields, read one after the other.
+    """Reads the fields of a message one after the other.
 
     Args:
-        data: the message's bytes.
-        cdr: whether they are CDR, as in ROS 2, or ROS 1.
+        data: the bytes of the message.
+        cdr: True for CDR (ROS 2), False for ROS 1.
 
     Raises:
-        BadMessage: here or in any reading: the bytes end before the field does, or are in no known byte order.
+        BadMessage: the byte order is unknown, or, from every method, the bytes end before the field ends.
     """
 
     def __init__(self, data: bytes, *, cdr: bool) -> None:
@@ -70,77 +70,77 @@ class Fields:
         self._order = "<"
         if cdr:
             if len(data) < 4 or data[0] != 0 or data[1] > 1:
-                raise BadMessage("it does not begin as plain CDR does")
+                raise BadMessage("the message does not begin with a plain CDR header")
             self._order = "<" if data[1] else ">"
             self._data = self._data[4:]
 
     def numbers(self, kind: str, count: int = 1) -> tuple[Any, ...]:
-        """So many numbers of one struct type, such as `d`."""
+        """Read `count` numbers of one struct type, for example `d`."""
         size = struct.calcsize("<" + kind)
         if self._cdr and count:
             self._at += -self._at % size
         return struct.unpack(f"{self._order}{count}{kind}", self.raw(size * count))
 
     def number(self, kind: str) -> Any:
-        """The next number."""
+        """Read the next number."""
         return self.numbers(kind)[0]
 
     def raw(self, size: int) -> memoryview:
-        """So many bytes as they are."""
+        """Read `size` bytes without decoding."""
         if self._at + size > len(self._data):
-            raise BadMessage("it ends within its fields")
+            raise BadMessage("the message ends within its fields")
         self._at += size
         return self._data[self._at - size : self._at]
 
     def text(self) -> str:
-        """The next string."""
+        """Read the next string."""
         data = bytes(self.raw(self.number("I")))
         return data.removesuffix(b"\0").decode("utf-8", "replace") if self._cdr else data.decode("utf-8", "replace")
 
     def stamp_ns(self) -> int:
-        """The next time."""
+        """Read the next time [ns]."""
         seconds, nanoseconds = self.numbers("I", 2)
         return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
     def header_ns(self) -> int:
-        """The stamp of a std_msgs/Header, which is read whole."""
+        """Read a std_msgs/Header and return its stamp [ns]."""
         if not self._cdr:
-            self.number("I")  # seq, which ROS 2 did away with
+            self.number("I")  # seq, which ROS 2 does not have
         stamp_ns = self.stamp_ns()
         self.text()
         return stamp_ns
 
     @property
     def rest(self) -> memoryview:
-        """What has not been read."""
+        """The bytes that are not read yet."""
         return self._data[self._at :]
 
     @property
     def order(self) -> str:
-        """`<` or `>`, as numpy and struct write it."""
+        """Byte order, `<` or `>`, in the notation of numpy and struct."""
         return self._order
 
 
 def event_packet(data: bytes, *, cdr: bool) -> EventMessage:
-    """An event_camera_msgs/EventPacket or event_array_msgs/EventArray, which have the same fields."""
+    """Parse an event_camera_msgs/EventPacket or an event_array_msgs/EventArray. Both have the same fields."""
     fields = Fields(data, cdr=cdr)
     stamp_ns = fields.header_ns()
     height, width = fields.numbers("I", 2)
     seq, time_base_ns = fields.numbers("Q", 2)
     encoding = fields.text()
     if fields.number("B"):
-        raise BadMessage("its events are big-endian")
+        raise BadMessage("big-endian events are not supported")
     return EventMessage(
         stamp_ns, width, height, int(seq), int(time_base_ns), encoding, fields.raw(int(fields.number("I")))
     )
 
 
 DVS: Final = "dvs_msgs"
-"""What stands as encoding in an EventMessage of dvs_msgs: events as the message type itself lays them out."""
+"""Encoding name in an EventMessage of dvs_msgs, whose message type defines the event layout."""
 
 
 def dvs_events(data: bytes, *, cdr: bool) -> tuple[EventMessage, Events]:
-    """A dvs_msgs/EventArray: x, y, time, polarity per event; times [us] of the host's clock."""
+    """Parse a dvs_msgs/EventArray: x, y, time and polarity of each event; times on the host clock [us]."""
     fields = Fields(data, cdr=cdr)
     stamp_ns = fields.header_ns()
     height, width = fields.numbers("I", 2)
@@ -154,23 +154,23 @@ _PACKED = np.dtype([("x", "<u2"), ("y", "<u2"), ("s", "<u4"), ("ns", "<u4"), ("p
 
 def _packed_dvs(data: memoryview, n: int, _: str) -> Events:
     if len(data) < n * _PACKED.itemsize:
-        raise BadMessage(f"it has {len(data)} bytes for {n} events")
+        raise BadMessage(f"{len(data)} bytes are too few for {n} events")
     rows = np.frombuffer(data, _PACKED, n)
     return _with_time(rows["x"], rows["y"], rows["s"], rows["ns"], rows["p"])
 
 
 def _cdr_dvs(data: memoryview, n: int, order: str) -> Events:
-    """CDR aligns every number to its own size, so events repeat every 16 bytes, but not from the first one on.
+    """Decode events in CDR, which aligns each number to its own size.
 
-    x y s ns p of the first event lie at 0, 2, 4, 8, 12; those of event k at 16 k - 2, 16 k, 16 k + 4, 16 k + 8 and
-    16 k + 12, for x follows the byte of the polarity before it.
+    The first event has x, y, s, ns, p at bytes 0, 2, 4, 8, 12. Event k > 0 has them at 16 k - 2, 16 k, 16 k + 4,
+    16 k + 8 and 16 k + 12, because its x follows the polarity byte of the event before it.
     """
     if n == 0:
         return Events.empty()
     if len(data) < 16 * n - 3:
-        raise BadMessage(f"it has {len(data)} bytes for {n} events")
+        raise BadMessage(f"{len(data)} bytes are too few for {n} events")
     kinds = (("s", "u4"), ("ns", "u4"), ("p", "u1"), ("", "u1"), ("x", "u2"), ("y", "u2"), ("", "u2"))
-    row = np.dtype([(name, order + kind) for name, kind in kinds])  # x and y are those of the event after this one
+    row = np.dtype([(name, order + kind) for name, kind in kinds])  # x and y belong to the next event
     rows = np.frombuffer(bytes(data[4 : 16 * n - 3]) + bytes(7), row, n)
     first = np.frombuffer(data, order + "u2", 2)
     x, y = np.empty((2, n), np.uint16)
@@ -185,7 +185,7 @@ def _with_time(x: Any, y: Any, s: NDArray[Any], ns: NDArray[Any], p: NDArray[Any
 
 
 def imu(data: bytes, *, cdr: bool) -> ImuSample:
-    """A sensor_msgs/Imu: SI already."""
+    """Parse a sensor_msgs/Imu. Its units are SI."""
     fields = Fields(data, cdr=cdr)
     stamp_ns = fields.header_ns()
     numbers = fields.numbers("d", 4 + 9 + 3 + 9 + 3)  # orientation, covariance, rate, covariance, acceleration
@@ -193,13 +193,13 @@ def imu(data: bytes, *, cdr: bool) -> ImuSample:
 
 
 def pose(data: bytes, *, cdr: bool) -> PoseSample:
-    """A geometry_msgs/PoseStamped."""
+    """Parse a geometry_msgs/PoseStamped."""
     fields = Fields(data, cdr=cdr)
     return _pose(fields.header_ns(), fields)
 
 
 def odometry(data: bytes, *, cdr: bool) -> PoseSample:
-    """The pose of a nav_msgs/Odometry."""
+    """Parse the pose of a nav_msgs/Odometry."""
     fields = Fields(data, cdr=cdr)
     stamp_ns = fields.header_ns()
     fields.text()  # child_frame_id
@@ -212,14 +212,14 @@ def _pose(stamp_ns: int, fields: Fields) -> PoseSample:
 
 
 def camera_info(data: bytes, *, cdr: bool) -> CameraInfo | None:
-    """The lens of a sensor_msgs/CameraInfo, or None where it is not calibrated or of a model that we do not have."""
+    """Parse the lens of a sensor_msgs/CameraInfo; None if it is not calibrated or its model is not supported."""
     fields = Fields(data, cdr=cdr)
     fields.header_ns()
     height, width = fields.numbers("I", 2)
     model = fields.text().lower()
     count = int(fields.number("I"))
     if count > 64:
-        raise BadMessage(f"a lens has no {count} coefficients")
+        raise BadMessage(f"{count} distortion coefficients; the limit is 64")
     distortion = fields.numbers("d", count)
     fx, _, cx, _, fy, cy, *_ = fields.numbers("d", 9)
     if model not in _LENSES or fx <= 0 or fy <= 0:  # all zeros: not calibrated
@@ -229,7 +229,7 @@ def camera_info(data: bytes, *, cdr: bool) -> CameraInfo | None:
             stream=_SENSOR,
             width=width,
             height=height,
-            lens=_LENSES[model],  # type: ignore[arg-type]  # the table has no other
+            lens=_LENSES[model],  # type: ignore[arg-type]  # the table has only valid lenses
             fx=fx,
             fy=fy,
             cx=cx,

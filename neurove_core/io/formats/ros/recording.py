@@ -1,4 +1,4 @@
-"""ROS bags: a .bag of ROS 1; .db3, .mcap or a folder of them of ROS 2. All that they hold of one camera."""
+"""One camera of a ROS bag: a .bag file (ROS 1), or a .db3 file, an .mcap file or a folder of them (ROS 2)."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -29,17 +29,17 @@ IMU_TYPE: Final = "sensor_msgs/Imu"
 CAMERA_TYPE: Final = "sensor_msgs/CameraInfo"
 POSE_TYPES: Final = ("geometry_msgs/PoseStamped", "nav_msgs/Odometry")
 
-_BATCH = 4096  # samples of an inertial unit handed out at once
-_EARLY_NS = 2_000_000_000  # how far before the wanted time messages are read: host and sensor clock drift apart
+_BATCH = 4096  # IMU samples in one chunk
+_MARGIN_NS = 2_000_000_000  # margin for reading before the requested time, because host and sensor clock drift apart
 
 T = TypeVar("T")
 
 
 def open_bag(path: Path) -> BagFile:
-    """The bag of this name, whatever its container.
+    """Open a bag of any supported container.
 
     Raises:
-        UnknownSource: it is none.
+        UnknownSource: the path is not a bag.
     """
     if path.is_dir():
         return BagFolder(path, tuple(open_bag(file) for file in in_recorded_order(path)))
@@ -51,15 +51,15 @@ def open_bag(path: Path) -> BagFile:
         case ".mcap":
             return McapFile.open(path)
         case suffix:
-            raise UnknownSource(path, f"no bag has the suffix {suffix!r}")
+            raise UnknownSource(path, f"{suffix!r} is not a suffix of a bag")
 
 
 @dataclass(frozen=True, slots=True)
 class RosbagRecording(EventsOnly):
     """One camera of a ROS bag; see `Recording`.
 
-    Times of `evt3` and `mono` messages are the sensor's clock, wraps counted on; those of `libcaer`, `libcaer_cmp` and
-    dvs_msgs are unix time. What else the bag holds has its header's stamp, less `ros_offset_us`.
+    Event times of `evt3` and `mono` messages are on the unwrapped sensor clock. Event times of `libcaer`, `libcaer_cmp`
+    and dvs_msgs are unix time. All other data have the stamp of their header minus `ros_offset_us`.
     """
 
     path: Path
@@ -72,16 +72,18 @@ class RosbagRecording(EventsOnly):
 
     @classmethod
     def open(cls, path: Path, sensor: Sensor | None = None, topic: str | None = None) -> Self:
-        """One camera of the bag.
+        """Open one camera of the bag.
 
         Args:
             path: the file or folder.
-            sensor: the pixel array; overrides the messages'.
-            topic: of the events; by default the first one by name, and the recording's name tells which.
+            sensor: the pixel array; overrides the size in the messages.
+            topic: topic of the events. The default is the first event topic by name; if the bag has several, the
+                recording's name gives the one that is read.
 
         Raises:
-            UnknownSource: it is no bag, or has no such topic of events.
-            MissingGeometry: its messages do not tell the sensor's size. BrokenRecording: not even the first is whole.
+            UnknownSource: the path is not a bag, or the bag has no such topic with events.
+            MissingGeometry: the messages do not give the sensor size.
+            BrokenRecording: the first message is incomplete or invalid.
         """
         bag = open_bag(path)
         topics = sorted(name for name, kind in bag.topics.items() if kind in EVENT_TYPES)
@@ -104,39 +106,39 @@ class RosbagRecording(EventsOnly):
 
     @property
     def streams(self) -> tuple[str, ...]:
-        """Events, and what else the bag has."""
-        held = {
-            "imu": self._beside(IMU_TYPE) is not None,
+        """Names of the data that the bag holds for this camera; the first is `events`."""
+        present = {
+            "imu": self._nearest_topic(IMU_TYPE) is not None,
             "triggers": self.first.encoding == "evt3",
-            "poses": self._beside(*POSE_TYPES) is not None,
-            "twists": self._beside(*POSE_TYPES) is not None,
+            "poses": self._nearest_topic(*POSE_TYPES) is not None,
+            "twists": self._nearest_topic(*POSE_TYPES) is not None,
         }
-        return ("events", *(name for name, here in held.items() if here))
+        return ("events", *(name for name, found in present.items() if found))
 
     def chunks(self) -> Iterator[Events]:
-        """All events from the beginning; see `Recording`.
+        """Yield all events from the beginning; see `Recording`.
 
         Raises:
-            BrokenRecording: the file is cut or garbled, a message is not what it must be, or an event is outside the
-                sensor or earlier than the one before it; it names the message or the byte.
+            BrokenRecording: the file is truncated or corrupt, a message is invalid, or an event is outside the sensor
+                or earlier than the event before it. The error names the message or the byte.
         """
         return checked(self.path, self._pieces(None, None), self.sensor)
 
     def since(self, t_us: int) -> Iterator[Events]:
-        """As `chunks`, from this time on; by the index of the bag where it has one."""
-        start = self._start()
+        """Yield the events from this time [us] on, as `chunks` does. Uses the index of the bag if there is one."""
+        start = self._first_anchor()
         if start is None:
             return later(self.chunks(), t_us)
         anchor, log_ns = start
-        since_ns = log_ns + (t_us - anchor.t_us) * 1000 - _EARLY_NS
+        since_ns = log_ns + (t_us - anchor.t_us) * 1000 - _MARGIN_NS
         if since_ns <= log_ns:
             return later(self.chunks(), t_us)
-        return self._jumped(t_us, anchor, since_ns)
+        return self._since_indexed(t_us, anchor, since_ns)
 
-    def _jumped(self, t_us: int, anchor: Anchor, since_ns: int) -> Iterator[Events]:
+    def _since_indexed(self, t_us: int, anchor: Anchor, since_ns: int) -> Iterator[Events]:
         chunks = checked(self.path, self._pieces(since_ns, anchor), self.sensor)
         chunk = next(chunks, None)
-        if chunk is None or chunk.t[0] > t_us:  # the clocks ran further apart than we read ahead
+        if chunk is None or chunk.t[0] > t_us:  # the clocks drifted by more than the margin
             yield from later(self.chunks(), t_us)
             return
         yield from later(iter([chunk]), t_us)
@@ -152,8 +154,8 @@ class RosbagRecording(EventsOnly):
             except BadMessage as why:
                 raise BrokenRecording(self.path, message.where, str(why)) from None
 
-    def _start(self) -> tuple[Anchor, int] | None:
-        """The first moment of the events on both clocks, and when that was recorded [ns]."""
+    def _first_anchor(self) -> tuple[Anchor, int] | None:
+        """Return the time of the first event on both clocks and the log time of its message [ns], or None."""
         decoder = Decoder(self.sensor)
         for message in self.bag.messages((self.topic,)):
             try:
@@ -167,17 +169,18 @@ class RosbagRecording(EventsOnly):
 
     @property
     def ros_offset_us(self) -> int:
-        """What to add to an event's time to have ROS time [us]: by the first message; 0 where they are the same clock.
+        """Offset from event time to ROS time [us], from the first message; 0 if event times are unix time.
 
-        A message's stamp is when the driver's host received the first of its events, so this is late by the latency of
-        the link, and host and sensor clock drift apart after it.
+        ROS time = event time + offset. The stamp of a message is the time at which the driver's host received the first
+        of its events. The offset therefore includes the latency of the link, and it does not follow the later drift
+        between host clock and sensor clock.
         """
-        start = None if self.first.encoding in UNIX_TIME else self._start()
+        start = None if self.first.encoding in UNIX_TIME else self._first_anchor()
         return start[0].stamp_ns // 1000 - start[0].t_us if start else 0
 
     def camera(self, stream: str) -> CameraInfo | None:
-        """The lens of the sensor_msgs/CameraInfo topic nearest by name; None where it is missing or of another size."""
-        topic = self._beside(CAMERA_TYPE)
+        """Return the lens of the sensor_msgs/CameraInfo topic nearest by name; None if missing or of another size."""
+        topic = self._nearest_topic(CAMERA_TYPE)
         if topic is None:
             return None
         for message in self.bag.messages((topic,)):
@@ -188,12 +191,14 @@ class RosbagRecording(EventsOnly):
         return None
 
     def imu(self) -> Iterator[Imu]:
-        """Samples of the sensor_msgs/Imu topic nearest by name, in its own frame: bags rarely tell how it is mounted.
+        """Yield the samples of the sensor_msgs/Imu topic nearest by name.
+
+        They are in the frame of the IMU, because bags rarely give its mounting.
 
         Raises:
-            BrokenRecording: as `chunks`.
+            BrokenRecording: as `chunks`, or the time of a sample decreases.
         """
-        topic = self._beside(IMU_TYPE)
+        topic = self._nearest_topic(IMU_TYPE)
         offset_us = self.ros_offset_us
         batch: list[messages.ImuSample] = []
         broken: BrokenRecording | None = None
@@ -214,7 +219,11 @@ class RosbagRecording(EventsOnly):
             raise broken
 
     def triggers(self) -> Iterator[Triggers]:
-        """Edges on the trigger input, which `evt3` messages hold among the events."""
+        """Yield the edges of the trigger input. `evt3` messages hold them among the events.
+
+        Raises:
+            BrokenRecording: as `chunks`.
+        """
         decoder = Decoder(self.sensor)
         if self.first.encoding != "evt3":
             return
@@ -225,14 +234,16 @@ class RosbagRecording(EventsOnly):
                 raise BrokenRecording(self.path, message.where, str(why)) from None
 
     def poses(self) -> Poses | None:
-        """The geometry_msgs/PoseStamped or nav_msgs/Odometry topic nearest by name, of whatever body that tracks.
+        """Return the poses of the geometry_msgs/PoseStamped or nav_msgs/Odometry topic nearest by name.
 
-        Of poses within one microsecond the first is kept: trackers send some twice.
+        They are poses of the body that this topic tracks. Of several poses within one microsecond only the first is
+        kept, because trackers send some poses twice.
 
         Raises:
-            BrokenRecording: as `chunks`; or an orientation is no rotation.
+            BrokenRecording: as `chunks`, the time of a pose decreases, a position is not finite, or an orientation is
+                not a unit quaternion.
         """
-        topic = self._beside(*POSE_TYPES)
+        topic = self._nearest_topic(*POSE_TYPES)
         if topic is None:
             return None
         read = messages.odometry if self.bag.topics[topic] == "nav_msgs/Odometry" else messages.pose
@@ -240,14 +251,14 @@ class RosbagRecording(EventsOnly):
         return _poses(self.path, found, self.ros_offset_us)
 
     def twists(self) -> Twists | None:
-        """How the tracked body moved, by its poses; None where these are too few. See `geometry.twists`."""
+        """Return the twists of the tracked body, from its poses; None for fewer than two poses. See `motion.twists`."""
         poses = self.poses()
         return motion.twists(poses) if poses is not None and poses.t.size > 1 else None
 
-    def _beside(self, *types: str) -> str | None:
-        """The topic of one of these types whose name has most in common with that of the events."""
+    def _nearest_topic(self, *types: str) -> str | None:
+        """Return the topic of one of these types that shares the most leading name parts with the event topic."""
         names = sorted(name for name, kind in self.bag.topics.items() if kind in types)
-        return max(names, key=lambda name: _in_common(name, self.topic), default=None)
+        return max(names, key=lambda name: _shared_parts(name, self.topic), default=None)
 
     def _read(self, message: BagMessage, read: Callable[..., T]) -> T:
         try:
@@ -257,7 +268,7 @@ class RosbagRecording(EventsOnly):
 
 
 def _parsed(message: BagMessage, bag: BagFile) -> tuple[EventMessage, Events | None]:
-    """The message, and its events where its type lays them out itself."""
+    """Return the message, and its events if the message type defines their layout (dvs_msgs)."""
     if bag.topics[message.topic] == "dvs_msgs/EventArray":
         return messages.dvs_events(message.data, cdr=bag.cdr)
     return messages.event_packet(message.data, cdr=bag.cdr), None
@@ -270,17 +281,17 @@ def _first(path: Path, bag: BagFile, topic: str) -> EventMessage:
         except BadMessage as why:
             raise BrokenRecording(path, message.where, str(why)) from None
         return parsed._replace(data=memoryview(b""))
-    raise UnknownSource(path, f"its topic {topic} has no message")
+    raise UnknownSource(path, f"topic {topic} has no message")
 
 
-def _in_common(one: str, other: str) -> int:
-    """How many parts of their names two topics share, from the beginning."""
+def _shared_parts(one: str, other: str) -> int:
+    """Return the number of leading name parts that two topics share."""
     pairs = zip(one.split("/"), other.split("/"), strict=False)
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
 def _poses(path: Path, found: Iterator[tuple[str, messages.PoseSample]], offset_us: int) -> Poses | None:
-    """The poses of some messages, each with its place in the file; None if there are none."""
+    """Join (position in the file, pose) pairs into one table; None if there are none."""
     samples: list[messages.PoseSample] = []
     for where, sample in found:
         if samples and sample.stamp_ns // 1000 <= samples[-1].stamp_ns // 1000:
@@ -288,7 +299,7 @@ def _poses(path: Path, found: Iterator[tuple[str, messages.PoseSample]], offset_
                 raise BrokenRecording(path, where, "time runs backwards")
             continue
         length = float(np.linalg.norm(sample.orientation))
-        if not (abs(length - 1) < 1e-2 and np.isfinite(sample.position_m).all()):  # written so that nan fails
+        if not (abs(length - 1) < 1e-2 and np.isfinite(sample.position_m).all()):  # this form rejects NaN
             why = f"position {sample.position_m} and orientation {sample.orientation} are not a pose"
             raise BrokenRecording(path, where, why)
         samples.append(sample)
@@ -307,7 +318,7 @@ def _imu(samples: list[messages.ImuSample], offset_us: int) -> Imu:
 
 
 def _accepts(path: Path) -> bool:
-    """Whether this is a bag; the metadata.yaml of a folder is missing if its recorder was killed."""
+    """Return whether the path is a bag. A folder has no metadata.yaml if its recorder was killed."""
     if path.is_file():
         return path.suffix.lower() in (".bag", ".db3", ".mcap")
     if (path / "events.txt").is_file():
