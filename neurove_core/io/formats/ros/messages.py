@@ -15,9 +15,6 @@ from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events
 
-MAX_MESSAGE_BYTES: Final = 64 << 20
-"""Maximum size of a message [bytes]. Typical event messages have 10 kB to several MB."""
-
 _LENSES = {"plumb_bob": "pinhole", "radtan": "pinhole", "equidistant": "equidistant", "fisheye": "equidistant"}
 _SENSOR = "recording"  # placeholder: CameraInfo requires a stream name, and the caller replaces it
 
