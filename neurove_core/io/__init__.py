@@ -1,4 +1,4 @@
-"""The contract of recordings: what each source of events gives, and how it fails.
+"""The interface of recordings: what each source of events provides, and which errors it raises.
 
 `neurove_core.sources.open_source` opens a recording; `formats/` has one module for each format. README.md in this
 folder explains how to add a format.

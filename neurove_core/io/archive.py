@@ -1,4 +1,4 @@
-"""Files of a recording that lie together, in a folder or in a .zip, and the images among them."""
+"""The files of a recording that consists of several files, in a folder or in a .zip file, and its images."""
 
 import io
 import lzma
@@ -16,19 +16,19 @@ from neurove_core.extras import MissingExtra
 from neurove_core.io.errors import BrokenRecording, UnknownSource
 
 BROKEN_ZIP = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, NotImplementedError, RuntimeError, ValueError)
-"""What the standard library raises over an archive that is not whole, or packed in a way that it does not know."""
+"""Errors of the standard library for an archive that is incomplete or has an unknown compression."""
 
-MAX_IMAGE_BYTES = 64 << 20  # of one image's file
+MAX_IMAGE_BYTES = 64 << 20  # of one image file
 
 
 class Place(NamedTuple):
-    """Where the files of a recording lie: in a folder, or in a folder within a .zip."""
+    """Location of the files of a recording: a folder, or a folder in a .zip file."""
 
-    path: Path  # the folder or the .zip
-    inside: str | None = None  # of a .zip: what the names of its files begin with
+    path: Path  # the folder or the .zip file
+    inside: str | None = None  # for a .zip file: prefix of the names of the files
 
     def has(self, name: str) -> bool:
-        """Whether there is a file of this name."""
+        """Whether there is a file with this name."""
         if self.inside is None:
             return (self.path / name).is_file()
         with zipfile.ZipFile(self.path) as archive:
@@ -36,10 +36,10 @@ class Place(NamedTuple):
 
     @contextmanager
     def open(self, name: str) -> Iterator[IO[bytes]]:
-        """The file of this name, to be read; of a .zip it is unpacked while one reads.
+        """Open the file with this name for reading. A file in a .zip file is decompressed while it is read.
 
         Raises:
-            BrokenRecording: while one reads, where what is packed is not whole.
+            BrokenRecording: the file in the .zip file cannot be decompressed. It can be raised while the file is read.
         """
         try:
             if self.inside is None:
@@ -49,30 +49,31 @@ class Place(NamedTuple):
             with zipfile.ZipFile(self.path) as archive, archive.open(self.inside + name) as packed:
                 yield packed
         except BROKEN_ZIP as error:
-            raise BrokenRecording(self.path, name, f"it can not be unpacked: {error}") from None
+            raise BrokenRecording(self.path, name, f"it cannot be unpacked: {error}") from None
 
 
 def folder_in_zip(path: Path, wanted: str) -> str:
-    """What the names of the files begin with that lie in a .zip beside one of this name.
+    """Prefix of the file names in the folder of a .zip file that has the file `wanted`.
 
     Raises:
-        UnknownSource: it is no .zip, or has no such file.
+        UnknownSource: it is not a .zip file, or it has no such file.
     """
     try:
         with zipfile.ZipFile(path) as archive:
             names = [name for name in archive.namelist() if name.rpartition("/")[2] == wanted]
     except BROKEN_ZIP as error:
-        raise UnknownSource(path, f"it is no zip file: {error}") from None
+        raise UnknownSource(path, f"it is not a zip file: {error}") from None
     if not names:
-        raise UnknownSource(path, f"there is no {wanted} in it")
+        raise UnknownSource(path, f"it has no {wanted}")
     return min(names, key=len).removesuffix(wanted)
 
 
 def read_image(path: Path, where: str, file: IO[bytes]) -> NDArray[np.uint8]:
-    """Grey (H, W) or RGB (H, W, 3), from a file of any format that Pillow knows.
+    """Read an image of any format that Pillow supports: grey (H, W) or RGB (H, W, 3).
 
     Raises:
-        MissingExtra: Pillow is not installed. BrokenRecording: it is no whole image; names `where` in `path`.
+        MissingExtra: Pillow is not installed. BrokenRecording: it is not a complete image; the error names `where` in
+            `path`.
     """
     try:
         from PIL import Image
@@ -83,4 +84,4 @@ def read_image(path: Path, where: str, file: IO[bytes]) -> NDArray[np.uint8]:
         with Image.open(io.BytesIO(data)) as image:
             return np.array(image.convert("L" if image.mode in ("L", "1", "I", "I;16") else "RGB"))
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise BrokenRecording(path, where, f"its image can not be read: {error}") from None
+        raise BrokenRecording(path, where, f"its image cannot be read: {error}") from None

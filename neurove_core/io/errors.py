@@ -1,4 +1,4 @@
-"""Errors of recordings: RecordingError and its cases."""
+"""Errors of recordings: RecordingError and its subclasses."""
 
 from pathlib import Path
 
@@ -29,7 +29,7 @@ class MissingGeometry(RecordingError):
 
 
 class BrokenRecording(RecordingError):
-    """The recording is damaged at some place; everything before it was read."""
+    """The recording is damaged at one place. All data before it was read."""
 
     code = "broken_recording"
     exit_code = EXIT_FAILURE
@@ -39,7 +39,7 @@ class BrokenRecording(RecordingError):
 
 
 class NoCarlaServer(RecordingError):
-    """No CARLA simulator answers."""
+    """No CARLA simulator responds."""
 
     code = "no_carla_server"
 

@@ -1,4 +1,4 @@
-"""How a stream of events is cut into packets: for the driver, and for a recording that is to look like its traffic."""
+"""Split a stream of events into packets, for the driver and for recordings of its traffic."""
 
 from collections.abc import Iterator
 from typing import Final, NamedTuple
@@ -11,20 +11,21 @@ PACKET_EVENTS: Final = 20_000
 
 
 class Slice(NamedTuple):
-    """Some events of a recording that go into one packet."""
+    """Events of a recording for one packet."""
 
     t0_us: int
-    end_us: int  # sensor time by which a real camera could have sent it
+    end_us: int  # earliest sensor time at which a real camera could send the slice
     events: Events
 
 
 def slices(chunks: Iterator[Events]) -> Iterator[Slice]:
-    """Cut ordered events into slices of at most PACKET_US and PACKET_EVENTS.
+    """Split ordered events into slices of at most PACKET_US and PACKET_EVENTS.
 
-    A span without events gives an empty slice, which tells the service how far sensor time has come; so does the end.
+    A span without events gives an empty slice, which reports the sensor time to the service. So does the end of the
+    recording.
 
     Raises:
-        BrokenRecording: what the chunks raise, after everything before it was handed out.
+        BrokenRecording: the chunks raise it. All events before were yielded.
     """
     start_us: int | None = None
     last_us = 0

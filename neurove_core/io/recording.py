@@ -1,4 +1,4 @@
-"""Recording: what every source of events looks like to its reader."""
+"""Recording: the interface of every source of events."""
 
 from abc import abstractmethod
 from collections.abc import Iterator
@@ -14,14 +14,14 @@ from neurove_protocol.camera import CameraInfo
 from neurove_protocol.events import Events, Sensor
 
 CHUNK_EVENTS: Final = 1 << 18
-"""Most events in one chunk; 13 bytes each, so 3.4 MB."""
+"""Maximum number of events in one chunk. An event has 13 bytes, so a chunk has at most 3.4 MB."""
 
 BLOCK_BYTES: Final = 4 << 20
-"""How much of a file is read at once [bytes]."""
+"""Size of the blocks in which a file is read [bytes]."""
 
 
 class Imu(NamedTuple):
-    """Samples of an inertial unit, ordered by time, in SI."""
+    """Samples of an inertial measurement unit (IMU), ordered by time, in SI units."""
 
     t: NDArray[np.int64]  # (N,) sensor clock [us]
     accel_m_s2: NDArray[np.float64]  # (N, 3) specific force
@@ -32,27 +32,30 @@ class Triggers(NamedTuple):
     """Edges on a camera's trigger input, ordered by time."""
 
     t: NDArray[np.int64]  # (N,) sensor clock [us]
-    channel: NDArray[np.uint8]  # (N,) which input
+    channel: NDArray[np.uint8]  # (N,) number of the input
     level: NDArray[np.uint8]  # (N,) 1 rising, 0 falling
 
 
 class Frame(NamedTuple):
-    """An image that the camera took beside its events."""
+    """An image that the camera took while it recorded events."""
 
-    t_us: int  # sensor clock, start of exposure where the format tells it
+    t_us: int  # sensor clock, start of exposure where the format has it
     image: NDArray[np.uint8]  # (H, W), or (H, W, 3) as RGB
 
 
 class Recording(Protocol):
-    """Events of one camera, in order, as often as one likes, and what was recorded beside them."""
+    """Events of one camera, ordered by time, and the other data that was recorded with them.
+
+    Every method can be called any number of times. Each call starts from the beginning of the recording.
+    """
 
     @property
     def name(self) -> str:
-        """Short, for people."""
+        """Short name to display."""
 
     @property
     def sensor(self) -> Sensor:
-        """The pixel array that all events lie on."""
+        """The pixel array of the events."""
 
     @property
     def endless(self) -> bool:
@@ -60,52 +63,52 @@ class Recording(Protocol):
 
     @property
     def streams(self) -> tuple[str, ...]:
-        """What it holds, of events, imu, frames, triggers, poses and twists."""
+        """The kinds of data in the recording: some of events, imu, frames, triggers, poses and twists."""
 
     def camera(self, stream: str) -> CameraInfo | None:
-        """The lens as it is to be told for this stream, or None where the recording does not know it."""
+        """The camera parameters to use for this stream, or None if the recording does not have them."""
 
     def chunks(self) -> Iterator[Events]:
-        """All events from the beginning, ordered by time over all chunks, none of them empty.
+        """All events from the beginning, ordered by time over all chunks. No chunk is empty.
 
-        Times are of the sensor's clock [us]. A chunk has at most CHUNK_EVENTS events, and memory stays bounded however
-        long the recording is.
+        Times are in the sensor's clock [us]. A chunk has at most CHUNK_EVENTS events. Memory use is bounded for a
+        recording of any length.
 
         Raises:
-            BrokenRecording: after everything whole was handed out.
+            BrokenRecording: the recording is damaged; all valid events before the damage were yielded.
         """
 
     def since(self, t_us: int) -> Iterator[Events]:
-        """As `chunks`, from the first event at or after this time on; where the format allows, without reading on."""
+        """As `chunks`, from the first event at or after this time [us]. Some formats do not read earlier data."""
 
     def imu(self) -> Iterator[Imu]:
-        """All samples of the inertial unit, some at a time, none of them empty; in SI.
+        """All samples of the inertial unit, in batches that are not empty, in SI units.
 
-        In the camera's optical frame (x right, y down, z forward) where the format tells how the unit is mounted, else
-        in its own; the reader's docstring says which.
+        The axes are those of the camera's optical frame (x right, y down, z forward) if the format gives the mounting
+        of the unit, otherwise those of the unit. The reader's docstring states which.
         """
 
     def triggers(self) -> Iterator[Triggers]:
-        """All trigger edges, some at a time, none of them empty."""
+        """All trigger edges, in batches that are not empty."""
 
     def frames(self) -> Iterator[Frame]:
         """All images, ordered by time."""
 
     def poses(self) -> Poses | None:
-        """Where the camera truly was, or None where that was not recorded."""
+        """Ground truth of the camera pose, or None if it was not recorded."""
 
     def twists(self) -> Twists | None:
-        """How the camera truly moved: recorded as such, or from the poses; None where neither was recorded."""
+        """Ground truth of the camera twist: recorded, or derived from the poses. None if neither was recorded."""
 
 
 class EventsOnly:
-    """What a recording answers that holds events alone; the readers of richer formats override what theirs has."""
+    """Base class of a recording that has only events. Readers of other formats override the methods for their data."""
 
     __slots__ = ()
 
     @property
     def streams(self) -> tuple[str, ...]:
-        """Events, and nothing else."""
+        """Only events."""
         return ("events",)
 
     @abstractmethod
@@ -113,11 +116,11 @@ class EventsOnly:
         """See `Recording`."""
 
     def camera(self, stream: str) -> CameraInfo | None:
-        """None: the format does not tell the lens."""
+        """None: the format has no camera parameters."""
         return None
 
     def since(self, t_us: int) -> Iterator[Events]:
-        """As `chunks`, from this time on; what is earlier is read and left out."""
+        """As `chunks`, from this time [us]. Earlier events are read and skipped."""
         return later(self.chunks(), t_us)
 
     def imu(self) -> Iterator[Imu]:
@@ -142,13 +145,13 @@ class EventsOnly:
 
 
 def in_chunks(events: Events) -> Iterator[Events]:
-    """The same events in spans of at most CHUNK_EVENTS; no span where there are none."""
+    """Split events into spans of at most CHUNK_EVENTS. Without events there is no span."""
     for first in range(0, events.n, CHUNK_EVENTS):
         yield events.span(first, min(first + CHUNK_EVENTS, events.n))
 
 
 def later(chunks: Iterator[Events], t_us: int) -> Iterator[Events]:
-    """The same chunks without the events before this time."""
+    """The same chunks without the events before this time [us]."""
     for chunk in chunks:
         first = int(chunk.t.searchsorted(t_us))
         if first < chunk.n:
@@ -156,7 +159,7 @@ def later(chunks: Iterator[Events], t_us: int) -> Iterator[Events]:
 
 
 def refuse_topic(source: str | Path, topic: str | None) -> None:
-    """Refuse a choice among event streams where there is one stream only.
+    """Refuse a topic for a recording that has only one event stream.
 
     Raises:
         UnknownSource: a topic is given.
@@ -165,17 +168,17 @@ def refuse_topic(source: str | Path, topic: str | None) -> None:
         raise UnknownSource(source, f"it has one event stream and no topic {topic!r}")
 
 
-def whole(events: Events, sensor: Sensor, not_before_us: int | None) -> Events:
-    """The events before the first that is outside the sensor or out of order."""
+def valid_prefix(events: Events, sensor: Sensor, not_before_us: int | None) -> Events:
+    """The events before the first one that is outside the sensor or out of order."""
     if not events.n:
         return events
-    good = (events.x < sensor.width) & (events.y < sensor.height)
-    good[1:] &= events.t[1:] >= events.t[:-1]
+    valid = (events.x < sensor.width) & (events.y < sensor.height)
+    valid[1:] &= events.t[1:] >= events.t[:-1]
     if not_before_us is not None:
-        good[0] &= events.t[0] >= not_before_us
-    return events.span(0, events.n if good.all() else int(good.argmin()))
+        valid[0] &= events.t[0] >= not_before_us
+    return events.span(0, events.n if valid.all() else int(valid.argmin()))
 
 
 def empty_events(n: int) -> Events:
-    """Columns for a decoder to write this many events into."""
+    """Columns without values, into which a decoder writes up to n events."""
     return Events(np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8))

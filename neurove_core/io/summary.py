@@ -1,4 +1,4 @@
-"""What a recording holds, in numbers: read once through, in bounded memory however long it is."""
+"""Statistics of a recording, from one pass over it and with bounded memory."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -14,22 +14,22 @@ from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
 
 PEAK_US: Final = 10_000
-"""The peak rate is that of the busiest of these, counted from the first event on [us]."""
+"""Length of the intervals for the peak rate [us]. The first interval starts at the first event."""
 
 SLICE_US: Final = 50_000
-"""How much of the recording an image of its events shows [us]; longer, and all edges run into each other."""
+"""Length of the event image [us]. In a longer image the edges overlap."""
 
 T = TypeVar("T")
 
-_BARS: Final = 1024  # of the rate over time; they grow wider as the recording goes on
+_BARS: Final = 1024  # of the rate over time; their width grows with the length of the recording
 
 
 @dataclass(frozen=True, slots=True)
 class ImuSummary:
-    """Statistics of the inertial unit, in SI and the frame that its recording gives it in; each (x, y, z)."""
+    """Statistics of the inertial unit in SI units, each (x, y, z), in the frame of the recording's samples."""
 
     samples: int
-    rate_hz: float | None  # None of fewer than two samples
+    rate_hz: float | None  # None for fewer than two samples
     gyro_mean_rad_s: tuple[float, ...]
     gyro_std_rad_s: tuple[float, ...]
     accel_mean_m_s2: tuple[float, ...]
@@ -38,9 +38,12 @@ class ImuSummary:
 
 @dataclass(frozen=True, slots=True)
 class TruthSummary:
-    """The camera's true motion; the speeds are of the samples whose twist is known, None where none is."""
+    """Ground truth of the camera's motion.
 
-    source: str  # `poses` or `twists`: what was recorded; told as `from` in JSON
+    The speeds are of the samples whose twist is known. They are None if no twist is known.
+    """
+
+    source: str  # the recorded stream, `poses` or `twists`; key `from` in JSON
     samples: int
     first_us: int
     last_us: int
@@ -52,7 +55,7 @@ class TruthSummary:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """What a recording holds; what can not be told is None."""
+    """Statistics of a recording. An unknown value is None."""
 
     name: str
     sensor: Sensor
@@ -68,10 +71,10 @@ class Summary:
     triggers: int
     imu: ImuSummary | None
     truth: TruthSummary | None
-    broken: str | None  # what ended the reading, if it was not the end
+    broken: str | None  # the error that ended the reading, if any
 
     def as_json(self) -> dict[str, Any]:
-        """The same as what `json.dumps` takes."""
+        """The summary as a dict for `json.dumps`."""
         fields = asdict(self)
         if self.truth is not None:
             truth = fields["truth"]
@@ -80,37 +83,38 @@ class Summary:
 
 
 class Survey(NamedTuple):
-    """A summary, and what a picture of the recording needs beside it."""
+    """A summary, and the additional data for a plot of the recording."""
 
     summary: Summary
-    counts: NDArray[np.int64]  # (2, H, W) events of each pixel, OFF and ON, in SLICE_US somewhere in its second half
-    counts_start_us: int  # where that begins
+    counts: NDArray[np.int64]  # (2, H, W) OFF and ON events of each pixel in SLICE_US of its second half
+    counts_start_us: int  # start of the counts
     rate_t_us: NDArray[np.int64]  # (bars + 1,) edges of the bars
     rate_hz: NDArray[np.float64]  # (bars,) events per second
     twists: Twists | None
 
 
 def survey(recording: Recording, seconds: float | None = None) -> Survey:
-    """Read a recording through and say what it holds.
+    """Read a recording once and summarise it.
 
-    One that breaks is told up to there. The truth's twists are the recording's own answer; see geometry.twists.
+    For a damaged recording the summary covers the part before the damage. The ground truth is `Recording.twists`; see
+    geometry.twists.
 
     Args:
-        recording: what to read.
-        seconds: look at no more than this much of its events [s] from the first on; one that never ends needs it.
+        recording: the recording to read.
+        seconds: maximum duration of the events [s], from the first event. An endless recording needs it.
 
     Raises:
-        InvalidField: the recording never ends and `seconds` is not given, or `seconds` is not above 0; or its truth is
-            not what it must be.
+        InvalidField: the recording is endless and `seconds` is not given, `seconds` is not above 0, or its ground truth
+            is not valid.
     """
     if seconds is None and recording.endless:
-        raise InvalidField("info", "seconds", None, f"{recording.name} never ends: say how many seconds of it")
-    if seconds is not None and not seconds > 0:  # so written that nan fails
+        raise InvalidField("info", "seconds", None, f"{recording.name} never ends: give the number of seconds")
+    if seconds is not None and not seconds > 0:  # this form also refuses nan
         raise InvalidField("info", "seconds", seconds, "must be above 0")
     tally = _Tally(recording.sensor)
     broken = _drain(_until(recording.chunks(), seconds), tally.add)
-    inertia, frames, edges = _Inertia(), _Count(), _Count()
-    broken = _drain(recording.imu(), inertia.add) or broken
+    imu, frames, edges = _ImuTally(), _Count(), _Count()
+    broken = _drain(recording.imu(), imu.add) or broken
     broken = _drain(recording.frames(), lambda _: frames.add(1)) or broken
     broken = _drain(recording.triggers(), lambda some: edges.add(some.t.size)) or broken
     truths: list[Twists | None] = []
@@ -130,7 +134,7 @@ def survey(recording: Recording, seconds: float | None = None) -> Survey:
         peak_rate_hz=tally.peak * 1e6 / PEAK_US if n else None,
         frames=frames.n,
         triggers=edges.n,
-        imu=inertia.summary(),
+        imu=imu.summary(),
         truth=None if truth is None else _truth(truth, "poses" if "poses" in recording.streams else "twists"),
         broken=broken,
     )
@@ -138,7 +142,7 @@ def survey(recording: Recording, seconds: float | None = None) -> Survey:
 
 
 def _drain(parts: Iterator[T], add: Callable[[T], None]) -> str | None:
-    """Add all parts; what broke on the way, if anything."""
+    """Add all parts. Return the message of the error that ended them, if any."""
     try:
         for part in parts:
             add(part)
@@ -148,7 +152,7 @@ def _drain(parts: Iterator[T], add: Callable[[T], None]) -> str | None:
 
 
 def _until(chunks: Iterator[Events], seconds: float | None) -> Iterator[Events]:
-    """The chunks of the first so many seconds."""
+    """The chunks of the first `seconds`, or all chunks if it is None."""
     last_us = None
     for chunk in chunks:
         if seconds is None:
@@ -175,18 +179,18 @@ class _Tally:
 
     def __init__(self, sensor: Sensor) -> None:
         self._slice = np.zeros((2, sensor.height, sensor.width), np.int64)
-        self._whole_slice = np.zeros_like(self._slice)
-        self._slice_us, self._whole_slice_us = 0, 0  # their starts, after the first event
+        self._last_slice = np.zeros_like(self._slice)
+        self._slice_us, self._last_slice_us = 0, 0  # their starts, relative to the first event
         self.n, self.on, self.peak = 0, 0, 0
         self.first_us: int | None = None
         self.last_us: int | None = None
-        self._open, self._open_n = 0, 0  # the newest 10 ms, which the next chunk may go on with
+        self._newest, self._newest_n = 0, 0  # the newest 10 ms interval, which the next chunk may continue
         self._bars = np.zeros(_BARS, np.int64)
         self._bar_us = PEAK_US
 
     @property
     def span_s(self) -> float:
-        """From the first event to the last [s]."""
+        """Time from the first event to the last [s]."""
         return 0.0 if self.first_us is None or self.last_us is None else (self.last_us - self.first_us) / 1e6
 
     def add(self, events: Events) -> None:
@@ -198,13 +202,16 @@ class _Tally:
         since_us = events.t - self.first_us
         self._add_slices(events, since_us)
         self._add_peak(since_us // PEAK_US)
-        while int(since_us[-1]) >= self._bar_us * _BARS:  # twice as wide, so half as many
+        while int(since_us[-1]) >= self._bar_us * _BARS:  # double the width, which halves the number of bars
             self._bars = np.concatenate([self._bars.reshape(-1, 2).sum(axis=1), np.zeros(_BARS // 2, np.int64)])
             self._bar_us *= 2
         self._bars += np.bincount(since_us // self._bar_us, minlength=_BARS)
 
     def _add_slices(self, events: Events, since_us: NDArray[np.int64]) -> None:
-        """Go on with the image; after each the next one begins at twice its time, so one lies in the second half."""
+        """Add events to the image.
+
+        Each image starts at twice the time of the image before it, so one image is in the second half.
+        """
         while int(since_us[-1]) >= self._slice_us:
             first, stop = since_us.searchsorted([self._slice_us, self._slice_us + SLICE_US])
             part = events.span(int(first), int(stop))
@@ -212,26 +219,26 @@ class _Tally:
             if stop == events.n:
                 return
             if self._slice.any():
-                self._whole_slice, self._whole_slice_us = self._slice, self._slice_us
+                self._last_slice, self._last_slice_us = self._slice, self._slice_us
             self._slice = np.zeros_like(self._slice)
             self._slice_us = max(2 * self._slice_us, SLICE_US)
 
     def picture(self) -> tuple[NDArray[np.int64], int]:
-        """Counts (2, H, W) of one slice and where it begins [us]: the last whole one, or all there is."""
-        counts, at_us = self._whole_slice, self._whole_slice_us
+        """Counts (2, H, W) of one slice and its start [us]: the last complete slice, or the only one."""
+        counts, at_us = self._last_slice, self._last_slice_us
         if not counts.any():
             counts, at_us = self._slice, self._slice_us
         return counts, at_us + (self.first_us or 0)
 
     def _add_peak(self, span: NDArray[np.int64]) -> None:
         spans, counts = np.unique(span, return_counts=True)
-        if spans[0] == self._open:
-            counts[0] += self._open_n
+        if spans[0] == self._newest:
+            counts[0] += self._newest_n
         self.peak = max(self.peak, int(counts.max()))
-        self._open, self._open_n = int(spans[-1]), int(counts[-1])
+        self._newest, self._newest_n = int(spans[-1]), int(counts[-1])
 
     def rate(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Edges of the bars up to the last event's [us], and events per second in them."""
+        """Edges (bars + 1,) of the bars up to the last event [us], and their event rates (bars,) [1/s]."""
         if self.first_us is None or self.last_us is None:
             return np.zeros(1, np.int64), np.zeros(0)
         n = (self.last_us - self.first_us) // self._bar_us + 1
@@ -239,25 +246,28 @@ class _Tally:
         return edges, np.asarray(self._bars[:n] * (1e6 / self._bar_us))
 
 
-class _Inertia:
-    """Running mean and spread of the inertial unit: of parts together as of the whole (Chan 1983)."""
+class _ImuTally:
+    """Running mean and standard deviation of the inertial samples.
+
+    Source: Chan 1983: the statistics of two parts give those of both together.
+    """
 
     def __init__(self) -> None:
         self._n, self._first_us, self._last_us = 0, 0, 0
         self._mean, self._squares = np.zeros(6), np.zeros(6)
 
     def add(self, imu: Imu) -> None:
-        """Take in some samples."""
+        """Add samples."""
         values = np.concatenate([imu.gyro_rad_s, imu.accel_m_s2], axis=1)
         n, mean = len(values), values.mean(axis=0)
         self._first_us = self._first_us if self._n else int(imu.t[0])
         self._last_us = int(imu.t[-1])
-        apart, total = mean - self._mean, self._n + n
-        self._squares += ((values - mean) ** 2).sum(axis=0) + apart**2 * (self._n * n / total)
-        self._mean, self._n = self._mean + apart * (n / total), total
+        difference, total = mean - self._mean, self._n + n
+        self._squares += ((values - mean) ** 2).sum(axis=0) + difference**2 * (self._n * n / total)
+        self._mean, self._n = self._mean + difference * (n / total), total
 
     def summary(self) -> ImuSummary | None:
-        """What was taken in, or None."""
+        """Statistics of the added samples, or None without samples."""
         if not self._n:
             return None
         span_us = self._last_us - self._first_us

@@ -1,4 +1,4 @@
-"""A picture of a recording: its events on the sensor, their rate over time, and the camera's true motion."""
+"""Plot of a recording: its events on the sensor, their rate over time, and the ground truth of the motion."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,18 +14,18 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SUFFIXES = (".png", ".svg")
-_MOST_POINTS = 4000  # of a curve: more are not seen
+_MOST_POINTS = 4000  # of a curve: a reader cannot see more
 
 
 def draw(survey: Survey, file: Path) -> None:
-    """Draw what a survey found; the file is whole or it is not there.
+    """Draw a survey. The file is written atomically.
 
     Args:
-        survey: of neurove_core.io.summary.
-        file: a PNG or SVG, by its suffix.
+        survey: result of `neurove_core.io.summary.survey`.
+        file: PNG or SVG file; its suffix selects the format.
 
     Raises:
-        InvalidField: another suffix, or the file can not be written. MissingExtra: matplotlib is not installed.
+        InvalidField: the file has another suffix or cannot be written. MissingExtra: matplotlib is not installed.
     """
     if file.suffix.lower() not in _SUFFIXES:
         raise InvalidField("info", "plot", str(file), f"the suffix must be {' or '.join(_SUFFIXES)}")
@@ -62,12 +62,12 @@ def _figure(survey: Survey) -> "Figure":
 
 
 def _draw_events(axis: Any, survey: Survey) -> None:
-    """ON in red, OFF in blue; brightest are the busiest hundredth of the pixels."""
+    """Draw ON in red and OFF in blue. The 1% of the pixels with the most events are the brightest."""
     summary = survey.summary
     axis.imshow(_image(survey.counts), interpolation="nearest")
     axis.set_title(f"{summary.name}: {summary.events:,} events, {summary.duration_s:.3f} s", fontsize="medium")
     at_s = (survey.counts_start_us - (summary.first_us or 0)) / 1e6
-    axis.set_xlabel(f"{SLICE_US // 1000} ms from {at_s:.3f} s on; ON red, OFF blue")
+    axis.set_xlabel(f"{SLICE_US // 1000} ms from {at_s:.3f} s; ON red, OFF blue")
 
 
 def _image(counts: NDArray[np.int64]) -> NDArray[np.float64]:

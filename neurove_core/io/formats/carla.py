@@ -21,7 +21,7 @@ from neurove_core.geometry.motion import Poses, Twists, twists
 from neurove_core.io.archive import BROKEN_ZIP
 from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.format import Format
-from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, in_chunks, refuse_topic, whole
+from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, in_chunks, refuse_topic, valid_prefix
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import EventOutsideSensor, InvalidField, TimeBackwards
 from neurove_protocol.events import Events, Sensor, check_events
@@ -145,7 +145,7 @@ class CarlaRecording(EventsOnly):
                 try:
                     check_events(events, self.sensor, not_before_us)
                 except (EventOutsideSensor, TimeBackwards) as error:
-                    good = whole(events, self.sensor, not_before_us)
+                    good = valid_prefix(events, self.sensor, not_before_us)
                     yield from in_chunks(good)
                     raise BrokenRecording(self.path, f"event {n + good.n}", error.message) from None
                 yield from in_chunks(events)

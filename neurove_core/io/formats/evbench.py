@@ -13,7 +13,7 @@ from neurove_core.geometry.motion import Twists
 from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.format import Format
 from neurove_core.io.formats.mat5 import MatFault, read_columns
-from neurove_core.io.recording import EventsOnly, in_chunks, refuse_topic, whole
+from neurove_core.io.recording import EventsOnly, in_chunks, refuse_topic, valid_prefix
 from neurove_protocol.errors import EventOutsideSensor, TimeBackwards
 from neurove_protocol.events import Events, Sensor, check_events
 
@@ -74,7 +74,7 @@ class EvbenchRecording(EventsOnly):
         try:
             check_events(events, self.sensor)
         except (EventOutsideSensor, TimeBackwards) as error:
-            good = whole(events, self.sensor, None)
+            good = valid_prefix(events, self.sensor, None)
             yield from in_chunks(good)
             raise BrokenRecording(self.path, f"event {good.n}", error.message) from None
         yield from in_chunks(events)

@@ -1,4 +1,4 @@
-"""Event Stream files (.es, version 2): a header, then events of five bytes and bytes that only move the clock."""
+"""Event Stream files (.es, version 2): a header, then events of five bytes and bytes that only advance the clock."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -24,10 +24,10 @@ EVENT_BYTES: Final = 5
 
 @dataclass(frozen=True, slots=True)
 class EventStreamRecording(EventsOnly):
-    """An .es file of DVS events, or of ATIS events, whose measurements of exposure are left out; see `Recording`.
+    """An .es file of DVS or ATIS events; see `Recording`. Exposure measurements of ATIS are skipped.
 
-    The format's y counts upwards: its own converters turn over the y of a Prophesee camera, which counts downwards. So
-    it is turned over here too, to be the image's.
+    In the format y counts upwards: its own converters flip the y of a Prophesee camera, which counts downwards. This
+    reader flips y to image coordinates.
 
     Source: github.com/neuromorphic-paris/event_stream, version 2.0.
     """
@@ -39,26 +39,26 @@ class EventStreamRecording(EventsOnly):
 
     @classmethod
     def open(cls, path: Path, sensor: Sensor | None = None) -> Self:
-        """The recording in this file.
+        """Open the recording in this file.
 
         Args:
             path: the .es file.
-            sensor: its pixel array; overrides the header.
+            sensor: its pixel array, which takes precedence over the header.
 
         Raises:
-            UnknownSource: the file is not of version 2, or holds events of another type.
-            MissingGeometry: the header has no size that a sensor could have.
+            UnknownSource: the file is not of version 2, or its events are of another type.
+            MissingGeometry: the header has no valid sensor size.
             BrokenRecording: the file ends within its header.
         """
         with path.open("rb") as file:
             header = file.read(_HEADER_BYTES)
         if not header.startswith(_MAGIC[: len(header)]):
-            raise UnknownSource(path, "the file does not begin as Event Stream does")
+            raise UnknownSource(path, "the file does not begin with the Event Stream signature")
         if len(header) < _HEADER_BYTES:
             raise BrokenRecording(path, f"byte {len(header)}", "the file ends within its header")
         major, minor, _, kind = header[12:16]
         if major != 2:
-            raise UnknownSource(path, f"it is Event Stream {major}.{minor}, version 2 can be read")
+            raise UnknownSource(path, f"it is Event Stream {major}.{minor}; the supported version is 2")
         if kind not in (DVS, ATIS):
             raise UnknownSource(path, f"its events are of type {kind} ({_TYPES.get(kind, 'unknown')})")
         try:
@@ -73,16 +73,16 @@ class EventStreamRecording(EventsOnly):
         return self.path.name
 
     def chunks(self) -> Iterator[Events]:
-        """All events from the beginning; see `Recording`. Times are counted from the start of the recording.
+        """All events from the beginning; see `Recording`. Times [us] start at 0 at the start of the recording.
 
         Raises:
-            BrokenRecording: an event is cut or outside the sensor; it names the byte.
+            BrokenRecording: an event is truncated or outside the sensor. The error names the byte.
         """
-        at, t_us, rest = _HEADER_BYTES, 0, b""
+        at, t_us, pending = _HEADER_BYTES, 0, b""
         with self.path.open("rb") as file:
             file.seek(at)
             while block := file.read(BLOCK_BYTES):
-                data = np.frombuffer(rest + block, np.uint8)
+                data = np.frombuffer(pending + block, np.uint8)
                 while True:
                     out = empty_events(CHUNK_EVENTS)
                     t_us, read, n, inside = es_decode(data, t_us, self.kind, self.sensor.width, self.sensor.height, out)
@@ -95,8 +95,8 @@ class EventStreamRecording(EventsOnly):
                         raise BrokenRecording(self.path, f"byte {at}", why)
                     if n < CHUNK_EVENTS:
                         break
-                rest = data.tobytes()
-        if rest:
+                pending = data.tobytes()
+        if pending:
             raise BrokenRecording(self.path, f"byte {at}", "the file ends within an event")
 
 
@@ -104,27 +104,27 @@ class EventStreamRecording(EventsOnly):
 def es_decode(
     data: NDArray[np.uint8], t_us: int, kind: int, width: int, height: int, out: Events
 ) -> tuple[int, int, int, bool]:  # pragma: no cover (machine code)
-    """Decode bytes until an event is cut, `out` is full, or an event is not on the sensor.
+    """Decode bytes until an event is truncated, `out` is full, or an event is outside the sensor.
 
     Args:
-        data: (N,) bytes from the first of an event on.
-        t_us: time of what was before them [us].
+        data: (N,) bytes, starting with the first byte of an event.
+        t_us: time before these bytes [us].
         kind: DVS or ATIS.
-        width: of the sensor [px].
-        height: of the sensor [px].
-        out: columns of one length to write events into, y turned to count downwards.
+        width: width of the sensor [px].
+        height: height of the sensor [px].
+        out: columns of equal length for the events, with y downwards.
 
     Returns:
-        The time after the bytes read, how many were read, how many events lie in `out`, and whether the next event is
-        on the sensor as far as one knows.
+        The time after the bytes read [us], the number of bytes read, the number of events in `out`, and False if the
+        next event is outside the sensor.
     """
     t_out, x_out, y_out, p_out = out
-    shift, longest = (1, 127) if kind == DVS else (2, 63)  # a time that fits no event: as much of it as one byte tells
+    shift, longest = (1, 127) if kind == DVS else (2, 63)  # `longest`: largest step of an overflow byte [us]
     n, i = 0, 0
     while i < data.size and n < t_out.size:
         first = np.int64(data[i])
         if first >> shift == longest:
-            t_us += longest * int(first & 1 if kind == DVS else first & 3)  # 0: a reset, which moves nothing
+            t_us += longest * int(first & 1 if kind == DVS else first & 3)  # 0: a reset, the clock does not advance
             i += 1
             continue
         if i + EVENT_BYTES > data.size:
@@ -145,7 +145,7 @@ def es_decode(
 def es_reference(
     data: NDArray[np.uint8], t_us: int, kind: int, width: int, height: int
 ) -> tuple[int, int, Events, bool]:
-    """The plain twin of `es_decode`, with room for any number of events: time, bytes read, events, verdict."""
+    """Reference implementation of `es_decode` without a limit on events: time, bytes read, events, verdict."""
     rows: list[tuple[int, int, int, int]] = []
     at, inside = 0, True
     left = data.tobytes()

@@ -1,4 +1,4 @@
-"""AEDAT 2.0: the real recording with its inertial samples, and small files in jAER's layout."""
+"""AEDAT 2.0: a real recording with inertial samples, and small files in the layout of jAER."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def pairs(address: np.ndarray, t: np.ndarray) -> bytes:
 
 
 def davis(events: Events, sensor: Sensor) -> np.ndarray:
-    """Addresses that count from the lower right corner."""
+    """Addresses of the events, which count from the lower right corner."""
     _, x, y, p = (column.astype(np.int64) for column in events)
     return (sensor.height - 1 - y) << 22 | (sensor.width - 1 - x) << 12 | p << 11
 
@@ -34,7 +34,7 @@ def imu_words(values: list[int]) -> np.ndarray:
     return np.array([1 << 31 | 3 << 10 | code << 28 | (value & 0xFFFF) << 12 for code, value in enumerate(values)])
 
 
-def test_the_real_recording_holds_its_known_events_and_samples():
+def test_the_real_recording_gives_its_known_events_and_samples():
     recording = open_source(str(shared("aedat2/IMU_translBoxes.aedat")))
     events = read(recording)
     assert recording.streams == ("events", "imu")
@@ -43,13 +43,13 @@ def test_the_real_recording_holds_its_known_events_and_samples():
     imu = all_samples(recording)
     assert imu.t.size == 4833
     assert 1e6 * (imu.t.size - 1) / (imu.t[-1] - imu.t[0]) == pytest.approx(2463, rel=0.06)
-    # held nearly upright: a specific force of about g, upwards, which is -y in the image
+    # the camera is nearly upright: the specific force is about g upwards, which is -y in the image
     assert imu.accel_m_s2.mean(0)[1] == pytest.approx(-9.9, abs=0.2)
     np.testing.assert_allclose(np.degrees(imu.gyro_rad_s.mean(0)), (3.50, -4.89, 0.30), atol=0.01)
 
 
 @pytest.mark.parametrize(("chip", "sensor"), [(b"DAVIS240C", Sensor(240, 180)), (b"Davis346blue", Sensor(346, 260))])
-def test_events_of_a_davis_lie_in_the_image_whatever_stands_between_them(chip, sensor, tmp_path):
+def test_events_of_a_davis_are_read_between_words_of_other_types(chip, sensor, tmp_path):
     events = make_events(500, seed=1, sensor=sensor)
     other = np.array([1 << 31 | 5, 1 << 10])  # a pixel of a frame, an edge on the camera's input
     address = np.insert(davis(events, sensor), [0, 100], other)
@@ -60,7 +60,7 @@ def test_events_of_a_davis_lie_in_the_image_whatever_stands_between_them(chip, s
     assert not list(recording.imu())
 
 
-def test_a_dvs128_shows_on_by_a_bit_that_is_not_set(tmp_path):
+def test_on_events_of_a_dvs128_have_a_clear_polarity_bit(tmp_path):
     sensor = Sensor(128, 128)
     events = make_events(500, seed=1, sensor=sensor)
     t, x, y, p = (column.astype(np.int64) for column in events)
@@ -70,7 +70,7 @@ def test_a_dvs128_shows_on_by_a_bit_that_is_not_set(tmp_path):
     assert recording.streams == ("events",)
 
 
-def test_samples_are_in_si_by_the_scale_of_the_header_and_in_the_camera_frame(tmp_path):
+def test_samples_are_scaled_to_si_by_the_header_and_in_the_camera_frame(tmp_path):
     words = imu_words([4096, -4096, 2048, 0, 655, 1310, -655])
     data = header(b"DAVIS240C", SCALE % (500, 8)) + pairs(words, np.full(7, 1234))
     imu = all_samples(open_source(put(tmp_path, "a.aedat", data)))
@@ -79,15 +79,15 @@ def test_samples_are_in_si_by_the_scale_of_the_header_and_in_the_camera_frame(tm
     np.testing.assert_allclose(np.degrees(imu.gyro_rad_s), [[-10, 20, 10]])
 
 
-def test_a_sample_that_lacks_a_word_is_left_out(tmp_path):
-    whole = imu_words([1, 2, 3, 4, 5, 6, 7])
-    words = np.concatenate([whole[3:], whole, whole[:4], whole, whole[:6]])
+def test_an_incomplete_sample_is_skipped(tmp_path):
+    sample = imu_words([1, 2, 3, 4, 5, 6, 7])
+    words = np.concatenate([sample[3:], sample, sample[:4], sample, sample[:6]])
     data = header(b"DAVIS240C", SCALE % (1000, 8)) + pairs(words, np.arange(words.size))
     assert all_samples(open_source(put(tmp_path, "a.aedat", data))).t.tolist() == [4, 15]
 
 
 @pytest.mark.parametrize("more", [b"", SCALE % (1000, 3), SCALE % (1000, 8) + SCALE % (250, 8)])
-def test_samples_whose_scale_is_not_told_are_refused_and_events_still_read(more, tmp_path):
+def test_samples_without_a_scale_are_refused_and_events_are_still_read(more, tmp_path):
     data = header(b"DAVIS240C", more) + pairs(imu_words([1, 2, 3, 4, 5, 6, 7]), np.arange(7))
     recording = open_source(put(tmp_path, "a.aedat", data))
     assert read(recording).n == 0
@@ -95,7 +95,7 @@ def test_samples_whose_scale_is_not_told_are_refused_and_events_still_read(more,
         list(recording.imu())
 
 
-def test_the_clock_is_counted_on_over_a_wrap(tmp_path):
+def test_the_clock_is_unwrapped(tmp_path):
     t = np.array([(1 << 32) - 2, (1 << 32) - 1, 1])
     events = Events.from_columns(t, [1, 2, 3], [4, 5, 6], [0, 1, 0])
     data = header(b"DAVIS240C") + pairs(davis(events, Sensor(240, 180)), t)
@@ -110,7 +110,7 @@ def test_the_clock_is_counted_on_over_a_wrap(tmp_path):
         (1 << 22, 2, "after t=3 us"),
     ],
 )
-def test_a_bad_pair_ends_the_recording_at_its_byte(last, t, why, tmp_path):
+def test_a_bad_pair_ends_the_recording_and_the_error_names_its_byte(last, t, why, tmp_path):
     head = header(b"DAVIS240C")
     data = head + pairs(np.array([1 << 22, 1 << 31, last]), np.array([3, 4, t]))
     events, error = read_broken(open_source(put(tmp_path, "a.aedat", data)))
@@ -120,7 +120,7 @@ def test_a_bad_pair_ends_the_recording_at_its_byte(last, t, why, tmp_path):
     assert why in error.message
 
 
-def test_a_cut_pair_is_told_after_the_whole_ones(tmp_path):
+def test_a_truncated_pair_is_reported_after_the_complete_pairs(tmp_path):
     head = header(b"DAVIS240C")
     events, error = read_broken(
         open_source(put(tmp_path, "a.aedat", head + pairs(np.full(3, 1 << 22), np.arange(3))[:-3]))
@@ -134,8 +134,8 @@ def test_a_cut_pair_is_told_after_the_whole_ones(tmp_path):
     ("head", "why"),
     [
         (header(b"CochleaAMS1c"), "its chip is 'CochleaAMS1c'"),
-        (b"#!AER-DAT2.0\r\n", "names no AEChip"),
-        (b"#!AER-DAT3.1\r\n", "does not begin as AEDAT 2.0 does"),
+        (b"#!AER-DAT2.0\r\n", "has no AEChip"),
+        (b"#!AER-DAT3.1\r\n", "does not begin with the AEDAT 2.0 signature"),
     ],
 )
 def test_an_unknown_chip_or_version_is_refused(head, why, tmp_path):

@@ -1,4 +1,4 @@
-"""AEDAT4: inertial samples, frames and triggers, and what is wrong with its packets of events."""
+"""AEDAT4: inertial samples, frames, triggers, and packets with bad events."""
 
 import struct
 
@@ -16,7 +16,7 @@ EVENTS = make_events(300, seed=1, start_us=16_700_000)
 
 
 @pytest.mark.parametrize(("name", "n", "rate_hz"), [("davis346", 2363, 1001), ("dvxplorer", 475, 805)])
-def test_the_samples_of_a_camera_at_rest_show_gravity_and_a_small_bias(name, n, rate_hz):
+def test_the_samples_of_a_stationary_camera_show_gravity_and_a_small_bias(name, n, rate_hz):
     imu = all_samples(open_source(str(shared(f"aedat4/{name}.aedat4"))))
     assert imu.t.size == n
     assert (np.diff(imu.t) >= 0).all()
@@ -29,7 +29,7 @@ def test_the_samples_of_a_camera_at_rest_show_gravity_and_a_small_bias(name, n, 
         np.testing.assert_allclose(np.degrees(imu.gyro_rad_s.mean(0)), (0.739, -0.493, 0.114), atol=1e-3)
 
 
-def test_each_frame_of_a_davis346_comes_with_its_marks():
+def test_each_frame_of_a_davis346_has_its_trigger_edges():
     recording = open_source(str(shared("aedat4/davis346.aedat4")))
     assert recording.streams == ("events", "imu", "frames", "triggers")
     frames = list(recording.frames())
@@ -54,9 +54,9 @@ def test_a_camera_without_frames_has_none():
 
 
 def trigger_packet(rows: list[tuple[int, int]]) -> bytes:
-    """A packet of stream 1 with these times and sources: a flatbuffer by hand, a vector of tables."""
+    """A packet of stream 1 with these times and sources, written as a flatbuffer: a vector of tables."""
     vector = 28 + 4 * len(rows)
-    layout = -(-(vector - 4) // 8) * 8 + 4  # of all tables; times lie at eights when the size in front is counted
+    layout = -(-(vector - 4) // 8) * 8 + 4  # of all tables; times are 8-byte aligned if the size prefix is included
     tables = [layout + 8 + 24 * i for i in range(len(rows))]
     buffer = struct.pack("<I4sHHHxxiII", 16, b"TRIG", 6, 8, 4, 8, 4, len(rows))
     buffer += b"".join(struct.pack("<I", table - (28 + 4 * i)) for i, table in enumerate(tables))
@@ -67,23 +67,23 @@ def trigger_packet(rows: list[tuple[int, int]]) -> bytes:
 
 
 def with_triggers(*packets: list[tuple[int, int]]) -> bytes:
-    """A file of one packet of events and these of triggers."""
+    """A file with one packet of events and these packets of triggers."""
     file = aedat4([make_events(20, seed=1)], SENSOR, finished=False)
     return file.data[: file.stops[0]] + b"".join(map(trigger_packet, packets))
 
 
-def test_the_camera_s_input_and_its_generator_have_channels_of_their_own(tmp_path):
+def test_the_input_and_the_generator_of_a_camera_have_separate_channels(tmp_path):
     rows = [(5, 1), (6, 2), (7, 0), (8, 3), (9, 4), (10, 5)]
     recording = open_source(put(tmp_path, "a.aedat4", with_triggers(rows, [(10, 2)])))
     assert recording.streams == ("events", "triggers")
     t, channel, level = (column.tolist() for column in all_triggers(recording))
-    assert t == [5, 6, 8, 9, 10, 10]  # the reset of the clock at 7 is no edge
+    assert t == [5, 6, 8, 9, 10, 10]  # the reset of the clock at 7 is not an edge
     assert channel == [EXTERNAL] * 3 + [GENERATOR] * 2 + [EXTERNAL]
     assert level == [1, 0, 1, 1, 0, 0]
     assert not list(recording.imu())
 
 
-def test_triggers_whose_time_runs_backwards_are_not_handed_on(tmp_path):
+def test_triggers_whose_time_runs_backwards_raise_an_error(tmp_path):
     data = with_triggers([(5, 1)], [(4, 2)])
     triggers = open_source(put(tmp_path, "a.aedat4", data)).triggers()
     assert next(iter(triggers)).t.tolist() == [5]
@@ -92,21 +92,21 @@ def test_triggers_whose_time_runs_backwards_are_not_handed_on(tmp_path):
 
 
 @pytest.mark.parametrize("part", [0.3, 0.7])
-def test_every_stream_of_a_cut_file_gives_what_is_whole_and_then_the_byte(part, tmp_path):
+def test_every_stream_of_a_truncated_file_gives_its_complete_packets_and_then_names_the_byte(part, tmp_path):
     data = shared("aedat4/davis346.aedat4").read_bytes()
-    whole = open_source(put(tmp_path, "a.aedat4", data))
-    cut = open_source(put(tmp_path, "b.aedat4", data[: int(part * len(data))]))
-    told = set()
+    full = open_source(put(tmp_path, "a.aedat4", data))
+    truncated = open_source(put(tmp_path, "b.aedat4", data[: int(part * len(data))]))
+    places = set()
     for stream in ("imu", "frames", "triggers", "chunks"):
         got = []
         with pytest.raises(BrokenRecording) as caught:
-            got.extend(getattr(cut, stream)())  # keeps what came before the error
-        told.add(caught.value.details["where"])
+            got.extend(getattr(truncated, stream)())  # keeps the items before the error
+        places.add(caught.value.details["where"])
         assert got
-        for piece, want in zip(got, getattr(whole, stream)(), strict=False):
+        for piece, want in zip(got, getattr(full, stream)(), strict=False):
             for a, b in zip(piece, want, strict=True):
                 np.testing.assert_array_equal(a, b)
-    assert len(told) == 1  # all streams end at the same place
+    assert len(places) == 1  # all streams end at the same place
 
 
 # --- packets and streams of events -----------------------------------------------------------------------------------
@@ -132,30 +132,30 @@ def test_a_packet_with_a_bad_event_ends_the_recording_before_that_event(t, x, wh
     assert why in error.message
 
 
-def test_a_packet_without_events_is_no_chunk(tmp_path):
+def test_a_packet_without_events_gives_no_chunk(tmp_path):
     file = aedat4([Events.empty(), EVENTS, Events.empty()], SENSOR)
     assert_same(read(open_source(put(tmp_path, "a.aedat4", file.data))), EVENTS)
 
 
-def test_an_aedat4_file_without_an_event_stream_or_a_size_says_so(tmp_path):
+def test_an_aedat4_file_without_an_event_stream_or_a_size_is_refused(tmp_path):
     data = aedat4([EVENTS], SENSOR).data
     with pytest.raises(UnknownSource, match="no event stream"):
         open_source(put(tmp_path, "a.aedat4", data.replace(b">EVTS<", b">FRME<")))
-    nowhere = put(tmp_path, "a.aedat4", data.replace(b">64<", b">00<"))
+    without_size = put(tmp_path, "a.aedat4", data.replace(b">64<", b">00<"))
     with pytest.raises(MissingGeometry):
-        open_source(nowhere)
-    assert_same(read(open_source(nowhere, SENSOR)), EVENTS)
-    with pytest.raises(UnknownSource, match="does not begin as AEDAT4 does"):
+        open_source(without_size)
+    assert_same(read(open_source(without_size, SENSOR)), EVENTS)
+    with pytest.raises(UnknownSource, match="does not begin with the AEDAT4 signature"):
         open_source(put(tmp_path, "a.aedat4", b"#!AER-DAT3.1\r\n"))
 
 
-def test_of_several_event_streams_the_first_is_read_and_the_name_says_so(tmp_path):
+def test_the_first_of_several_event_streams_is_read_and_named(tmp_path):
     data = aedat4([EVENTS], SENSOR).data
     size = b'<attr key="sizeX" type="int">64</attr><attr key="sizeY" type="int">48</attr>'
     both = data.replace(b">TRIG<", b">EVTS<").replace(b'1/info/"></node>', b'1/info/">' + size + b"</node>")
     longer = len(both) - len(data)
     header = bytearray(both)
-    for at, form in ((14, "<u4"), (46, "<i8"), (58, "<u4")):  # lengths of header and text, and where the packets end
+    for at, form in ((14, "<u4"), (46, "<i8"), (58, "<u4")):  # lengths of header and text, and the end of the packets
         header[at : at + int(form[2])] = (np.frombuffer(both, form, 1, at) + longer).astype(form).tobytes()
     recording = open_source(put(tmp_path, "a.aedat4", bytes(header)))
     assert recording.name == "a.aedat4 (stream 0, the first of 2 event streams)"

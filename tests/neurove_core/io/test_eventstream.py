@@ -1,4 +1,4 @@
-"""Event Stream files: the compiled decoder beside its reference, the real recording, broken files."""
+"""Event Stream files: the compiled decoder and its reference implementation, a real recording, broken files."""
 
 import struct
 
@@ -20,7 +20,7 @@ def header(kind: int = DVS, version: bytes = b"\2\0\0", sensor: Sensor = SENSOR)
 
 
 def write(events: Events, kind: int = DVS, sensor: Sensor = SENSOR) -> list[bytes]:
-    """The bytes of each event, with the overflows before it; y counts upwards in the file."""
+    """The bytes of each event and of the overflows before it. In the file y counts upwards."""
     longest, shift = (127, 1) if kind == DVS else (63, 2)
     parts, last = [], 0
     for t, x, y, p in zip(*(column.tolist() for column in events), strict=True):
@@ -35,7 +35,7 @@ def write(events: Events, kind: int = DVS, sensor: Sensor = SENSOR) -> list[byte
 EVENTS = make_events(300, seed=1, duration_us=60_000)
 
 
-def test_the_real_recording_holds_its_known_events():
+def test_the_real_recording_gives_its_known_events():
     recording = open_source(str(shared("es/dvs.es")))
     assert recording.sensor == Sensor(320, 240)
     events = read(recording)
@@ -44,53 +44,53 @@ def test_the_real_recording_holds_its_known_events():
 
 
 @pytest.mark.parametrize("kind", [DVS, ATIS])
-def test_what_was_written_is_read(kind, tmp_path):
+def test_a_written_file_reads_back_identical(kind, tmp_path):
     data = header(kind) + b"".join(write(EVENTS, kind))
     assert_same(read(open_source(put(tmp_path, "a.es", data))), EVENTS)
 
 
 @pytest.mark.parametrize("kind", [DVS, ATIS])
-@given(data=st.lists(st.sampled_from([*range(4), 126, 127, 252, 253, 254, 255]), max_size=200), room=st.integers(1, 9))
-def test_compiled_is_its_reference_however_little_room_there_is(kind, data, room):
+@given(data=st.lists(st.sampled_from([*range(4), 126, 127, 252, 253, 254, 255]), max_size=200), n_max=st.integers(1, 9))
+def test_compiled_decoder_equals_its_reference_for_any_size_of_out(kind, data, n_max):
     array = np.array(data, np.uint8)
     t_us, read_, want, inside = es_reference(array, 5, kind, 300, 600)
     state, parts = 5, [Events.empty()]
     while True:
-        out = Events(*(np.zeros(room, column.dtype) for column in Events.empty()))
+        out = Events(*(np.zeros(n_max, column.dtype) for column in Events.empty()))
         state, done, n, good = es_decode(array, state, kind, 300, 600, out)
         parts.append(out.span(0, n))
         array = array[done:]
-        if n < room:
+        if n < n_max:
             break
     assert_same(Events.join(parts), want)
     assert (state, len(data) - array.size, good) == (t_us, read_, inside)
 
 
-def test_measurements_of_exposure_are_left_out_and_their_time_counts(tmp_path):
+def test_exposure_measurements_are_skipped_and_advance_the_clock(tmp_path):
     data = header(ATIS) + bytes([5 << 2 | 1, 1, 0, 1, 0]) + bytes([6 << 2 | 2, 1, 0, 1, 0])
     got = read(open_source(put(tmp_path, "a.es", data)))
     assert_same(got, Events.from_columns([11], [1], [46], [1]))
 
 
-def test_a_cut_file_gives_its_whole_events_and_then_the_byte(tmp_path):
+def test_a_truncated_file_gives_its_complete_events_and_then_names_the_byte(tmp_path):
     parts = write(EVENTS)
     ends = np.cumsum([len(part) for part in parts])
-    for cut in (3, 100, 777):
-        stream = b"".join(parts)[:cut]
+    for size in (3, 100, 777):
+        stream = b"".join(parts)[:size]
         events, error = read_broken(open_source(put(tmp_path, "a.es", header() + stream)))
-        whole = int(np.searchsorted(ends, cut, "right"))
-        assert_same(events, EVENTS.span(0, whole))
-        clock = len(stream[ends[whole - 1] if whole else 0 :]) - len(
-            stream[ends[whole - 1] if whole else 0 :].lstrip(b"\xff")
+        complete = int(np.searchsorted(ends, size, "right"))
+        assert_same(events, EVENTS.span(0, complete))
+        clock = len(stream[ends[complete - 1] if complete else 0 :]) - len(
+            stream[ends[complete - 1] if complete else 0 :].lstrip(b"\xff")
         )
-        reached = 20 + (int(ends[whole - 1]) if whole else 0) + clock
+        reached = 20 + (int(ends[complete - 1]) if complete else 0) + clock
         if error is not None:
             assert error.details["where"] == f"byte {reached}"
         else:
-            assert reached == 20 + cut
+            assert reached == 20 + size
 
 
-def test_an_event_outside_the_sensor_ends_the_recording_at_its_byte(tmp_path):
+def test_an_event_outside_the_sensor_ends_the_recording_and_the_error_names_its_byte(tmp_path):
     good = b"".join(write(EVENTS))
     events, error = read_broken(open_source(put(tmp_path, "a.es", header() + good + bytes([0, 64, 0, 3, 0]))))
     assert_same(events, EVENTS)

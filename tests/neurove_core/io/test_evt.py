@@ -1,4 +1,4 @@
-"""EVT2 and EVT3 words -> events: the compiled decoders, their references, and what the camera's clock does."""
+"""Decoders of EVT2 and EVT3 words: the compiled ones, their reference implementations, and the camera's clock."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -51,17 +51,17 @@ EVT3 = Format(evt.evt3_decode, evt.evt3_reference, Evt3State(), write_evt3, np.u
 both = pytest.mark.parametrize("format_", [EVT2, EVT3], ids=["evt2", "evt3"])
 
 
-def room(n: int) -> Events:
+def zero_events(n: int) -> Events:
     return Events(np.zeros(n, np.int64), np.zeros(n, np.uint16), np.zeros(n, np.uint16), np.zeros(n, np.uint8))
 
 
 def decode(
-    format_: Format, words: NDArray[Any], *, state: Any = None, sensor: Sensor = SENSOR, room_for: int = 4096
+    format_: Format, words: NDArray[Any], *, state: Any = None, sensor: Sensor = SENSOR, n_max: int = 4096
 ) -> tuple[Any, int, Events, int]:
-    """All words, through an `out` of this room as often as it takes: state, words read, events, verdict."""
+    """Decode all words, with an `out` of n_max events for each call: state, words read, events, verdict."""
     state, parts, done = state or format_.start, [Events.empty()], 0
     while True:
-        out = room(room_for)
+        out = zero_events(n_max)
         state, read, n, verdict = format_.decode(words[done:], state, sensor.width, sensor.height, out)
         parts.append(out.span(0, n))
         done += read
@@ -74,7 +74,7 @@ def rows(events: Events) -> list[tuple[int, ...]]:
 
 
 def in_rows(n: int, seed: int, start_us: int, duration_us: int, sensor: Sensor = SENSOR) -> Events:
-    """Events as a camera's rows come: many of one time and row, next to each other."""
+    """Events as a camera sends rows: many neighbours with the same time and row."""
     rng = np.random.default_rng(seed)
     t = np.sort(rng.integers(start_us, start_us + duration_us, max(n // 8, 1)))[rng.integers(0, max(n // 8, 1), n)]
     y, p = t * 7919 % sensor.height, t * 31 % 2
@@ -83,7 +83,7 @@ def in_rows(n: int, seed: int, start_us: int, duration_us: int, sensor: Sensor =
     return Events.from_columns(*(column[order] for column in (t, x, y, p)))
 
 
-# Words of every type, the ones that matter often; TIME_HIGH mostly near the last one, as a clock shows it.
+# Words of every type, with the important types more often; TIME_HIGH is mostly near its previous value, as in a clock.
 def evt3_streams() -> st.SearchStrategy[NDArray[np.uint16]]:
     word = st.tuples(st.sampled_from([0, 2, 2, 2, 3, 4, 4, 5, 5, 6, 7, 0xA, 0xE, 0xF]), st.integers(0, 0xFFF))
     high = st.tuples(st.just(TIME_HIGH), st.one_of(st.integers(0, 15), st.integers(4085, 4095), st.integers(0, 4095)))
@@ -100,7 +100,7 @@ def evt2_streams() -> st.SearchStrategy[NDArray[np.uint32]]:
 
 @both
 @pytest.mark.parametrize("seed", range(5))
-def test_what_was_written_is_read_across_a_wrap_of_the_clock(format_, seed):
+def test_written_words_decode_to_their_events_across_a_wrap_of_the_clock(format_, seed):
     start_us = format_.wrap_us - 50_000
     for events in (
         make_events(500, seed=seed, start_us=start_us, sensor=SENSOR),
@@ -116,7 +116,7 @@ def test_what_was_written_is_read_across_a_wrap_of_the_clock(format_, seed):
 
 
 @pytest.mark.parametrize(("format_", "days"), [(EVT3, 0.01), (EVT2, 0.5)], ids=["evt3", "evt2"])
-def test_the_clock_is_counted_on_over_many_wraps(format_, days):
+def test_the_clock_is_unwrapped_over_many_wraps(format_, days):
     t = np.arange(0, int(days * 86_400e6), format_.wrap_us // 3)
     events = Events.from_columns(t, t % 640, t % 480, t % 2)
     assert events.t[-1] > 2 * format_.wrap_us
@@ -124,29 +124,29 @@ def test_the_clock_is_counted_on_over_many_wraps(format_, days):
 
 
 @given(words=evt3_streams(), width=st.sampled_from([300, 1280, 4096]))
-def test_compiled_evt3_is_its_reference(words, width):
-    assert_twins(EVT3, words, Sensor(width, 2048))
+def test_compiled_evt3_decoder_equals_its_reference(words, width):
+    assert_equals_reference(EVT3, words, Sensor(width, 2048))
 
 
 @given(words=evt2_streams(), width=st.sampled_from([2000, 4096]))
-def test_compiled_evt2_is_its_reference(words, width):
-    assert_twins(EVT2, words, Sensor(width, 2048))
+def test_compiled_evt2_decoder_equals_its_reference(words, width):
+    assert_equals_reference(EVT2, words, Sensor(width, 2048))
 
 
 @both
 @pytest.mark.parametrize("seed", range(10))
-def test_compiled_is_its_reference_on_noise(format_, seed):
-    """Words of every value, also of no known type: both stop at the same word for the same reason."""
+def test_compiled_decoder_equals_its_reference_on_noise(format_, seed):
+    """Random words, also of unknown types: both decoders stop at the same word with the same verdict."""
     rng = np.random.default_rng(seed)
     top = np.iinfo(format_.dtype).max
     kinds = np.array([0, 1, 2, 3, 4, 5, 6, 8, 8, 0xA, 0xE, 0xF] if format_ is EVT3 else [0, 1, 8, 0xE, 9])
     words = rng.integers(0, top, 3000, format_.dtype, endpoint=True)
     shift = np.iinfo(format_.dtype).bits - 4
     words = (words & (top >> 4)) | (rng.choice(kinds[kinds != seed % 10], 3000).astype(format_.dtype) << shift)
-    assert_twins(format_, words, Sensor(4096, 4096))
+    assert_equals_reference(format_, words, Sensor(4096, 4096))
 
 
-def assert_twins(format_: Format, words: NDArray[Any], sensor: Sensor) -> None:
+def assert_equals_reference(format_: Format, words: NDArray[Any], sensor: Sensor) -> None:
     state, read, events, verdict = decode(format_, words, sensor=sensor)
     want_state, want_read, want_events, want_verdict = format_.reference(
         words, format_.start, sensor.width, sensor.height
@@ -158,45 +158,45 @@ def assert_twins(format_: Format, words: NDArray[Any], sensor: Sensor) -> None:
         assert state == want_state
 
 
-@given(words=evt3_streams(), cuts=st.lists(st.integers(0, 200), max_size=6), room_for=st.integers(VECTOR_EVENTS, 40))
-def test_events_do_not_depend_on_how_evt3_words_are_cut(words, cuts, room_for):
-    assert_cuts_do_not_matter(EVT3, words, cuts, room_for)
+@given(words=evt3_streams(), splits=st.lists(st.integers(0, 200), max_size=6), n_max=st.integers(VECTOR_EVENTS, 40))
+def test_events_do_not_depend_on_how_evt3_words_are_split(words, splits, n_max):
+    assert_splits_do_not_matter(EVT3, words, splits, n_max)
 
 
-@given(words=evt2_streams(), cuts=st.lists(st.integers(0, 200), max_size=6), room_for=st.integers(1, 40))
-def test_events_do_not_depend_on_how_evt2_words_are_cut(words, cuts, room_for):
-    assert_cuts_do_not_matter(EVT2, words, cuts, room_for)
+@given(words=evt2_streams(), splits=st.lists(st.integers(0, 200), max_size=6), n_max=st.integers(1, 40))
+def test_events_do_not_depend_on_how_evt2_words_are_split(words, splits, n_max):
+    assert_splits_do_not_matter(EVT2, words, splits, n_max)
 
 
-def assert_cuts_do_not_matter(format_: Format, words: NDArray[Any], cuts: Sequence[int], room_for: int) -> None:
+def assert_splits_do_not_matter(format_: Format, words: NDArray[Any], splits: Sequence[int], n_max: int) -> None:
     sensor = Sensor(4096, 2048)
-    whole_state, _, whole, verdict = decode(format_, words, sensor=sensor)
+    want_state, _, want, verdict = decode(format_, words, sensor=sensor)
     assert verdict == OK
     for step in (decode, reference):
         state, parts = format_.start, []
-        for piece in np.split(words, sorted(cuts)):
-            state, _, events, _ = step(format_, piece, state=state, sensor=sensor, room_for=room_for)
+        for piece in np.split(words, sorted(splits)):
+            state, _, events, _ = step(format_, piece, state=state, sensor=sensor, n_max=n_max)
             parts.append(events)
-        assert_same(Events.join(parts), whole)
-        assert state == whole_state
+        assert_same(Events.join(parts), want)
+        assert state == want_state
 
 
-def reference(format_: Format, words: NDArray[Any], *, state: Any, sensor: Sensor, room_for: int) -> Any:
+def reference(format_: Format, words: NDArray[Any], *, state: Any, sensor: Sensor, n_max: int) -> Any:
     return format_.reference(words, state, sensor.width, sensor.height)
 
 
-@pytest.mark.parametrize("room_for", range(VECTOR_EVENTS, 2 * VECTOR_EVENTS))
-def test_a_vector_that_does_not_fit_any_more_is_left_for_the_next_call(room_for):
+@pytest.mark.parametrize("n_max", range(VECTOR_EVENTS, 2 * VECTOR_EVENTS))
+def test_a_vector_that_does_not_fit_is_left_for_the_next_call(n_max):
     words = evt3((TIME_HIGH, 0), (ADDR_Y, 1), (BASE_X, 0), HIT, *[(VECT_12, 0xFFF)] * 50)
-    out = room(room_for + 50)  # what lies beyond `out` must not be written to
-    _, _, n, _ = evt.evt3_decode(words, Evt3State(), 1280, 720, out.span(0, room_for))
-    assert n <= room_for
-    assert not out.x[room_for:].any()
-    assert_same(decode(EVT3, words, room_for=room_for)[2], decode(EVT3, words)[2])
+    out = zero_events(n_max + 50)  # the decoder must not write beyond `out`
+    _, _, n, _ = evt.evt3_decode(words, Evt3State(), 1280, 720, out.span(0, n_max))
+    assert n <= n_max
+    assert not out.x[n_max:].any()
+    assert_same(decode(EVT3, words, n_max=n_max)[2], decode(EVT3, words)[2])
 
 
-def test_without_room_for_a_vector_nothing_is_read_or_written():
-    out = room(VECTOR_EVENTS)
+def test_without_space_for_a_vector_nothing_is_read_or_written():
+    out = zero_events(VECTOR_EVENTS)
     _, read, n, verdict = evt.evt3_decode(
         evt3((TIME_HIGH, 0), (ADDR_Y, 1), HIT), Evt3State(), 1280, 720, out.span(0, VECTOR_EVENTS - 1)
     )
@@ -208,11 +208,11 @@ HIT = (ADDR_X, 7)
 
 
 def evt3_times(*words: tuple[int, int]) -> list[int]:
-    """Times of the events that these words make, after a first row."""
+    """Times of the events of these words, after a word for the row."""
     return list(map(int, decode(EVT3, evt3((ADDR_Y, 5), *words))[2].t))
 
 
-def test_a_small_step_back_of_time_high_is_no_wrap_and_time_does_not_run_backwards():
+def test_a_small_decrease_of_time_high_is_not_a_wrap_and_times_do_not_decrease():
     times = evt3_times(
         (TIME_HIGH, 100), (TIME_LOW, 50), HIT, (TIME_HIGH, 98), (TIME_LOW, 60), HIT, (TIME_HIGH, 101), HIT
     )
@@ -228,18 +228,18 @@ def test_a_small_step_back_of_time_high_is_no_wrap_and_time_does_not_run_backwar
         (4095, "wraps"),
     ],
 )
-def test_how_far_time_high_may_step_back(back, then):
+def test_a_decrease_of_time_high_by_more_than_ten_is_a_wrap(back, then):
     first, second = evt3_times((TIME_HIGH, 4095), HIT, (TIME_HIGH, 4095 - back), HIT)
     assert first == 4095 * 4096
     assert second == (first if then == "stays" else (2 * 4096 - 1 - back) * 4096)
 
 
-def test_a_step_back_over_a_wrap_is_undone_by_the_next_step():
+def test_a_decrease_across_a_wrap_is_undone_by_the_next_increase():
     times = evt3_times((TIME_HIGH, 4095), HIT, (TIME_HIGH, 0), HIT, (TIME_HIGH, 4094), HIT, (TIME_HIGH, 1), HIT)
     assert [t >> 12 for t in times] == [4095, 4096, 4096, 4097]
 
 
-def test_evt2_steps_back_a_little_too():
+def test_evt2_accepts_a_small_decrease_of_time_high_too():
     top = (1 << 28) - 1
     words = [
         (8, top),
@@ -256,27 +256,27 @@ def test_evt2_steps_back_a_little_too():
     assert times == [wrap - 64 + 3, wrap - 64 + 3, wrap + 2, wrap + 2]
 
 
-def test_a_new_time_high_begins_at_its_first_us_and_a_repeated_one_changes_nothing():
+def test_a_new_time_high_resets_time_low_and_a_repeated_one_changes_nothing():
     times = evt3_times((TIME_HIGH, 1), (TIME_LOW, 4000), HIT, (TIME_HIGH, 1), HIT, (TIME_HIGH, 2), HIT)
     assert times == [4096 + 4000, 4096 + 4000, 2 * 4096]
 
 
-def test_events_without_a_time_or_a_place_are_ignored():
+def test_events_before_the_first_time_or_row_are_ignored():
     early = [(TIME_LOW, 9), (ADDR_Y, 3), HIT, (BASE_X, 20), (VECT_8, 0xFF)]
     got = decode(EVT3, evt3(*early, (TIME_HIGH, 2), HIT, (VECT_8, 1)))[2]
-    assert rows(got) == [(2 * 4096, 7, 3, 0), (2 * 4096, 28, 3, 0)]  # the vector before had moved the base on by 8
-    no_place = evt3((TIME_HIGH, 2), HIT, (VECT_12, 1), (ADDR_Y, 3), (VECT_12, 1))
-    assert decode(EVT3, no_place)[2].n == 0
+    assert rows(got) == [(2 * 4096, 7, 3, 0), (2 * 4096, 28, 3, 0)]  # the earlier vector advanced the base by 8
+    no_base = evt3((TIME_HIGH, 2), HIT, (VECT_12, 1), (ADDR_Y, 3), (VECT_12, 1))
+    assert decode(EVT3, no_base)[2].n == 0
     assert decode(EVT2, evt2((1, cd(1, 2, 3)), (8, 0), (1, cd(1, 2, 3))))[2].n == 1
 
 
-def test_vectors_advance_the_base_and_single_events_leave_it():
+def test_vectors_advance_the_base_and_single_events_do_not():
     words = [(BASE_X, 1 << 11 | 100), (VECT_12, 0b1000_0000_0001), (ADDR_X, 5), (VECT_8, 0b1000_0001), (VECT_12, 1)]
     got = decode(EVT3, evt3((TIME_HIGH, 0), (ADDR_Y, 9), *words))[2]
     assert [(x, p) for _, x, _, p in rows(got)] == [(100, 1), (111, 1), (5, 0), (112, 1), (119, 1), (120, 1)]
 
 
-def test_triggers_and_monitoring_words_make_no_event():
+def test_triggers_and_monitoring_words_give_no_events():
     words = evt3((TIME_HIGH, 0), (ADDR_Y, 1), (TRIGGER, 1), (OTHERS, 5), (7, 3), (0xF, 4), HIT)
     assert decode(EVT3, words)[2].n == 1
     assert decode(EVT2, evt2((8, 0), (TRIGGER, 1), (OTHERS, 5), (0xF, 4), (1, cd(0, 1, 1))))[2].n == 1
@@ -292,14 +292,18 @@ def test_triggers_are_found_with_their_time_channel_and_level():
     assert (t.tolist(), channel.tolist(), level.tolist()) == ([5 * 64 + 63], [17], [1])
 
 
-@given(words=evt3_streams(), cuts=st.lists(st.integers(0, 200), max_size=6))
-def test_compiled_evt3_triggers_are_their_reference_however_the_words_are_cut(words, cuts):
-    assert_same_triggers(triggers.evt3_triggers, triggers.evt3_triggers_reference, np.split(words, sorted(cuts)), words)
+@given(words=evt3_streams(), splits=st.lists(st.integers(0, 200), max_size=6))
+def test_compiled_evt3_triggers_equal_their_reference_for_every_split_of_the_words(words, splits):
+    assert_same_triggers(
+        triggers.evt3_triggers, triggers.evt3_triggers_reference, np.split(words, sorted(splits)), words
+    )
 
 
-@given(words=evt2_streams(), cuts=st.lists(st.integers(0, 200), max_size=6))
-def test_compiled_evt2_triggers_are_their_reference_however_the_words_are_cut(words, cuts):
-    assert_same_triggers(triggers.evt2_triggers, triggers.evt2_triggers_reference, np.split(words, sorted(cuts)), words)
+@given(words=evt2_streams(), splits=st.lists(st.integers(0, 200), max_size=6))
+def test_compiled_evt2_triggers_equal_their_reference_for_every_split_of_the_words(words, splits):
+    assert_same_triggers(
+        triggers.evt2_triggers, triggers.evt2_triggers_reference, np.split(words, sorted(splits)), words
+    )
 
 
 def assert_same_triggers(
@@ -317,19 +321,19 @@ def assert_same_triggers(
 
 
 @pytest.mark.parametrize("kind", [1, 9, 0xB, 0xC, 0xD])
-def test_an_unknown_evt3_word_stops_before_itself(kind):
+def test_the_evt3_decoder_stops_before_an_unknown_word(kind):
     _, read, events, verdict = decode(EVT3, evt3((TIME_HIGH, 0), (ADDR_Y, 1), HIT, (kind, 0), HIT))
     assert (read, events.n, verdict) == (3, 1, ILLEGAL)
 
 
 @pytest.mark.parametrize("kind", [2, 3, 4, 5, 6, 7, 9, 0xB, 0xC, 0xD])
-def test_an_unknown_evt2_word_stops_before_itself(kind):
+def test_the_evt2_decoder_stops_before_an_unknown_word(kind):
     _, read, events, verdict = decode(EVT2, evt2((8, 0), (1, cd(0, 1, 1)), (kind, 0), (1, cd(0, 1, 1))))
     assert (read, events.n, verdict) == (2, 1, ILLEGAL)
 
 
-def test_an_event_outside_the_sensor_stops_and_can_be_seen():
-    out = room(64)
+def test_the_decoder_stops_at_an_event_outside_the_sensor_and_writes_it():
+    out = zero_events(64)
     words = evt3((TIME_HIGH, 1), (ADDR_Y, 47), (BASE_X, 58), (VECT_12, 0b1111), (VECT_12, 0b1), HIT)
     _, read, n, verdict = evt.evt3_decode(words, Evt3State(), 64, 48, out)
     assert (read, n, verdict) == (4, 4, OUTSIDE)
@@ -339,21 +343,21 @@ def test_an_event_outside_the_sensor_stops_and_can_be_seen():
     assert rows(out)[1] == (64, 3, 48, 1)
 
 
-def test_a_vector_may_reach_over_the_border_where_none_of_its_events_does():
+def test_a_vector_may_extend_past_the_border_if_its_events_do_not():
     words = evt3((TIME_HIGH, 1), (ADDR_Y, 47), (BASE_X, 60), (VECT_12, 0b1111))
     _, read, events, verdict = decode(EVT3, words, sensor=Sensor(64, 48))
     assert (read, events.n, verdict) == (4, 4, OK)
 
 
-def test_a_kernel_runs_where_no_cache_can_be_written(monkeypatch):
+def test_a_kernel_runs_if_no_cache_can_be_written(monkeypatch):
     njit = numba.njit
 
-    def without_a_place_to_write(*, nogil: bool, cache: bool = False) -> Any:
+    def without_writable_cache(*, nogil: bool, cache: bool = False) -> Any:
         if cache:
             raise RuntimeError("cannot cache function: no locator available")
         return njit(nogil=nogil)
 
-    monkeypatch.setattr(numba, "njit", without_a_place_to_write)
+    monkeypatch.setattr(numba, "njit", without_writable_cache)
 
     def double(x: int) -> int:
         return 2 * x

@@ -1,4 +1,4 @@
-"""Recordings: what real ones hold, where broken ones end, and what is said about those that can not be read."""
+"""Recordings: content of real ones, place of the damage in broken ones, and errors of unknown sources."""
 
 import itertools
 from collections.abc import Callable
@@ -33,7 +33,7 @@ from tests.recordings import aedat4, assert_same, ecd_text, put, read, read_brok
         ("ecd/shapes_rotation_1.43s.txt", Sensor(240, 180), 120_000, 0, 1_428_658),
     ],
 )
-def test_a_real_recording_holds_its_known_events_each_time_it_is_read(path, sensor, n, first_us, last_us):
+def test_a_real_recording_gives_its_known_events_on_each_read(path, sensor, n, first_us, last_us):
     recording = open_source(str(shared(path)), sensor if path.endswith("evt2.raw") else None)
     assert recording.sensor == sensor
     assert not recording.endless
@@ -43,14 +43,14 @@ def test_a_real_recording_holds_its_known_events_each_time_it_is_read(path, sens
     assert_same(read(recording), events)
 
 
-def test_evt3_and_dat_of_one_camera_agree_up_to_a_constant_in_time():
+def test_evt3_and_dat_of_one_camera_differ_only_by_a_constant_time():
     events = read(open_source(str(shared("prophesee/evt3.raw"))))
     dat = read(open_source(str(shared("prophesee/gen4.dat"))))
     assert np.unique(events.t - dat.t).size == 1
     assert_same(events._replace(t=dat.t), dat)
 
 
-def test_a_raw_file_without_geometry_asks_for_it_and_never_guesses():
+def test_a_raw_file_without_geometry_requires_a_sensor_size():
     path = shared("prophesee/evt2.raw")
     with pytest.raises(MissingGeometry, match="--sensor WIDTHxHEIGHT") as caught:
         open_source(str(path))
@@ -59,7 +59,7 @@ def test_a_raw_file_without_geometry_asks_for_it_and_never_guesses():
         read(open_source(str(path), Sensor(320, 240)))
 
 
-def test_the_event_camera_dataset_knows_its_lens():
+def test_the_event_camera_dataset_gives_its_camera_parameters():
     camera = open_source(str(shared("ecd/shapes_rotation"))).camera("left")
     assert camera is not None
     assert (camera.stream, camera.lens, camera.sensor) == ("left", "pinhole", Sensor(240, 180))
@@ -70,55 +70,60 @@ def test_the_event_camera_dataset_knows_its_lens():
     assert open_source(str(shared("aedat4/davis346.aedat4"))).camera("left") is None
 
 
-# --- small recordings, written here ----------------------------------------------------------------------------------
+# --- small recordings, written by these tests -------------------------------------------------------------------------
 
 
 class Written(NamedTuple):
-    """A small recording: where the words, lines or packets in it end, and how many events are whole by then."""
+    """A small recording, with the end of each unit (word, line or packet) and the number of complete events there."""
 
     name: str
     data: bytes
     header: int  # [bytes]
-    stops: list[int]  # byte after each word, line or packet
-    whole: list[int]  # events up to there
-    where: Callable[[int], str]  # of the first unit that is not whole, by its number
-    cut_at_stop: bool = False  # whether the end of a unit is noticed as a premature end too
-    events_end: int | None = None  # a cut from this byte on costs nothing
+    stops: list[int]  # byte after each unit
+    complete: list[int]  # number of complete events up to each stop
+    where: Callable[[int], str]  # place of the first truncated unit, by its number
+    error_at_stop: bool = False  # whether truncation at the end of a unit is an error too
+    events_end: int | None = None  # truncation at this byte or later loses no event
 
 
 def written_evt(name: str, header: bytes, events: Events) -> Written:
     words, ends = (write_evt2 if name == "evt2" else write_evt3)(events)
     size = words.itemsize
     stops = [len(header) + size * (i + 1) for i in range(words.size)]
-    whole = np.searchsorted(ends, np.arange(1, words.size + 1), "right").tolist()
+    complete = np.searchsorted(ends, np.arange(1, words.size + 1), "right").tolist()
     return Written(
-        f"{name}.raw", header + words.tobytes(), len(header), stops, whole, lambda i: f"byte {len(header) + size * i}"
+        f"{name}.raw",
+        header + words.tobytes(),
+        len(header),
+        stops,
+        complete,
+        lambda i: f"byte {len(header) + size * i}",
     )
 
 
 def written_aedat4(events: Events, *, finished: bool) -> Written:
     bounds = list(range(0, events.n + 1, events.n // 6))
     file = aedat4([events.span(a, b) for a, b in itertools.pairwise(bounds)], SENSOR, finished=finished)
-    # packets of events and of triggers by turns
+    # packets of events and of triggers alternate
     triggers = [*file.starts[1:], file.end]
     stops = [stop for pair in zip(file.stops, triggers, strict=True) for stop in pair]
-    whole = [n for n in bounds[1:] for _ in range(2)]
+    complete = [n for n in bounds[1:] for _ in range(2)]
     header = file.starts[0]
     return Written(
         "a.aedat4",
         file.data,
         header,
         stops,
-        whole,
+        complete,
         lambda i: f"byte {[header, *stops][i]}",
-        cut_at_stop=finished,
+        error_at_stop=finished,
         events_end=file.end,
     )
 
 
 def written_ecd(events: Events) -> Written:
     data = ecd_text(events)
-    stops = [i for i, byte in enumerate(data) if byte == ord("\n")]  # an end of file does for an end of line
+    stops = [i for i, byte in enumerate(data) if byte == ord("\n")]  # the end of the file also ends a line
     return Written("a.txt", data, 0, stops, list(range(1, events.n + 1)), lambda i: f"line {i + 1}")
 
 
@@ -134,7 +139,7 @@ each_format = pytest.mark.parametrize("file", WRITTEN.values(), ids=WRITTEN.keys
 
 
 @each_format
-def test_what_was_written_is_read(file, tmp_path):
+def test_a_written_recording_reads_back_identical(file, tmp_path):
     recording = open_source(put(tmp_path, file.name, file.data), SENSOR)
     assert_same(read(recording), EVENTS)
     assert_same(read(recording), EVENTS)
@@ -142,17 +147,17 @@ def test_what_was_written_is_read(file, tmp_path):
 
 @each_format
 @pytest.mark.parametrize("seed", range(3))
-def test_a_cut_recording_gives_its_whole_prefix_and_then_the_place_where_it_broke(file, seed, tmp_path):
-    cuts = np.random.default_rng(seed).integers(file.header, len(file.data), 40)
+def test_a_truncated_recording_gives_its_complete_events_and_then_names_the_place(file, seed, tmp_path):
+    sizes = np.random.default_rng(seed).integers(file.header, len(file.data), 40)
     near = np.random.default_rng(seed).choice(file.stops, 8)
-    for cut in {*cuts.tolist(), *near.tolist(), *(near + 1).tolist(), *(near - 1).tolist()}:
-        events, error = read_broken(open_source(put(tmp_path, file.name, file.data[:cut]), SENSOR))
-        units = int(np.searchsorted(file.stops, cut, "right"))
-        assert_same(events, EVENTS.span(0, [0, *file.whole][units]))
+    for size in {*sizes.tolist(), *near.tolist(), *(near + 1).tolist(), *(near - 1).tolist()}:
+        events, error = read_broken(open_source(put(tmp_path, file.name, file.data[:size]), SENSOR))
+        units = int(np.searchsorted(file.stops, size, "right"))
+        assert_same(events, EVENTS.span(0, [0, *file.complete][units]))
         reached = [file.header, *file.stops][units]
-        past_the_end = file.events_end is not None and cut >= file.events_end
-        at_a_seam = cut == reached or (file.name == "a.txt" and file.data[cut - 1 : cut] == b"\n")
-        if past_the_end or (at_a_seam and not file.cut_at_stop):
+        past_the_end = file.events_end is not None and size >= file.events_end
+        between_units = size == reached or (file.name == "a.txt" and file.data[size - 1 : size] == b"\n")
+        if past_the_end or (between_units and not file.error_at_stop):
             assert error is None
         else:
             assert error is not None
@@ -161,20 +166,20 @@ def test_a_cut_recording_gives_its_whole_prefix_and_then_the_place_where_it_brok
 
 
 @each_format
-def test_a_recording_cut_within_its_header_is_refused_or_has_no_events(file, tmp_path):
-    for cut in range(file.header):
-        path = put(tmp_path, file.name, file.data[:cut])
+def test_a_recording_truncated_within_its_header_is_refused_or_has_no_events(file, tmp_path):
+    for size in range(file.header):
+        path = put(tmp_path, file.name, file.data[:size])
         try:
             events, _ = read_broken(open_source(path))
         except (BrokenRecording, MissingGeometry, UnknownSource) as error:
-            assert path in error.message  # noqa: PT017 a text header may be cut after all that matters
+            assert path in error.message  # noqa: PT017 a truncated text header can still be valid
         else:
             assert events.n == 0
 
 
 @each_format
 @pytest.mark.parametrize("seed", range(3))
-def test_a_garbled_recording_is_refused_in_our_own_words_or_read(file, seed, tmp_path):
+def test_a_corrupt_recording_is_read_or_raises_an_error_of_ours(file, seed, tmp_path):
     rng = np.random.default_rng(seed)
     for _ in range(60):
         data = bytearray(file.data)
@@ -186,11 +191,11 @@ def test_a_garbled_recording_is_refused_in_our_own_words_or_read(file, seed, tmp
             check_events(events, SENSOR)
             assert not (events.p > 1).any()
         except NeuroVEError as error:
-            assert str(tmp_path) in error.message  # noqa: PT017 not raising is fine too
+            assert str(tmp_path) in error.message  # noqa: PT017 no error is valid too
 
 
 @pytest.mark.parametrize("name", ["a.raw", "a.txt", "a.aedat4"])
-def test_a_recording_larger_than_what_is_read_at_once_comes_in_bounded_chunks(name, tmp_path):
+def test_a_recording_larger_than_a_block_gives_several_bounded_chunks(name, tmp_path):
     n = 1_100_000 if name == "a.raw" else 300_000
     events = make_events(n, seed=2, start_us=5, duration_us=n)
     data = {"a.raw": large_evt2, "a.txt": ecd_text, "a.aedat4": lambda events: aedat4([events], SENSOR).data}[name](
@@ -203,7 +208,7 @@ def test_a_recording_larger_than_what_is_read_at_once_comes_in_bounded_chunks(na
 
 
 def large_evt2(events: Events) -> bytes:
-    """The words of write_evt2, for a million events."""
+    """The words of write_evt2, vectorised for a million events."""
     high = np.unique(events.t >> 6)
     x, y, p = (column.astype(np.int64) for column in events[1:])
     words = np.concatenate([TIME_HIGH << 28 | high, p << 28 | (events.t & 63) << 22 | x << 11 | y])
@@ -211,7 +216,7 @@ def large_evt2(events: Events) -> bytes:
     return HEADER_EVT2 + words[order].astype("<u4").tobytes()
 
 
-# --- what is no source -----------------------------------------------------------------------------------------------
+# --- unknown sources -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -226,7 +231,7 @@ def large_evt2(events: Events) -> bytes:
         ("pattern://?speed=3", "a seed and nothing else"),
     ],
 )
-def test_the_error_of_an_unknown_source_lists_the_supported_ones(source, why, tmp_path):
+def test_the_error_of_an_unknown_source_lists_the_supported_sources(source, why, tmp_path):
     put(tmp_path, "a.xyz", b"")
     put(tmp_path, "events", b"")
     with pytest.raises(UnknownSource) as caught:

@@ -1,4 +1,4 @@
-"""Prophesee's RAW and DAT: headers, words, triggers, and a time that is sought."""
+"""RAW and DAT files of Prophesee: headers, words, triggers, and the search for a time."""
 
 import numpy as np
 import pytest
@@ -39,7 +39,7 @@ def columns(triggers: Triggers) -> list[list[int]]:
 
 
 @pytest.mark.parametrize("start_us", [5, (1 << 32) - 50_000])
-def test_what_was_written_is_read_across_a_wrap_of_the_clock(start_us, tmp_path):
+def test_a_written_file_reads_back_identical_across_a_wrap_of_the_clock(start_us, tmp_path):
     events = make_events(3000, seed=1, start_us=start_us)
     recording = open_source(put(tmp_path, "a.dat", dat(events)))
     assert (recording.sensor, recording.streams) == (SENSOR, ("events",))
@@ -47,7 +47,7 @@ def test_what_was_written_is_read_across_a_wrap_of_the_clock(start_us, tmp_path)
 
 
 @pytest.mark.parametrize("start_us", [5, (1 << 32) - 2_000_000])
-def test_a_time_is_found_in_the_file_as_by_reading_it(start_us, tmp_path):
+def test_since_gives_the_same_events_as_reading_the_whole_file(start_us, tmp_path):
     n = 3 * SEEK_RECORDS + 17
     events = make_events(n, seed=2, start_us=start_us, duration_us=4_000_000)
     recording = open_source(put(tmp_path, "a.dat", dat(events)))
@@ -60,14 +60,14 @@ def test_a_time_is_found_in_the_file_as_by_reading_it(start_us, tmp_path):
     assert not list(open_source(put(tmp_path, "b.dat", dat(Events.empty()))).since(5))
 
 
-def test_a_time_is_found_in_a_real_file():
+def test_since_finds_a_time_in_a_real_file():
     recording = open_source(str(shared("prophesee/gen4.dat")))
     late = Events.join(list(recording.since(10_000_000)))
     events = read(recording)
     assert_same(late, events.span(int(events.t.searchsorted(10_000_000)), events.n))
 
 
-def test_a_file_larger_than_what_is_read_at_once_comes_whole(tmp_path):
+def test_a_file_larger_than_a_block_is_read_completely(tmp_path):
     events = make_events(700_000, seed=3, duration_us=700_000)
     data = dat(events)
     assert len(data) > BLOCK_BYTES
@@ -78,7 +78,7 @@ def test_a_file_larger_than_what_is_read_at_once_comes_whole(tmp_path):
     ("x", "y", "t", "why"),
     [(64, 3, 30, "outside the sensor"), (3, 48, 30, "outside the sensor"), (3, 4, 19, "comes after t=20 us")],
 )
-def test_a_bad_record_ends_the_recording_at_its_byte(x, y, t, why, tmp_path):
+def test_a_bad_record_ends_the_recording_and_the_error_names_its_byte(x, y, t, why, tmp_path):
     events = Events.from_columns([10, 20, t, 40], [1, 2, x, 4], [1, 2, y, 4], [0, 1, 0, 1])
     got, error = read_broken(open_source(put(tmp_path, "a.dat", dat(events))))
     assert_same(got, events.span(0, 2))
@@ -87,17 +87,17 @@ def test_a_bad_record_ends_the_recording_at_its_byte(x, y, t, why, tmp_path):
     assert why in error.message
 
 
-@pytest.mark.parametrize("cut", range(1, 17))
-def test_a_cut_file_gives_its_whole_records_and_then_the_byte(cut, tmp_path):
+@pytest.mark.parametrize("missing", range(1, 17))
+def test_a_truncated_file_gives_its_complete_records_and_then_names_the_byte(missing, tmp_path):
     events = make_events(10, seed=1)
-    got, error = read_broken(open_source(put(tmp_path, "a.dat", dat(events)[:-cut])))
-    assert_same(got, events.span(0, 10 - (cut + 7) // 8))
-    assert (error is None) == (cut % 8 == 0)
+    got, error = read_broken(open_source(put(tmp_path, "a.dat", dat(events)[:-missing])))
+    assert_same(got, events.span(0, 10 - (missing + 7) // 8))
+    assert (error is None) == (missing % 8 == 0)
     if error is not None:
         assert error.details["where"] == f"byte {len(HEADER) + 2 + 8 * got.n}"
 
 
-def test_a_header_that_does_not_tell_what_it_must_is_refused(tmp_path):
+def test_an_incomplete_header_is_refused(tmp_path):
     with pytest.raises(MissingGeometry, match="--sensor"):
         open_source(put(tmp_path, "a.dat", b"% Version 1\n\x00\x08"))
     assert open_source(put(tmp_path, "a.dat", b"% Version 1\n\x00\x08"), SENSOR).sensor == SENSOR
@@ -118,7 +118,7 @@ def test_a_dat_file_of_triggers_has_triggers_and_no_events(tmp_path):
         all_triggers(open_source(put(tmp_path, "a.dat", HEADER + b"\x0e\x08" + backwards.tobytes())))
 
 
-def test_the_triggers_of_raw_files_are_found_between_their_events(tmp_path):
+def test_the_triggers_of_a_raw_file_are_found_between_its_events(tmp_path):
     words = evt3(
         (TIME_HIGH, 1), (TIME_LOW, 5), (ADDR_Y, 1), (TRIGGER, 2 << 8 | 1), (ADDR_X, 3), (TIME_LOW, 9), (TRIGGER, 2 << 8)
     )
@@ -130,7 +130,7 @@ def test_the_triggers_of_raw_files_are_found_between_their_events(tmp_path):
     assert columns(all_triggers(recording)) == [[67], [1], [1]]
 
 
-def test_triggers_end_where_a_word_is_unknown_or_cut(tmp_path):
+def test_triggers_end_at_an_unknown_or_truncated_word(tmp_path):
     words = evt3((TIME_HIGH, 1), (TRIGGER, 1), (0x9, 1), (TRIGGER, 0))
     for data, where in ((words.tobytes(), 4), (words[:2].tobytes() + b"\0", 4)):
         recording = open_source(put(tmp_path, "a.raw", HEADER_EVT3 + data))
@@ -157,7 +157,7 @@ def test_the_real_recordings_have_no_triggers():
         b"% Format EVT3\n% Width 64\n% Height 48\n",
     ],
 )
-def test_the_geometry_is_found_however_the_header_writes_it(header, tmp_path):
+def test_the_geometry_is_found_in_every_form_of_the_header(header, tmp_path):
     words = write_evt3(EVENTS).words
     path = put(tmp_path, "A.RAW", header + words.tobytes())
     assert open_source(path).sensor == SENSOR
@@ -165,7 +165,7 @@ def test_the_geometry_is_found_however_the_header_writes_it(header, tmp_path):
     assert open_source(path, Sensor(640, 480)).sensor == Sensor(640, 480)
 
 
-def test_a_first_word_that_looks_like_a_percent_sign_is_no_header(tmp_path):
+def test_a_first_word_that_begins_with_a_percent_sign_is_not_a_header_line(tmp_path):
     words = evt3((TIME_HIGH, 0x25), (ADDR_Y, 1), (ADDR_X, 1))
     assert words.tobytes().startswith(b"%")
     assert read(open_source(put(tmp_path, "a.raw", b"% evt 3.0\n% geometry 64x48\n" + words.tobytes()))).n == 1
@@ -175,7 +175,7 @@ def test_a_first_word_that_looks_like_a_percent_sign_is_no_header(tmp_path):
     "header",
     [b"% evt 3.0\n", b"% evt 3.0\n% geometry 0x0\n", b"% evt 3.0\n% geometry wide\n", b"% format EVT2;width=64\n"],
 )
-def test_a_header_without_a_geometry_asks_for_one(header, tmp_path):
+def test_a_header_without_geometry_requires_a_sensor_size(header, tmp_path):
     path = put(tmp_path, "a.raw", header)
     with pytest.raises(MissingGeometry, match=r"a\.raw.*--sensor WIDTHxHEIGHT"):
         open_source(path)
@@ -185,8 +185,8 @@ def test_a_header_without_a_geometry_asks_for_one(header, tmp_path):
 @pytest.mark.parametrize(
     ("header", "why"),
     [
-        (b"", "names no word format"),
-        (b"% geometry 64x48\n", "names no word format"),
+        (b"", "does not name a word format"),
+        (b"% geometry 64x48\n", "does not name a word format"),
         (b"% evt 2.1\n", "its words are EVT21"),
         (b"% format EVT4;width=64;height=48\n", "its words are EVT4"),
     ],
@@ -199,11 +199,11 @@ def test_words_of_another_format_are_refused(header, why, tmp_path):
 @pytest.mark.parametrize(
     ("bad", "why"),
     [
-        (0x9123, "0x9123 is of no known word type"),
+        (0x9123, "0x9123 has an unknown word type"),
         (ADDR_X << 12 | 64, "x=64 y=7 lies outside the sensor 64x48"),
     ],
 )
-def test_a_bad_word_ends_the_recording_at_its_byte(bad, why, tmp_path):
+def test_a_bad_word_ends_the_recording_and_the_error_names_its_byte(bad, why, tmp_path):
     good = evt3((TIME_HIGH, 1), (ADDR_Y, 7), (ADDR_X, 63))
     words = np.concatenate([good, np.array([bad], np.uint16), good])
     events, error = read_broken(open_source(put(tmp_path, "a.raw", HEADER_EVT3 + words.tobytes())))

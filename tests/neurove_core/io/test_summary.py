@@ -1,4 +1,4 @@
-"""What is told of a recording: its counts, rates and statistics, whole or broken, and a picture of it."""
+"""Summary of a recording, valid or broken: counts, rates, statistics, and a plot."""
 
 import json
 from collections.abc import Iterator
@@ -25,13 +25,13 @@ GYRO, ACCEL = RNG.normal(3, 2, (2, 999, 3))
 
 @dataclass
 class Rich(EventsOnly):
-    """A recording in memory that has everything; it may break where asked."""
+    """A recording in memory that has all kinds of data. It can break at a chosen stream."""
 
     events: Events
     sensor: Sensor = SENSOR
     name: str = "rich"
     endless: bool = False
-    cut: int = 7  # parts of events and of inertial samples
+    chunk: int = 7  # number of events or inertial samples in a chunk
     breaks_in: str = ""
 
     @property
@@ -39,14 +39,14 @@ class Rich(EventsOnly):
         return ("events", "imu", "frames", "triggers", "poses")
 
     def chunks(self) -> Iterator[Events]:
-        for first in range(0, self.events.n, self.cut):
-            yield self.events.span(first, min(first + self.cut, self.events.n))
+        for first in range(0, self.events.n, self.chunk):
+            yield self.events.span(first, min(first + self.chunk, self.events.n))
         self._break("events")
 
     def imu(self) -> Iterator[Imu]:
         t = np.arange(999) * 1000
-        for first in range(0, 999, self.cut):
-            part = slice(first, first + self.cut)
+        for first in range(0, 999, self.chunk):
+            part = slice(first, first + self.chunk)
             yield Imu(t[part], ACCEL[part], GYRO[part])
         self._break("imu")
 
@@ -66,17 +66,17 @@ class Rich(EventsOnly):
 
     def _break(self, where: str) -> None:
         if self.breaks_in == where:
-            raise BrokenRecording(Path("rich"), f"the end of its {where}", "cut")
+            raise BrokenRecording(Path("rich"), f"the end of its {where}", "truncated")
 
 
 def peak_by_hand(t: np.ndarray) -> float:
     return float(np.bincount((t - t[0]) // 10_000).max() * 100)
 
 
-@pytest.mark.parametrize("cut", [1, 7, 1000, 100_000])
-def test_a_summary_is_that_of_the_whole_however_the_recording_cuts_itself(cut):
+@pytest.mark.parametrize("chunk", [1, 7, 1000, 100_000])
+def test_a_summary_does_not_depend_on_the_chunks_of_the_recording(chunk):
     events = make_events(n=3_000, seed=1)
-    found = survey(Rich(events, cut=cut))
+    found = survey(Rich(events, chunk=chunk))
     summary = found.summary
     assert (summary.events, summary.first_us, summary.last_us) == (3_000, events.t[0], events.t[-1])
     assert summary.on_fraction == pytest.approx(events.p.mean())
@@ -89,22 +89,22 @@ def test_a_summary_is_that_of_the_whole_however_the_recording_cuts_itself(cut):
     assert (found.rate_hz * np.diff(found.rate_t_us)).sum() / 1e6 == pytest.approx(3_000)
 
 
-@pytest.mark.parametrize("cut", [1, 7, 1000])
-def test_the_image_is_of_fifty_milliseconds_in_the_second_half_of_the_recording(cut):
+@pytest.mark.parametrize("chunk", [1, 7, 1000])
+def test_the_image_shows_fifty_milliseconds_of_the_second_half_of_the_recording(chunk):
     t = np.sort(np.random.default_rng(1).integers(0, 1_700_000, 3_000)) + 10**15
     events = Events.from_columns(t, t % 64, t % 48, t // 7 % 2)
-    found = survey(Rich(events, cut=cut))
+    found = survey(Rich(events, chunk=chunk))
     start_us = found.counts_start_us
     assert 850_000 <= start_us - t[0] < 1_650_000
     part = events.span(*map(int, t.searchsorted([start_us, start_us + 50_000])))
     want = np.zeros((2, SENSOR.height, SENSOR.width), np.int64)
     np.add.at(want, (part.p, part.y, part.x), 1)
     np.testing.assert_array_equal(found.counts, want)
-    short = survey(Rich(events.span(0, 20), cut=cut))
+    short = survey(Rich(events.span(0, 20), chunk=chunk))
     assert (short.counts.sum(), short.counts_start_us) == (20, t[0])
 
 
-def test_imu_and_truth_are_told_in_si():
+def test_imu_and_ground_truth_are_in_si():
     summary = survey(Rich(make_events(n=100, seed=2))).summary
     assert summary.imu is not None
     assert (summary.imu.samples, summary.imu.rate_hz) == (999, pytest.approx(1000))
@@ -119,16 +119,16 @@ def test_imu_and_truth_are_told_in_si():
     assert truth["peak_angular_rad_s"] == pytest.approx(0, abs=1e-9)
 
 
-def test_the_summary_has_the_keys_that_scripts_rely_on_and_survives_json():
+def test_the_summary_as_json_has_the_keys_that_scripts_need():
     summary = survey(Rich(make_events(n=100, seed=3))).summary
-    told = json.loads(json.dumps(summary.as_json()))
-    assert told["sensor"] == {"width": SENSOR.width, "height": SENSOR.height}
+    loaded = json.loads(json.dumps(summary.as_json()))
+    assert loaded["sensor"] == {"width": SENSOR.width, "height": SENSOR.height}
     for key in ("events", "on_fraction", "first_us", "last_us", "duration_s", "streams", "imu", "truth"):
-        assert key in told
-    assert told["streams"] == ["events", "imu", "frames", "triggers", "poses"]
+        assert key in loaded
+    assert loaded["streams"] == ["events", "imu", "frames", "triggers", "poses"]
 
 
-def test_of_a_recording_without_events_nothing_is_made_up(tmp_path: Path):
+def test_values_of_a_recording_without_events_are_unknown(tmp_path: Path):
     summary = survey(Rich(Events.empty())).summary
     assert (summary.events, summary.duration_s) == (0, 0.0)
     for unknown in (summary.on_fraction, summary.first_us, summary.last_us, summary.mean_rate_hz, summary.peak_rate_hz):
@@ -137,7 +137,7 @@ def test_of_a_recording_without_events_nothing_is_made_up(tmp_path: Path):
     assert (one.events, one.duration_s, one.mean_rate_hz, one.peak_rate_hz) == (1, 0.0, None, 100)
 
 
-def test_a_broken_recording_is_told_up_to_there(tmp_path: Path):
+def test_a_broken_recording_is_summarised_up_to_the_damage(tmp_path: Path):
     events = make_events(n=1000, seed=4)
     file = tmp_path / "events.txt"
     file.write_bytes(ecd_text(events) + b"nonsense\n")
@@ -148,7 +148,7 @@ def test_a_broken_recording_is_told_up_to_there(tmp_path: Path):
 
 
 @pytest.mark.parametrize("stream", ["events", "imu", "twists"])
-def test_where_one_stream_breaks_the_others_are_told_all_the_same(stream):
+def test_if_one_stream_breaks_the_others_are_still_summarised(stream):
     summary = survey(Rich(make_events(n=100, seed=5), breaks_in=stream)).summary
     assert (summary.events, summary.frames, summary.triggers) == (100, 5, 3)
     assert summary.imu is not None
@@ -158,7 +158,7 @@ def test_where_one_stream_breaks_the_others_are_told_all_the_same(stream):
     assert f"the end of its {stream}" in summary.broken
 
 
-def test_only_the_first_seconds_are_looked_at_when_asked_and_an_endless_source_needs_that():
+def test_seconds_limits_the_summary_and_an_endless_source_needs_it():
     pattern = open_source("pattern://")
     summary = survey(pattern, seconds=0.5).summary
     assert summary.events > 1000
@@ -169,15 +169,15 @@ def test_only_the_first_seconds_are_looked_at_when_asked_and_an_endless_source_n
 
 
 def test_the_rate_over_time_of_a_very_long_recording_has_a_bounded_number_of_bars():
-    t = np.cumsum(RNG.integers(0, 10_000_000, 20_000))  # a day and more
+    t = np.cumsum(RNG.integers(0, 10_000_000, 20_000))  # more than a day
     events = Events.from_columns(t, t % 64, t % 48, t % 2)
-    found = survey(Rich(events, cut=999))
+    found = survey(Rich(events, chunk=999))
     assert found.rate_hz.size <= 1024
     assert (found.rate_hz * np.diff(found.rate_t_us)).sum() / 1e6 == pytest.approx(20_000)
     assert found.summary.peak_rate_hz == peak_by_hand(t - t[0])
 
 
-def test_a_pause_of_years_costs_nothing():
+def test_a_pause_of_years_needs_no_memory():
     events = Events.from_columns([5, 6, 10**15], [1, 2, 3], [1, 2, 3], [0, 1, 1])
     assert survey(Rich(events)).summary.peak_rate_hz == 200
 
@@ -190,18 +190,18 @@ def test_a_pause_of_years_costs_nothing():
         ("ecd/shapes_rotation_1.43s.txt", 120_000, None, 1.4287),
     ],
 )
-def test_real_recordings_are_told_as_they_are_known(path, events, on_fraction, duration_s):
+def test_the_summary_of_a_real_recording_has_its_known_values(path, events, on_fraction, duration_s):
     summary = survey(open_source(str(shared(path)))).summary
     assert summary.events == events
     assert on_fraction is None or summary.on_fraction == pytest.approx(on_fraction, abs=5e-4)
     assert summary.duration_s == pytest.approx(duration_s, abs=5e-4)
 
 
-# --- the picture ----------------------------------------------------------------------------------------------------
+# --- the plot -------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("name", "magic"), [("a.png", b"\x89PNG"), ("b.svg", b"<?xml"), ("c.SVG", b"<?xml")])
-def test_a_picture_is_of_the_kind_that_its_name_says_and_nothing_else_is_left(tmp_path: Path, name: str, magic: bytes):
+def test_the_suffix_selects_the_format_of_the_plot_and_no_other_file_is_left(tmp_path: Path, name: str, magic: bytes):
     pytest.importorskip("matplotlib")
     draw(survey(Rich(make_events(n=500, seed=6))), tmp_path / name)
     assert (tmp_path / name).read_bytes().startswith(magic)
@@ -209,7 +209,7 @@ def test_a_picture_is_of_the_kind_that_its_name_says_and_nothing_else_is_left(tm
 
 
 @pytest.mark.parametrize("n", [0, 1])
-def test_next_to_nothing_can_be_drawn_too(tmp_path: Path, n: int):
+def test_a_recording_with_at_most_one_event_can_be_drawn(tmp_path: Path, n: int):
     pytest.importorskip("matplotlib")
 
     class Plain(Rich):
@@ -220,7 +220,7 @@ def test_next_to_nothing_can_be_drawn_too(tmp_path: Path, n: int):
         draw(survey(kind(make_events(n=n, seed=0))), tmp_path / "a.png")
 
 
-def test_a_picture_that_can_not_be_written_is_refused_by_its_name(tmp_path: Path):
+def test_a_plot_that_cannot_be_written_is_refused(tmp_path: Path):
     pytest.importorskip("matplotlib")
     found = survey(Rich(make_events(n=50, seed=0)))
     for file in (tmp_path / "a.jpg", tmp_path / "a", tmp_path / "no" / "a.png"):
@@ -229,7 +229,7 @@ def test_a_picture_that_can_not_be_written_is_refused_by_its_name(tmp_path: Path
     assert not list(tmp_path.iterdir())
 
 
-def test_chunks_of_the_reader_are_not_changed_by_counting_them():
+def test_the_summary_does_not_change_the_events():
     events = make_events(n=100, seed=7)
     before = events.to_records()
     survey(Rich(Events.join(list(in_chunks(events)))))

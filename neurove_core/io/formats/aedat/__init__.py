@@ -1,1 +1,1 @@
-"""iniVation's AEDAT 2.0 and AEDAT 4."""
+"""AEDAT 2.0 and AEDAT4 files of iniVation cameras."""

@@ -1,1 +1,1 @@
-"""Prophesee's RAW (EVT2, EVT3) and DAT files."""
+"""RAW (EVT2, EVT3) and DAT files of Prophesee."""

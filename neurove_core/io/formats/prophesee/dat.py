@@ -1,4 +1,4 @@
-"""Prophesee .dat files: a text header, two bytes that tell what follows, then records of 8 bytes."""
+"""Prophesee .dat files: a text header, two bytes with the type and size of the records, then records of 8 bytes."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -8,23 +8,23 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.io.clock import count_on
+from neurove_core.io.clock import unwrap_times
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
 from neurove_core.io.format import Format
 from neurove_core.io.formats.prophesee.raw import HEADER_BYTES, parse_header
-from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Triggers, in_chunks, later, refuse_topic, whole
+from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Triggers, in_chunks, later, refuse_topic, valid_prefix
 from neurove_protocol.errors import EventOutsideSensor, TimeBackwards
 from neurove_protocol.events import Events, Sensor, check_events
 
 RECORD = np.dtype([("t", "<u4"), ("bits", "<u4")])
 _EVENTS, _TRIGGERS = (0x00, 0x0C), (0x0E,)
 SEEK_RECORDS = 4096
-"""Distance of the records whose time is looked at to find a time in the file."""
+"""Distance between the records that the search for a time reads."""
 
 
 @dataclass(frozen=True, slots=True)
 class DatRecording(EventsOnly):
-    """A .dat file of events, or one of triggers, which has no events; see `Recording`."""
+    """A .dat file of events, or of triggers without events; see `Recording`."""
 
     path: Path
     sensor: Sensor
@@ -34,15 +34,15 @@ class DatRecording(EventsOnly):
 
     @classmethod
     def open(cls, path: Path, sensor: Sensor | None = None) -> Self:
-        """The recording in this file.
+        """Open the recording in this file.
 
         Args:
             path: the .dat file.
-            sensor: its pixel array; overrides the header.
+            sensor: its pixel array, which takes precedence over the header.
 
         Raises:
             UnknownSource: its records are neither events nor triggers of 8 bytes.
-            MissingGeometry: the header does not tell the sensor's size and `sensor` does not either.
+            MissingGeometry: neither the header nor `sensor` gives the sensor size.
             BrokenRecording: the file ends within its header.
         """
         with path.open("rb") as file:
@@ -66,28 +66,29 @@ class DatRecording(EventsOnly):
 
     @property
     def streams(self) -> tuple[str, ...]:
-        """Events or triggers: a file holds one of them."""
+        """Events or triggers: a file has only one of them."""
         return ("triggers",) if self.kind in _TRIGGERS else ("events",)
 
     def chunks(self) -> Iterator[Events]:
-        """All events from the beginning; see `Recording`. The 32-bit clock wraps every 71.6 min and is counted on.
+        """All events from the beginning; see `Recording`. The 32-bit clock wraps every 71.6 min and is unwrapped.
 
         Raises:
-            BrokenRecording: a record is cut, outside the sensor, or earlier than the one before; it names the byte.
+            BrokenRecording: a record is truncated, outside the sensor, or earlier than the record before it. The error
+                names the byte.
         """
         return self._events(0, 0)
 
     def since(self, t_us: int) -> Iterator[Events]:
-        """As `chunks`, from this time on, by bisection.
+        """As `chunks`, from this time [us], found by bisection.
 
-        Looks at the time of every SEEK_RECORDS-th record; where so many events took longer than the 71.6 min of a wrap
-        of the clock, the wrap goes unseen.
+        The search reads the time of every SEEK_RECORDS-th record. It misses a wrap of the clock if these events take
+        longer than the 71.6 min of a wrap.
         """
         n = (self.path.stat().st_size - self.start) // RECORD.itemsize
         if n <= 0:
             return self.chunks()
         records = np.memmap(self.path, RECORD, "r", self.start, (n,))
-        times, _ = count_on(np.array(records["t"][::SEEK_RECORDS]), 0)
+        times, _ = unwrap_times(np.array(records["t"][::SEEK_RECORDS]), 0)
         sample = max(int(times.searchsorted(t_us)) - 1, 0)
         return later(self._events(sample * SEEK_RECORDS, int(times[sample])), t_us)
 
@@ -95,20 +96,20 @@ class DatRecording(EventsOnly):
         """The trigger edges of a file of triggers; see `Recording`.
 
         Raises:
-            BrokenRecording: a record is cut, or earlier than the one before.
+            BrokenRecording: a record is truncated, or earlier than the record before it.
         """
         if self.kind not in _TRIGGERS:
             return
         for at, t, bits in self._blocks(0, 0):
-            back = np.flatnonzero(t[1:] < t[:-1])
-            n = int(back[0]) + 1 if back.size else t.size
+            backwards = np.flatnonzero(t[1:] < t[:-1])
+            n = int(backwards[0]) + 1 if backwards.size else t.size
             if n:
                 yield Triggers(t[:n], (bits[:n] >> 8 & 0x1F).astype(np.uint8), (bits[:n] & 1).astype(np.uint8))
-            if back.size:
+            if backwards.size:
                 raise BrokenRecording(self.path, f"byte {at + n * RECORD.itemsize}", "time runs backwards")
 
     def _events(self, first: int, before_us: int) -> Iterator[Events]:
-        """The events from record number `first` on, given the time of it or of an earlier one."""
+        """The events from record number `first`. `before_us` is the time of this record or of an earlier one [us]."""
         if self.kind not in _EVENTS:
             return
         not_before_us = None
@@ -117,20 +118,20 @@ class DatRecording(EventsOnly):
             try:
                 check_events(events, self.sensor, not_before_us)
             except (EventOutsideSensor, TimeBackwards) as error:
-                good = whole(events, self.sensor, not_before_us)
-                yield from in_chunks(good)
-                raise BrokenRecording(self.path, f"byte {at + good.n * RECORD.itemsize}", error.message) from None
+                valid = valid_prefix(events, self.sensor, not_before_us)
+                yield from in_chunks(valid)
+                raise BrokenRecording(self.path, f"byte {at + valid.n * RECORD.itemsize}", error.message) from None
             yield from in_chunks(events)
             not_before_us = int(t[-1]) if t.size else not_before_us
 
     def _blocks(self, first: int, before_us: int) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.uint32]]]:
-        """Some BLOCK_BYTES of records at a time: the byte where they begin, their times [us] and their other word."""
+        """Blocks of up to BLOCK_BYTES: the byte of the first record, the times [us] and the second words."""
         at = self.start + first * RECORD.itemsize
         with self.path.open("rb") as file:
             file.seek(at)
             while block := file.read(BLOCK_BYTES):
                 records = np.frombuffer(block, RECORD, len(block) // RECORD.itemsize)
-                t, before_us = count_on(records["t"], before_us)
+                t, before_us = unwrap_times(records["t"], before_us)
                 yield at, t, records["bits"]
                 at += records.nbytes
                 if len(block) % RECORD.itemsize:

@@ -1,4 +1,4 @@
-"""Prophesee EVT2 and EVT3: camera words -> events, each decoder compiled, beside its plain reference."""
+"""Decoders of Prophesee EVT2 and EVT3 words: a compiled fast path and a reference implementation of each."""
 
 from typing import Any, Final, NamedTuple
 
@@ -8,56 +8,56 @@ from numpy.typing import NDArray
 from neurove_core.compiled import compiled
 from neurove_protocol.events import Events
 
-OK: Final = 0  # every word was read, or `out` is full: call again with the words that were not
-ILLEGAL: Final = 1  # the next word is of no known type
-OUTSIDE: Final = 2  # the next word holds an event that is not on the sensor; it stands in `out`, after the good ones
+OK: Final = 0  # all words were read, or `out` is full: call again with the remaining words
+ILLEGAL: Final = 1  # the next word has an unknown type
+OUTSIDE: Final = 2  # the next word has an event outside the sensor; it is in `out` after the valid ones
 
 STEP_BACK: Final = 10
-"""How far TIME_HIGH may step back without that being a wrap of its counter; what Prophesee's own decoder allows."""
+"""Maximum decrease of TIME_HIGH that is not a wrap of its counter. Prophesee's own decoder has the same limit."""
 
 VECTOR_EVENTS: Final = 12
-"""Most events that one word makes; `out` must have at least this much room."""
+"""Maximum number of events in one word. `out` must have space for at least as many."""
 
 EVT2_WORDS: Final = (0x0, 0x1, 0x8, 0xA, 0xE, 0xF)
 EVT3_WORDS: Final = (0x0, 0x2, 0x3, 0x4, 0x5, 0x6, 0x7, 0x8, 0xA, 0xE, 0xF)
-"""The known types of words, by their first four bits."""
+"""Known word types, given by the first four bits."""
 
 _ADDR_Y, _ADDR_X, _BASE_X, _VECT_12, _VECT_8, TIME_LOW, TIME_HIGH = 0, 2, 3, 4, 5, 6, 8
 _EVT3_SKIPPED = 1 << 0x7 | 1 << 0xA | 1 << 0xE | 1 << 0xF  # CONTINUED_4, EXT_TRIGGER, OTHERS, CONTINUED_12
 _EVT2_SKIPPED = (0xA, 0xE, 0xF)  # EXT_TRIGGER, OTHERS, CONTINUED
 _ONE = np.uint64(1)
-_BIT = np.array([0, 0, 1, 4, 2, 9, 5, 11, 3, 8, 10, 7, 6])  # k of 2**k for 2**k % 13, all different for k < 12
+_BIT = np.array([0, 0, 1, 4, 2, 9, 5, 11, 3, 8, 10, 7, 6])  # maps 2**k % 13 to k; the remainders differ for k < 12
 
 
 class Evt3State(NamedTuple):
-    """What an EVT3 decoder carries from word to word; the default is the start of a recording or what follows a gap."""
+    """State of an EVT3 decoder between words. The default is for the start of a recording or after a gap."""
 
-    timed: int = 0  # 1 from the first TIME_HIGH on; before it events have no time and are ignored
-    high: int = 0  # TIME_HIGH, counted on over its wraps [4096 us]
+    timed: int = 0  # 1 after the first TIME_HIGH; before it events have no time and are ignored
+    high: int = 0  # TIME_HIGH, unwrapped [4096 us]
     low: int = 0  # TIME_LOW [us]
     last_us: int = 0  # time of the last event [us]
-    y: int = -1  # row [px], -1 before the first one
-    base_x: int = -1  # column of the next vector [px], -1 before the first one
+    y: int = -1  # row [px], -1 before the first row
+    base_x: int = -1  # column of the next vector [px], -1 before the first vector
     p: int = 0  # polarity of the vectors
 
 
 class Evt2State(NamedTuple):
-    """What an EVT2 decoder carries from word to word; the default is the start of a recording or what follows a gap."""
+    """State of an EVT2 decoder between words. The default is for the start of a recording or after a gap."""
 
-    timed: int = 0  # 1 from the first TIME_HIGH on; before it events have no time and are ignored
-    high: int = 0  # TIME_HIGH, counted on over its wraps [64 us]
+    timed: int = 0  # 1 after the first TIME_HIGH; before it events have no time and are ignored
+    high: int = 0  # TIME_HIGH, unwrapped [64 us]
     last_us: int = 0  # time of the last event [us]
 
 
 @compiled
 def signed(word: np.unsignedinteger[Any]) -> int:  # pragma: no cover (machine code)
-    """A word as a number to reckon with."""
-    return np.int64(word)  # type: ignore[return-value]  # int() would stay unsigned in numba, and mix to float
+    """A word as a signed number."""
+    return np.int64(word)  # type: ignore[return-value]  # int() is unsigned in numba, and mixed arithmetic gives float
 
 
 @compiled
-def counted_on(high: int, value: int, period: int) -> int:  # pragma: no cover (machine code)
-    """A counter that went on to show `value`, over its wraps: a little back is back, more is once around."""
+def unwrapped(high: int, value: int, period: int) -> int:  # pragma: no cover (machine code)
+    """Unwrap a counter whose new value is `value`. A decrease by more than STEP_BACK is a wrap."""
     return high + (value - high + STEP_BACK) % period - STEP_BACK
 
 
@@ -65,37 +65,40 @@ def counted_on(high: int, value: int, period: int) -> int:  # pragma: no cover (
 def evt3_decode(
     words: NDArray[np.uint16], state: Evt3State, width: int, height: int, out: Events
 ) -> tuple[Evt3State, int, int, int]:  # pragma: no cover (machine code)
-    """Decode EVT3 words until they end, `out` is full, or a word can not be used.
+    """Decode EVT3 words until they end, `out` is full, or a word cannot be used.
 
-    The camera's clock is 24 bits of us, wraps every 16.777 s and is counted on. TIME_HIGH sometimes steps back a little
-    (up to STEP_BACK) without a wrap; emitted times never run backwards: an event from such a moment carries the time of
-    the event before it. Triggers and monitoring words are skipped, and so is what precedes the first TIME_HIGH.
+    The camera's clock has 24 bits [us] and wraps every 16.777 s; the times are unwrapped. TIME_HIGH sometimes decreases
+    by up to STEP_BACK without a wrap. Output times never decrease: an event at such a moment gets the time of the event
+    before it. Triggers, monitoring words, and events before the first TIME_HIGH are skipped.
 
     Source: docs.prophesee.ai, EVT 3.0 format.
 
     Args:
-        words: (N,) words as the camera wrote them.
-        state: of the words before these.
-        width: of the sensor [px].
-        height: of the sensor [px].
-        out: columns of one length, at least VECTOR_EVENTS, to write events into.
+        words: (N,) words from the camera.
+        state: state after the words before these.
+        width: width of the sensor [px].
+        height: height of the sensor [px].
+        out: columns of equal length, at least VECTOR_EVENTS, for the events.
 
     Returns:
-        The state after the words read, how many words were read, how many events lie in `out`, and OK, ILLEGAL or
-        OUTSIDE. After anything but OK the state is of no more use.
+        The state after the words read, the number of words read, the number of events in `out`, and OK, ILLEGAL or
+        OUTSIDE. The state is valid only after OK.
     """
     timed, high, low, last_us, y, base_x, p = state
     t_out, x_out, y_out, p_out = out
-    if t_out.size < VECTOR_EVENTS:  # below 0 the unsigned room would be without end
+    if t_out.size < VECTOR_EVENTS:  # a negative limit would become a huge unsigned number
         return state, 0, 0, OK
-    n, room = np.uint64(0), np.uint64(t_out.size - VECTOR_EVENTS)  # unsigned: no index needs a look for being negative
+    n, limit = (
+        np.uint64(0),
+        np.uint64(t_out.size - VECTOR_EVENTS),
+    )  # unsigned: numba omits the check for negative indices
     base = high << 12
     for i in range(words.size):
         word = signed(words[i])
         kind, value = word >> 12, word & 0xFFF
         if kind == _ADDR_X:
             if timed and y >= 0:
-                if n > room:
+                if n > limit:
                     return Evt3State(timed, high, low, last_us, y, base_x, p), i, signed(n), OK
                 last_us = max(last_us, base + low)
                 x = value & 0x7FF
@@ -114,12 +117,12 @@ def evt3_decode(
                 timed, high, low, last_us = 1, value, 0, value << 12
                 base = high << 12
             elif value != high & 0xFFF:
-                high, low = counted_on(high, value, 1 << 12), 0  # the old TIME_LOW belongs to the old TIME_HIGH
+                high, low = unwrapped(high, value, 1 << 12), 0  # TIME_LOW belongs to the previous TIME_HIGH
                 base = high << 12
         elif kind in (_VECT_12, _VECT_8):
             mask = value if kind == _VECT_12 else value & 0xFF
             if mask and timed and y >= 0 and base_x >= 0:
-                if n > room:
+                if n > limit:
                     return Evt3State(timed, high, low, last_us, y, base_x, p), i, signed(n), OK
                 last_us = max(last_us, base + low)
                 while mask:
@@ -142,19 +145,19 @@ def evt3_decode(
 def evt2_decode(
     words: NDArray[np.uint32], state: Evt2State, width: int, height: int, out: Events
 ) -> tuple[Evt2State, int, int, int]:  # pragma: no cover (machine code)
-    """Decode EVT2 words until they end, `out` is full, or a word can not be used.
+    """Decode EVT2 words until they end, `out` is full, or a word cannot be used.
 
-    Time is 28 bits of TIME_HIGH and 6 bits in each event, wraps every 4.77 h and is counted on; it never runs
-    backwards, and what precedes the first TIME_HIGH is skipped, as in `evt3_decode`.
+    Time has 28 bits in TIME_HIGH and 6 bits in each event. It wraps every 4.77 h and is unwrapped. As in `evt3_decode`,
+    output times never decrease, and events before the first TIME_HIGH are skipped.
 
     Source: docs.prophesee.ai, EVT 2.0 format.
 
     Args:
-        words: (N,) words as the camera wrote them.
-        state: of the words before these.
-        width: of the sensor [px].
-        height: of the sensor [px].
-        out: columns of one length to write events into.
+        words: (N,) words from the camera.
+        state: state after the words before these.
+        width: width of the sensor [px].
+        height: height of the sensor [px].
+        out: columns of equal length for the events.
 
     Returns:
         As `evt3_decode`.
@@ -176,7 +179,7 @@ def evt2_decode(
                 n += 1
         elif kind == TIME_HIGH:
             value = word & 0xFFF_FFFF
-            high = counted_on(high, value, 1 << 28) if timed else value
+            high = unwrapped(high, value, 1 << 28) if timed else value
             if not timed:
                 timed, last_us = 1, high << 6
         elif kind not in _EVT2_SKIPPED:
@@ -187,7 +190,7 @@ def evt2_decode(
 def evt3_reference(
     words: NDArray[np.uint16], state: Evt3State, width: int, height: int
 ) -> tuple[Evt3State, int, Events, int]:
-    """The plain twin of `evt3_decode`, with room for any number of events: state, words read, events, verdict."""
+    """Reference implementation of `evt3_decode` without a limit on events: state, words read, events, verdict."""
     s = state._asdict()
     events: list[tuple[int, int, int, int]] = []
 
@@ -232,7 +235,7 @@ def evt3_reference(
 def evt2_reference(
     words: NDArray[np.uint32], state: Evt2State, width: int, height: int
 ) -> tuple[Evt2State, int, Events, int]:
-    """The plain twin of `evt2_decode`, all words at once: state, words read, events, verdict."""
+    """Reference implementation of `evt2_decode`, vectorised over all words: state, words read, events, verdict."""
     kinds = words >> 28
     known = np.isin(kinds, EVT2_WORDS)
     read, verdict = (words.size, OK) if known.all() else (int(np.argmin(known)), ILLEGAL)
@@ -260,7 +263,7 @@ def evt2_reference(
 
 
 def step_of(difference: int, period: int) -> int:
-    """How far a counter went that shows this difference: a little back is back, more is once around."""
+    """Step of a counter with this difference of values. A decrease by more than STEP_BACK is a wrap."""
     if difference < -STEP_BACK:
         return difference + period
     return difference - period if difference >= period - STEP_BACK else difference

@@ -1,4 +1,4 @@
-"""Prophesee .raw files: a text header, then EVT2 or EVT3 words as the camera wrote them."""
+"""Prophesee .raw files: a text header, then EVT2 or EVT3 words from the camera."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -15,17 +15,17 @@ from neurove_core.io.recording import BLOCK_BYTES, CHUNK_EVENTS, EventsOnly, Tri
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
 
-HEADER_BYTES = 64 << 10  # a header is some 500 bytes; more than this is none
+HEADER_BYTES = 64 << 10  # maximum size; a header has about 500 bytes
 
 Decode = Callable[[NDArray[Any], Any, int, int, Events], tuple[Any, int, int, int]]
 FindTriggers = Callable[[NDArray[Any], triggers.TriggerState], tuple[triggers.TriggerState, triggers.Columns]]
 
 
 class Words(NamedTuple):
-    """One word format: how wide a word is and what reads it."""
+    """A word format: its word type and its decoders."""
 
     dtype: np.dtype[Any]
-    known: NDArray[np.bool_]  # (16,) of the four bits that tell a word's type
+    known: NDArray[np.bool_]  # (16,) known word types, indexed by the first four bits
     decode: Decode
     start: NamedTuple
     triggers: FindTriggers
@@ -43,18 +43,18 @@ _FORMAT_OF_EVT = {"2.0": "EVT2", "2.1": "EVT21", "3.0": "EVT3"}
 
 
 class Header(NamedTuple):
-    """What the text in front of the words says."""
+    """Content of the text header."""
 
     format: str | None
-    sensor: Sensor | None  # None where it says nothing that a sensor could have
+    sensor: Sensor | None  # None if the header has no valid sensor size
     size: int  # [bytes]
 
 
 def parse_header(path: Path, head: bytes) -> Header:
-    r"""Read the lines that begin with `% `, up to the first that does not or to `% end`.
+    r"""Read the lines that begin with `% `, up to the first other line or `% end`.
 
-    Both ways of writing the geometry occur: a line of its own (or one each for width and height), and as fields of the
-    format. Of two that speak of the same, the later one counts.
+    The geometry is either in a line of its own (or one line each for width and height) or in fields of the format line.
+    If a value occurs twice, the later one applies.
 
     >>> parse_header(Path("a.raw"), b"% evt 3.0\n% format EVT3;height=720;width=1280\n% end\n\x00\x80")
     Header(format='EVT3', sensor=Sensor(width=1280, height=720), size=52)
@@ -64,7 +64,7 @@ def parse_header(path: Path, head: bytes) -> Header:
     """
     fields: dict[str, str] = {}
     at = 0
-    while head.startswith(b"% ", at):  # the blank too: a first word may well begin with the byte of a '%'
+    while head.startswith(b"% ", at):  # with the space: the first word can begin with the byte of '%'
         end = head.find(b"\n", at)
         if end < 0:
             raise BrokenRecording(path, f"byte {at}", "the file ends within its header")
@@ -99,21 +99,21 @@ class PropheseeRecording(EventsOnly):
 
     @classmethod
     def open(cls, path: Path, sensor: Sensor | None = None) -> Self:
-        """The recording in this file.
+        """Open the recording in this file.
 
         Args:
             path: the .raw file.
-            sensor: its pixel array; overrides the header.
+            sensor: its pixel array, which takes precedence over the header.
 
         Raises:
-            UnknownSource: the header names no format that can be read.
-            MissingGeometry: the header does not tell the sensor's size and `sensor` does not either.
+            UnknownSource: the header does not name a supported format.
+            MissingGeometry: neither the header nor `sensor` gives the sensor size.
             BrokenRecording: the file ends within its header.
         """
         with path.open("rb") as file:
             header = parse_header(path, file.read(HEADER_BYTES))
         if header.format not in FORMATS:
-            why = f"its words are {header.format}" if header.format else "its header names no word format"
+            why = f"its words are {header.format}" if header.format else "its header does not name a word format"
             raise UnknownSource(path, why)
         sensor = sensor or header.sensor
         if sensor is None:
@@ -122,7 +122,7 @@ class PropheseeRecording(EventsOnly):
 
     @property
     def streams(self) -> tuple[str, ...]:
-        """Events and triggers: whether any trigger came shows when they are read."""
+        """Events and triggers. Only reading shows whether there are triggers."""
         return ("events", "triggers")
 
     @property
@@ -134,7 +134,8 @@ class PropheseeRecording(EventsOnly):
         """All events from the beginning; see `Recording`. Other words are skipped.
 
         Raises:
-            BrokenRecording: a word is cut, of no known type, or holds an event outside the sensor; it names the byte.
+            BrokenRecording: a word is truncated, has an unknown type, or has an event outside the sensor. The error
+                names the byte.
         """
         dtype, _, decode, state, _ = self.words
         at = self.header_bytes
@@ -149,16 +150,18 @@ class PropheseeRecording(EventsOnly):
                         yield out.span(0, n)
                     at += read * dtype.itemsize
                     if verdict != evt.OK:
-                        raise BrokenRecording(self.path, f"byte {at}", self._why(verdict, int(words[read]), out, n))
+                        raise BrokenRecording(
+                            self.path, f"byte {at}", self._fault_text(verdict, int(words[read]), out, n)
+                        )
                     words = words[read:]
                 if len(block) % dtype.itemsize:
                     raise BrokenRecording(self.path, f"byte {at}", "the file ends within a word")
 
     def triggers(self) -> Iterator[Triggers]:
-        """All edges on the trigger inputs; see `Recording`. Their times are of the clock of the events.
+        """All edges on the trigger inputs; see `Recording`. Their times are in the clock of the events.
 
         Raises:
-            BrokenRecording: a word is cut or of no known type; it names the byte.
+            BrokenRecording: a word is truncated or has an unknown type. The error names the byte.
         """
         dtype, known, _, _, find = self.words
         at, state = self.header_bytes, triggers.TriggerState()
@@ -166,24 +169,24 @@ class PropheseeRecording(EventsOnly):
             file.seek(at)
             while block := file.read(BLOCK_BYTES):
                 words = np.frombuffer(block, dtype, len(block) // dtype.itemsize)
-                good = known[words >> (8 * dtype.itemsize - 4)]
-                n = words.size if good.all() else int(good.argmin())
+                is_known = known[words >> (8 * dtype.itemsize - 4)]
+                n = words.size if is_known.all() else int(is_known.argmin())
                 state, columns = find(words[:n], state)
                 if columns[0].size:
                     yield Triggers(*columns)
                 at += n * dtype.itemsize
                 if n < words.size:
-                    raise BrokenRecording(self.path, f"byte {at}", self._unknown(int(words[n])))
+                    raise BrokenRecording(self.path, f"byte {at}", self._unknown_text(int(words[n])))
                 if len(block) % dtype.itemsize:
                     raise BrokenRecording(self.path, f"byte {at}", "the file ends within a word")
 
-    def _unknown(self, word: int) -> str:
-        return f"0x{word:0{2 * self.words.dtype.itemsize}x} is of no known word type"
+    def _unknown_text(self, word: int) -> str:
+        return f"0x{word:0{2 * self.words.dtype.itemsize}x} has an unknown word type"
 
-    def _why(self, verdict: int, word: int, out: Events, n: int) -> str:
+    def _fault_text(self, verdict: int, word: int, out: Events, n: int) -> str:
         if verdict == evt.OUTSIDE:
             return f"an event at x={out.x[n]} y={out.y[n]} lies outside the sensor {self.sensor}"
-        return self._unknown(word)
+        return self._unknown_text(word)
 
 
 def _open(path: Path, sensor: Sensor | None, topic: str | None) -> PropheseeRecording:

@@ -1,4 +1,4 @@
-"""Edges on a camera's trigger inputs among Prophesee words: a pass of its own, so that evt's decoders need not look."""
+"""Edges on the trigger inputs in Prophesee words. A separate pass keeps the decoders in `evt` fast."""
 
 from typing import Any, NamedTuple
 
@@ -6,40 +6,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.compiled import compiled
-from neurove_core.io.formats.prophesee.evt import TIME_HIGH, TIME_LOW, counted_on, signed, step_of
+from neurove_core.io.formats.prophesee.evt import TIME_HIGH, TIME_LOW, signed, step_of, unwrapped
 
 Columns = tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.uint8]]
-"""Time [us], channel and level (1 rising, 0 falling) of trigger edges, each (N,); the fields of io's Triggers."""
+"""Time [us], channel and level (1 rising, 0 falling) of trigger edges, each (N,): the fields of `io.Triggers`."""
 
 _TRIGGER = 0xA
 
 
 class TriggerState(NamedTuple):
-    """What the search for triggers carries from word to word; the default is the start of a recording."""
+    """State of the search for triggers between words. The default is for the start of a recording."""
 
-    timed: int = 0  # 1 from the first TIME_HIGH on; before it triggers have no time and are ignored
-    high: int = 0  # TIME_HIGH, counted on over its wraps [4096 us in EVT3, 64 us in EVT2]
-    low: int = 0  # TIME_LOW [us], of EVT3 alone
+    timed: int = 0  # 1 after the first TIME_HIGH; before it triggers have no time and are ignored
+    high: int = 0  # TIME_HIGH, unwrapped [4096 us in EVT3, 64 us in EVT2]
+    low: int = 0  # TIME_LOW [us], only EVT3
     last_us: int = 0  # time of the last trigger [us]
 
 
 def evt3_triggers(words: NDArray[np.uint16], state: TriggerState) -> tuple[TriggerState, Columns]:
-    """The edges on the trigger inputs among EVT3 words; the clock counts on and never runs back, as in `evt3_decode`.
+    """Edges on the trigger inputs in EVT3 words. Times are unwrapped and never decrease, as in `evt3_decode`.
 
     Source: docs.prophesee.ai, EVT 3.0 format, EXT_TRIGGER: channel in bits 8 to 11, level in bit 0.
 
     Args:
-        words: (N,) words as the camera wrote them, all of known types (the decoder of events tells others).
-        state: of the words before these.
+        words: (N,) words from the camera, all of known types (the decoder of events reports unknown types).
+        state: state after the words before these.
 
     Returns:
-        The state after them, and the triggers.
+        The state after the words, and the triggers.
     """
     return _triggers(words, state, 12)
 
 
 def evt2_triggers(words: NDArray[np.uint32], state: TriggerState) -> tuple[TriggerState, Columns]:
-    """The edges on the trigger inputs among EVT2 words; see `evt3_triggers`.
+    """Edges on the trigger inputs in EVT2 words; see `evt3_triggers`.
 
     Source: docs.prophesee.ai, EVT 2.0 format, EXT_TRIGGER: time in bits 22 to 27, channel in 8 to 12, level in bit 0.
     """
@@ -47,8 +47,8 @@ def evt2_triggers(words: NDArray[np.uint32], state: TriggerState) -> tuple[Trigg
 
 
 def _triggers(words: NDArray[Any], state: TriggerState, shift: int) -> tuple[TriggerState, Columns]:
-    room = np.count_nonzero(words >> shift == _TRIGGER)
-    out = np.empty(room, np.int64), np.empty(room, np.uint8), np.empty(room, np.uint8)
+    n_max = np.count_nonzero(words >> shift == _TRIGGER)
+    out = np.empty(n_max, np.int64), np.empty(n_max, np.uint8), np.empty(n_max, np.uint8)
     state, n = (_evt3_triggers if shift == 12 else _evt2_triggers)(words, state, out)
     return state, (out[0][:n], out[1][:n], out[2][:n])
 
@@ -68,7 +68,7 @@ def _evt3_triggers(
             if not timed:
                 timed, high, low, last_us = 1, value, 0, value << 12
             elif value != high & 0xFFF:
-                high, low = counted_on(high, value, 1 << 12), 0
+                high, low = unwrapped(high, value, 1 << 12), 0
         elif kind == _TRIGGER and timed:
             last_us = max(last_us, (high << 12) + low)
             out[0][n], out[1][n], out[2][n] = last_us, value >> 8, value & 1
@@ -87,7 +87,7 @@ def _evt2_triggers(
         kind = word >> 28
         if kind == TIME_HIGH:
             value = word & 0xFFF_FFFF
-            high = counted_on(high, value, 1 << 28) if timed else value
+            high = unwrapped(high, value, 1 << 28) if timed else value
             if not timed:
                 timed, last_us = 1, high << 6
         elif kind == _TRIGGER and timed:
@@ -98,14 +98,14 @@ def _evt2_triggers(
 
 
 def evt3_triggers_reference(words: NDArray[np.uint16], state: TriggerState) -> tuple[TriggerState, Columns]:
-    """The plain twin of `evt3_triggers`."""
+    """Reference implementation of `evt3_triggers`."""
     s, rows = state._asdict(), []
     for word in words.tolist():
         kind, value = word >> 12, word & 0xFFF
         if kind == TIME_LOW:
             s["low"] = value
         elif kind == TIME_HIGH:
-            _show(s, value, 1 << 12, 1 << 12)
+            _apply_time_high(s, value, 1 << 12, 1 << 12)
         elif kind == _TRIGGER and s["timed"]:
             s["last_us"] = max(s["last_us"], (s["high"] << 12) + s["low"])
             rows.append((s["last_us"], value >> 8, value & 1))
@@ -113,19 +113,19 @@ def evt3_triggers_reference(words: NDArray[np.uint16], state: TriggerState) -> t
 
 
 def evt2_triggers_reference(words: NDArray[np.uint32], state: TriggerState) -> tuple[TriggerState, Columns]:
-    """The plain twin of `evt2_triggers`."""
+    """Reference implementation of `evt2_triggers`."""
     s, rows = state._asdict(), []
     for word in words.tolist():
         if word >> 28 == TIME_HIGH:
-            _show(s, word & 0xFFF_FFFF, 1 << 28, 1 << 6)
+            _apply_time_high(s, word & 0xFFF_FFFF, 1 << 28, 1 << 6)
         elif word >> 28 == _TRIGGER and s["timed"]:
             s["last_us"] = max(s["last_us"], (s["high"] << 6) + (word >> 22 & 0x3F))
             rows.append((s["last_us"], word >> 8 & 0x1F, word & 1))
     return TriggerState(**s), _columns(rows)
 
 
-def _show(s: dict[str, int], value: int, period: int, tick_us: int) -> None:
-    """A TIME_HIGH that wraps after this many ticks, as the references count it on."""
+def _apply_time_high(s: dict[str, int], value: int, period: int, tick_us: int) -> None:
+    """Update the state with a TIME_HIGH that wraps after `period` ticks."""
     if not s["timed"]:
         s.update(timed=1, high=value, low=0, last_us=value * tick_us)
         return

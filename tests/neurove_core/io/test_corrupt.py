@@ -1,4 +1,4 @@
-"""Whatever is wrong with a file: it is read, or refused in our own words, and nothing false is handed on."""
+"""A corrupt or truncated file is read or raises an error of ours, and all data that is read is valid."""
 
 from pathlib import Path
 
@@ -40,7 +40,7 @@ each_format = pytest.mark.parametrize("name", WRITTEN)
 
 
 def read_all(recording: Recording) -> None:
-    """Everything, as far as it goes, with what every recording promises of it."""
+    """Read everything up to an error, and check the guarantees of every recording."""
     last_us = None
     for chunk in recording.chunks():
         check_events(chunk, recording.sensor, last_us)
@@ -63,30 +63,30 @@ def read_or_refused(path: str) -> None:
     try:
         read_all(open_source(path, DAVIS if path.endswith(("aedat", "mat")) else SENSOR))
     except NeuroVEError as error:
-        assert path in error.message  # noqa: PT017 not raising is fine too
+        assert path in error.message  # noqa: PT017 no error is valid too
 
 
 @each_format
 @pytest.mark.parametrize("seed", range(2))
-def test_a_garbled_file_is_read_or_refused_in_our_own_words(name, seed, tmp_path):
+def test_a_corrupt_file_is_read_or_raises_an_error_of_ours(name, seed, tmp_path):
     data = WRITTEN[name](tmp_path)
     rng = np.random.default_rng(seed)
     for _ in range(60):
-        garbled = bytearray(data)
+        corrupt = bytearray(data)
         for at in rng.integers(0, len(data), rng.integers(1, 4)):
-            garbled[at] = rng.integers(0, 256)
-        read_or_refused(put(tmp_path, name, bytes(garbled)))
+            corrupt[at] = rng.integers(0, 256)
+        read_or_refused(put(tmp_path, name, bytes(corrupt)))
 
 
 @each_format
-def test_a_cut_file_is_read_or_refused_in_our_own_words(name, tmp_path):
+def test_a_truncated_file_is_read_or_raises_an_error_of_ours(name, tmp_path):
     data = WRITTEN[name](tmp_path)
-    for cut in np.random.default_rng(0).integers(0, len(data), 60).tolist():
-        read_or_refused(put(tmp_path, name, data[:cut]))
+    for size in np.random.default_rng(0).integers(0, len(data), 60).tolist():
+        read_or_refused(put(tmp_path, name, data[:size]))
 
 
 @each_format
-def test_the_name_of_a_format_may_be_written_in_capitals(name, tmp_path):
+def test_the_suffix_of_a_file_may_be_in_capitals(name, tmp_path):
     sensor = DAVIS if name.endswith(("aedat", "mat")) else SENSOR
     recording = open_source(put(tmp_path, name.upper(), WRITTEN[name](tmp_path)), sensor)
     assert Events.join(list(recording.chunks())).n > 0
