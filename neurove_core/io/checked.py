@@ -40,7 +40,7 @@ def checked(path: Path, pieces: Iterator[tuple[str, Events]], sensor: Sensor) ->
 def _batches(
     pieces: Iterator[tuple[str, Events]],
 ) -> Iterator[tuple[list[tuple[str, Events]], BrokenRecording | None]]:
-    """Batches of pieces with about _MIN_EVENTS events. The last batch has the error that ended the pieces, if any."""
+    """Batches of at least _MIN_EVENTS events, except the last, which has the error that ended the pieces, if any."""
     batch: list[tuple[str, Events]] = []
     n = 0
     try:

@@ -1,4 +1,4 @@
-"""Statistics of a recording, from one pass over it and with bounded memory."""
+"""Statistics of a recording. Each stream is read once, with bounded memory."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -94,7 +94,7 @@ class Survey(NamedTuple):
 
 
 def survey(recording: Recording, seconds: float | None = None) -> Survey:
-    """Read a recording once and summarise it.
+    """Read each stream of a recording once and summarise it.
 
     For a damaged recording the summary covers the part before the damage. The ground truth is `Recording.twists`; see
     geometry.twists.

@@ -1,4 +1,4 @@
-"""A corrupt or truncated file is read or raises an error of ours, and all data that is read is valid."""
+"""A corrupt or truncated file is read or raises a NeuroVEError, and all data that is read is valid."""
 
 from pathlib import Path
 
@@ -68,7 +68,7 @@ def read_or_refused(path: str) -> None:
 
 @each_format
 @pytest.mark.parametrize("seed", range(2))
-def test_a_corrupt_file_is_read_or_raises_an_error_of_ours(name, seed, tmp_path):
+def test_a_corrupt_file_is_read_or_raises_a_neurove_error(name, seed, tmp_path):
     data = WRITTEN[name](tmp_path)
     rng = np.random.default_rng(seed)
     for _ in range(60):
@@ -79,7 +79,7 @@ def test_a_corrupt_file_is_read_or_raises_an_error_of_ours(name, seed, tmp_path)
 
 
 @each_format
-def test_a_truncated_file_is_read_or_raises_an_error_of_ours(name, tmp_path):
+def test_a_truncated_file_is_read_or_raises_a_neurove_error(name, tmp_path):
     data = WRITTEN[name](tmp_path)
     for size in np.random.default_rng(0).integers(0, len(data), 60).tolist():
         read_or_refused(put(tmp_path, name, data[:size]))

@@ -179,7 +179,7 @@ def test_a_recording_truncated_within_its_header_is_refused_or_has_no_events(fil
 
 @each_format
 @pytest.mark.parametrize("seed", range(3))
-def test_a_corrupt_recording_is_read_or_raises_an_error_of_ours(file, seed, tmp_path):
+def test_a_corrupt_recording_is_read_or_raises_a_neurove_error(file, seed, tmp_path):
     rng = np.random.default_rng(seed)
     for _ in range(60):
         data = bytearray(file.data)
