@@ -45,7 +45,7 @@ class RecordedSequences:
         UnknownSource: a recording does not exist, or a folder contains none.
         InvalidField: a recording has no truth, never ends, or has linear velocities but no camera height. The error
             names the field.
-        BrokenRecording, MissingGeometry, MissingExtra: as `io.open_source`.
+        BrokenRecording, MissingGeometry, MissingExtra: as `sources.open_source`.
     """
 
     def __init__(self, folder: Path, config: TrainingConfig) -> None:

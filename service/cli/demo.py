@@ -57,9 +57,9 @@ def run(
     """Run driver, service and consumer on any source, and return a summary.
 
     Args:
-        source: as io.open_source.
+        source: as sources.open_source.
         sensor: WIDTHxHEIGHT, if the source lacks it.
-        topic: as io.open_source.
+        topic: as sources.open_source.
         speed: as `neurove drive --speed`.
         loop: start again at the end.
         duration_s: sensor time to play [s]; infinity: until the source ends or the stop event.

@@ -11,9 +11,9 @@ import pytest
 import neurove_core
 from neurove_core import Estimator, load_model, models
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from neurove_core.io import open_source
 from neurove_core.io.packets import slices
 from neurove_core.models import bundle
+from neurove_core.sources import open_source
 from neurove_protocol.errors import BadModel
 
 SMALL = ModelConfig(
