@@ -1,6 +1,7 @@
 """NeuroVE: velocity of an event camera from its events, by a spiking network. No network access, no clocks, no threads.
 
-The public names of the package; each is loaded at its first use, so that reading recordings does not import torch:
+These are the public names of the package. Each is loaded at its first use, so that reading recordings does not import
+torch. Every other name is private by contract: a release may change it without notice.
 
 - `open_source(source)`: a recording from a file, a folder, or a simulation.
 - `load_model(name_or_path)`: a model, built in or from a bundle file.
