@@ -112,8 +112,8 @@ def test_a_simulation_contains_its_truth(run, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["nowhere"], "scene='nowhere': known are street, bare-street, corridor, room, plain-room, wall"),
-        (["street", "--camera", "nikon"], "camera='nikon': known are"),
+        (["nowhere"], "scene='nowhere': known scenes: street, bare-street, corridor, room, plain-room, wall"),
+        (["street", "--camera", "nikon"], "camera='nikon': known cameras:"),
         (["street", "--trajectory", "flying"], "'flying': neither a known trajectory nor a file"),
         (["street", "--height", "0"], "height"),
         (["street", "--seed", "-1"], "seed='-1'"),

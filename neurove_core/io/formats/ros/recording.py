@@ -191,7 +191,7 @@ class RosbagRecording(EventsOnly):
         return None
 
     def imu(self) -> Iterator[Imu]:
-        """Yield the samples of the sensor_msgs/Imu topic nearest by name.
+        """The samples of the sensor_msgs/Imu topic nearest by name.
 
         They are in the frame of the IMU, because bags rarely give its mounting.
 
@@ -199,24 +199,11 @@ class RosbagRecording(EventsOnly):
             BrokenRecording: as `chunks`, or the time of a sample decreases.
         """
         topic = self._nearest_topic(IMU_TYPE)
-        offset_us = self.ros_offset_us
-        batch: list[messages.ImuSample] = []
-        broken: BrokenRecording | None = None
-        try:
-            for message in self.bag.messages((topic,) if topic else ()):
-                sample = self._read(message, messages.imu)
-                if batch and sample.stamp_ns < batch[-1].stamp_ns:
-                    raise BrokenRecording(self.path, message.where, "time runs backwards")
-                batch.append(sample)
-                if len(batch) > _BATCH:
-                    yield _imu(batch[:-1], offset_us)
-                    batch = batch[-1:]
-        except BrokenRecording as error:
-            broken = error
-        if batch:
-            yield _imu(batch, offset_us)
-        if broken is not None:
-            raise broken
+        found = (
+            (message.where, self._read(message, messages.imu))
+            for message in self.bag.messages((topic,) if topic else ())
+        )
+        return _imu_batches(self.path, found, self.ros_offset_us)
 
     def triggers(self) -> Iterator[Triggers]:
         """Yield the edges of the trigger input. `evt3` messages hold them among the events.
@@ -309,6 +296,26 @@ def _poses(path: Path, found: Iterator[tuple[str, messages.PoseSample]], offset_
     orientation = np.array([sample.orientation for sample in samples])
     orientation /= np.linalg.norm(orientation, axis=1, keepdims=True)
     return Poses(t, np.array([sample.position_m for sample in samples]), orientation)
+
+
+def _imu_batches(path: Path, found: Iterator[tuple[str, messages.ImuSample]], offset_us: int) -> Iterator[Imu]:
+    """The samples of some messages, each with its place in the file, up to the first error."""
+    batch: list[messages.ImuSample] = []
+    broken: BrokenRecording | None = None
+    try:
+        for where, sample in found:
+            if batch and sample.stamp_ns < batch[-1].stamp_ns:
+                raise BrokenRecording(path, where, "time runs backwards")
+            batch.append(sample)
+            if len(batch) > _BATCH:
+                yield _imu(batch[:-1], offset_us)
+                batch = batch[-1:]
+    except BrokenRecording as error:
+        broken = error
+    if batch:
+        yield _imu(batch, offset_us)
+    if broken is not None:
+        raise broken
 
 
 def _imu(samples: list[messages.ImuSample], offset_us: int) -> Imu:
