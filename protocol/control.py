@@ -7,7 +7,7 @@ from pydantic import ConfigDict, Field
 from neurove_protocol.codec import Count, Message, Name, Part
 from neurove_protocol.errors import EXIT_CONFLICT, EXIT_FAILURE, Conflict, NeuroVEError
 
-Verdict = Literal["ok", "lossy", "stalled", "idle"]
+Verdict = Literal["ok", "lossy", "stalled", "idle", "unstable", "uncertain"]
 
 STATUS_SCHEMA = "application/msgpack;neurove.status.1"
 """Zenoh Encoding of a StreamStatus."""
@@ -98,10 +98,14 @@ class Losses(Part):
     overload_packets: Count = 0  # dropped here, oldest first, because the queue was full
     duplicate_packets: Count = 0  # a sequence number that arrived before
     out_of_order_packets: Count = 0  # older than a packet already processed
+    foreign_packets: Count = 0  # of a second driver on this stream; the first one is followed
+    stale_packets: Count = 0  # older than max_age_s when their turn came
     malformed_packets: Count = 0  # refused: they break a rule of the contract
     failed_packets: Count = 0  # an internal error; the log has the traceback
     late_events: Count = 0  # of a window that is already answered
     skipped_windows: Count = 0  # windows in a gap of the sensor's time that is too long to bridge
+    shed_windows: Count = 0  # left out whole by an overloaded node, which goes on with the newest data
+    restart_windows: Count = 0  # open when the stream restarted, with the events that they had
 
     def nonzero(self) -> dict[str, int]:
         """The causes with a count above 0."""
@@ -137,6 +141,10 @@ class StreamStatus(Message):
     lost: Losses
     latency_ms: Latency | None  # None before the first estimate
     last_packet_age_s: float
+    recovered_packets: Count = 0  # of gap_packets: they arrived later, in time for their window
+    uncounted_packets: Count = 0  # all had the sequence number 0, so losses before this node cannot be counted
+    refused_cameras: Count = 0  # CameraInfo messages that were refused or do not belong to the sensor
+    refusal: str = ""  # why the newest packet or CameraInfo was refused
 
 
 class ModelInfo(Part):

@@ -76,13 +76,21 @@ STATUS: Fields = {
         "overload_packets": 0,
         "duplicate_packets": 0,
         "out_of_order_packets": 0,
+        "foreign_packets": 0,
+        "stale_packets": 0,
         "malformed_packets": 0,
         "failed_packets": 0,
         "late_events": 41,
         "skipped_windows": 0,
+        "shed_windows": 0,
+        "restart_windows": 0,
     },
     "latency_ms": {"p50": 3.25, "p95": 5.5, "p99": 9.75},
     "last_packet_age_s": 0.004,
+    "recovered_packets": 0,
+    "uncounted_packets": 0,
+    "refused_cameras": 1,
+    "refusal": "t0_us=-1: must be 0 or more",
 }
 EXAMPLES: dict[str, Fields] = {
     "EventPacket": {
@@ -125,6 +133,8 @@ EXAMPLES: dict[str, Fields] = {
         "flags": ["settling", "uncalibrated"],
         "covariance": [0.25 if i == j else 0.125 if i + j == 2 else 0.0 for i in range(6) for j in range(6)],
         "trace": {"received_ns": 1_000, "queued_ns": 2_000, "computed_ns": 3_000, "published_ns": 4_000},
+        "node": "rover-1",
+        "host": {"end_ns": 1_700_000_000_000_000_000, "uncertainty_ns": 200_000, "age_ns": 4_000_000},
     },
     "StreamStatus": STATUS,
     "HealthRequest": {"v": 1},
@@ -215,7 +225,7 @@ MODELS: tuple[type[Message], ...] = (
     RollbackRequest,
     ErrorReply,
 )
-EVENT_PACKET = Kind("EventPacket", decode_packet, encode_packet, strict=False, optional=frozenset())
+EVENT_PACKET = Kind("EventPacket", decode_packet, encode_packet, strict=False, optional=frozenset({"sent_us"}))
 KINDS = (EVENT_PACKET, *map(_kind, MODELS))
 BY_NAME = {kind.name: kind for kind in KINDS}
 
@@ -284,8 +294,9 @@ statuses = st.fixed_dictionaries(
     {
         "node": names,
         "stream": names,
-        "verdict": st.sampled_from(["ok", "lossy", "stalled", "idle"]),
+        "verdict": st.sampled_from(["ok", "lossy", "stalled", "idle", "unstable", "uncertain"]),
         "why": sentences,
+        "refusal": sentences,
         "calibrated": st.booleans(),
         "lost": st.fixed_dictionaries(dict.fromkeys(STATUS["lost"], counts)),
         "latency_ms": st.none() | st.fixed_dictionaries(dict.fromkeys(("p50", "p95", "p99"), floats)),
@@ -341,6 +352,10 @@ def estimates(draw: st.DrawFn) -> Fields:
         "flags": draw(st.lists(sentences, max_size=4)),
         "covariance": draw(st.none() | covariances()),
         "trace": draw(st.fixed_dictionaries(dict.fromkeys(EXAMPLES["TwistEstimate"]["trace"], int64s))),
+        "node": draw(st.none() | names),
+        "host": draw(
+            st.none() | st.fixed_dictionaries({"end_ns": int64s, "uncertainty_ns": counts, "age_ns": counts})
+        ),
     }
 
 
@@ -426,9 +441,9 @@ def packets(draw: st.DrawFn, max_events: int = 40, max_span_us: int = 2**32 - 1)
         )
     )
     t, x, y, p = zip(*sorted(rows), strict=True) if rows else ((), (), (), ())
-    return EventPacket(
-        draw(names), draw(counts), sensor, t0_us, Events.from_columns([t0_us + offset for offset in t], x, y, p)
-    )
+    events = Events.from_columns([t0_us + offset for offset in t], x, y, p)
+    sent_us = draw(st.none() | st.integers(-(2**62), 2**62 - 1))
+    return EventPacket(draw(names), draw(counts), sensor, t0_us, events, sent_us)
 
 
 def same(left: object, right: object) -> bool:
@@ -446,7 +461,8 @@ def same(left: object, right: object) -> bool:
 
 def assert_same_packet(left: EventPacket, right: EventPacket) -> None:
     """Bit for bit: all columns, their types, and everything in the header."""
-    assert (left.stream, left.seq, left.sensor, left.t0_us) == (right.stream, right.seq, right.sensor, right.t0_us)
+    for name in ("stream", "seq", "sensor", "t0_us", "sent_us"):
+        assert getattr(left, name) == getattr(right, name), name
     assert_same_events(left.events, right.events)
 
 

@@ -39,6 +39,8 @@ WRONG: dict[type, tuple[Any, ...]] = {
 }
 NULLABLE = {
     ("TwistEstimate", "covariance"),
+    ("TwistEstimate", "node"),
+    ("TwistEstimate", "host"),
     ("CameraInfo", "height_m"),
     ("StreamStatus", "latency_ms"),
     ("HealthReply", "latency_ms"),
@@ -49,6 +51,7 @@ NULLABLE = {
 }
 FREE_MAPS = ("details", "unreadable", "figures", "partial")
 DEFAULTED = {"release", "figures", "signature"}  # of a ModelInfo
+DEFAULTED |= {"recovered_packets", "uncounted_packets", "refused_cameras", "refusal"}  # of a StreamStatus
 OUT_OF_BOUND: dict[str, dict[str, tuple[Any, ...]]] = {
     "EventPacket": {
         "stream": ("", "a/b", "@node", "*", "**", ".", "..", "-a", "a" * 65, "caf\u00e9", "a b", "a\n", "$*", "#", "?"),
