@@ -353,9 +353,7 @@ def estimates(draw: st.DrawFn) -> Fields:
         "covariance": draw(st.none() | covariances()),
         "trace": draw(st.fixed_dictionaries(dict.fromkeys(EXAMPLES["TwistEstimate"]["trace"], int64s))),
         "node": draw(st.none() | names),
-        "host": draw(
-            st.none() | st.fixed_dictionaries({"end_ns": int64s, "uncertainty_ns": counts, "age_ns": counts})
-        ),
+        "host": draw(st.none() | st.fixed_dictionaries({"end_ns": int64s, "uncertainty_ns": counts, "age_ns": counts})),
     }
 
 
