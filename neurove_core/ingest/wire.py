@@ -108,7 +108,8 @@ def _read(data: NDArray[np.uint8], max_events: int, max_side: int) -> _Found:  #
     width, at = _integer(data, _past(data, at, _TO_WIDTH))
     height, at = _integer(data, _past(data, at, _TO_HEIGHT))
     t0_us, at = _integer(data, _past(data, at, _TO_T0))
-    sent_us, sent_good = np.int64(0), True
+    sent_us: Any = np.int64(0)
+    sent_good = True
     if timed:
         sent_us, at = _integer(data, _past(data, at, _TO_SENT))
         sent_good = -(1 << 62) <= sent_us < 1 << 62
