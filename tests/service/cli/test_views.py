@@ -9,7 +9,8 @@ from rich.console import Console
 from neurove_protocol.control import HealthReply, Losses, ModelInfo, ModelsReply
 from neurove_service.cli.views import Board, health_table, models_table
 from neurove_service.node.health import stream_status
-from neurove_service.streams.stream import Arrival, Stream
+from neurove_service.streams.intake import Arrival
+from neurove_service.streams.stream import Stream
 from tests.builders import make_packets
 
 INFO = ModelInfo(name="one", digest="ab" * 32, trained=False, provenance="a test", parameters=1234)

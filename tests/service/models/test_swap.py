@@ -14,7 +14,8 @@ from neurove_protocol.errors import Conflict, Diverged, InvalidField, NoMemory, 
 from neurove_service.models.change import Rules
 from neurove_service.models.slot import ModelSlot
 from neurove_service.streams.comparison import TrialLimits
-from neurove_service.streams.stream import Arrival, Stream
+from neurove_service.streams.intake import Arrival
+from neurove_service.streams.stream import Stream
 from tests.builders import make_packets
 from tests.service.conftest import SMALL
 

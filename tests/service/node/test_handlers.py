@@ -33,7 +33,8 @@ from neurove_service.models.slot import ModelSlot
 from neurove_service.models.store import ModelStore
 from neurove_service.node.handlers import Handlers
 from neurove_service.node.health import stream_status
-from neurove_service.streams.stream import Arrival, Stream
+from neurove_service.streams.intake import Arrival
+from neurove_service.streams.stream import Stream
 from tests.builders import make_packets
 from tests.service.conftest import SMALL
 

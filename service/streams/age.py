@@ -1,0 +1,53 @@
+"""Age: how old the events of a packet are on the clock of this node, learned from the packets that arrive quickest."""
+
+import statistics
+from collections import deque
+
+from neurove_protocol.events import Packet
+
+DRIFT = 200e-6
+"""The clock of a sensor may be slower than that of this node by this share: 100 ppm for each of two crystals."""
+
+_DELAYS = 64
+
+
+class Ages:
+    """Learns the offset between the clock of a stream and the monotonic clock of this node.
+
+    The offset is that of the quickest packet, because a packet cannot arrive before its events happened. It grows by no
+    more than the drift of two crystals, so a delay that grows is seen as age. A delay that all packets share is not
+    seen.
+    The clock of a stream is that of the sensor, or `sent_us` where the driver gives it.
+    """
+
+    def __init__(self) -> None:
+        self._offset_ns: int | None = None
+        self._learned_ns = 0
+        self._delays_ns: deque[int] = deque(maxlen=_DELAYS)
+
+    @property
+    def uncertainty_ns(self) -> int:
+        """Median delay of the recent packets beyond the quickest one [ns]."""
+        return int(statistics.median(self._delays_ns)) if self._delays_ns else 0
+
+    def forget(self) -> None:
+        """Begin anew: the clock of the stream has changed."""
+        self._offset_ns = None
+        self._delays_ns.clear()
+
+    def learn(self, packet: Packet, received_ns: int) -> int:
+        """The delay of a packet beyond the quickest one, from its newest event to its arrival [ns]."""
+        clock_us = packet.sent_us if packet.sent_us is not None else newest_us(packet)
+        offset_ns = received_ns - clock_us * 1000
+        drifted_ns = offset_ns
+        if self._offset_ns is not None:
+            drifted_ns = self._offset_ns + int(DRIFT * max(0, received_ns - self._learned_ns))
+        self._offset_ns, self._learned_ns = min(offset_ns, drifted_ns), received_ns
+        delay_ns = offset_ns - self._offset_ns
+        self._delays_ns.append(delay_ns)
+        return delay_ns
+
+
+def newest_us(packet: Packet) -> int:
+    """Sensor time that a packet has reached [us]."""
+    return packet.events.last_us if packet.events.n else packet.t0_us
