@@ -63,7 +63,7 @@ class Activity:
         self.last_loss_ns: int | None = None
         self.taken_ns = 0  # when the newest packet was taken out of the queue
         self.reset_ns: deque[int] = deque(maxlen=_RESETS)  # times of the newest resets
-        self.newest_ns: dict[str, int] = {}  # counter -> when it last grew
+        self.newest_ns: dict[str, int] = {}  # counter or flag -> when it last grew
         self.certain_ns = self.last_estimate_ns  # newest estimate that was neither uncertain nor settling
         self.refusal = ""  # why the newest packet or CameraInfo was refused
         self._now_ns = now_ns
@@ -102,5 +102,7 @@ class Activity:
         """Record the latency of an estimate."""
         self.latencies_ms.append(estimate.trace.latency_ms)
         self.last_estimate_ns = estimate.trace.published_ns
+        if Flag.FROZEN in estimate.flags:
+            self.newest_ns["frozen"] = self.last_estimate_ns
         if not _UNSURE.intersection(estimate.flags):
             self.certain_ns = estimate.trace.published_ns

@@ -16,6 +16,7 @@ from neurove_service.streams.intake import Arrival, Intake
 from neurove_service.streams.lanes import Lanes, Pushing, ServingModelFailed
 from neurove_service.streams.model_source import ModelSource
 from neurove_service.streams.sequence import Order
+from neurove_service.streams.verdict import Verdicts
 
 log = logs.get(__name__)
 
@@ -51,6 +52,7 @@ class Stream:
         self.camera: CameraInfo | None = None
         self.activity = Activity(now_ns)
         self.counters = self.activity.counters
+        self.verdicts = Verdicts(self.activity)
         self.lanes = Lanes(name, ring)
         self._models = models
         self._flags = Flags()

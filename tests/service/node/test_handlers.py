@@ -1,5 +1,6 @@
 import hashlib
 import threading
+from dataclasses import replace
 
 import pytest
 
@@ -57,7 +58,8 @@ def handlers(slot, stream, clock):
 
 
 def feed(stream, clock, packets):
-    for packet in packets:
+    for packet in packets:  # of a source whose own clock does not run
+        packet = replace(packet, sent_us=clock[0] // 1000)
         for estimate in stream.accept(packet, Arrival(clock[0], clock[0])):
             stream.activity.published(estimate)
 

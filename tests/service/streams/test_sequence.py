@@ -111,10 +111,8 @@ def test_a_driver_that_does_not_count_is_followed(sequence):
 def test_of_two_drivers_one_is_followed_and_the_other_is_named(sequence):
     a = [make_packet(1, seq=5000 + i, t0_us=4000 * i) for i in range(40)]
     b = [make_packet(1, seq=i, t0_us=77 + 4000 * i) for i in range(40)]
-    found = []
-    for one, other in zip(a, b, strict=True):
-        for packet in (one, other):
-            found.append(NEXT if sequence.advance(packet, 0) else sequence.place(packet, 0))
+    mixed = [packet for pair in zip(a, b, strict=True) for packet in pair]
+    found = [NEXT if sequence.advance(packet, 0) else sequence.place(packet, 0) for packet in mixed]
     kinds = [order for order, _ in found]
     assert kinds.count(Order.AFTER_RESTART) == 1  # the second driver began at 0
     assert kinds[10:].count("next") == kinds[10:].count(Order.FOREIGN) == 35
