@@ -36,6 +36,7 @@ class BrokenRecording(RecordingError):
 
     def __init__(self, path: Path, where: str, why: str) -> None:
         super().__init__(f"{path}: broken at {where}: {why}", value=str(path), where=where, why=why)
+        self.where, self.why = where, why
 
 
 class NoCarlaServer(RecordingError):

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from neurove_core.geometry.motion import Twists
 from neurove_core.io.errors import BrokenRecording
+from neurove_core.io.faults import Fault
 from neurove_core.io.recording import Imu, Recording
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
@@ -72,10 +73,12 @@ class Summary:
     imu: ImuSummary | None
     truth: TruthSummary | None
     broken: str | None  # the error that ended the reading, if any
+    faults: tuple[Fault, ...] = ()  # what was skipped, discarded or not read, by reason
 
     def as_json(self) -> dict[str, Any]:
         """The summary as a dict for `json.dumps`."""
         fields = asdict(self)
+        fields["faults"] = [fault.as_json() for fault in self.faults]
         if self.truth is not None:
             truth = fields["truth"]
             fields["truth"] = {"from": truth.pop("source"), **truth}
@@ -96,8 +99,8 @@ class Survey(NamedTuple):
 def survey(recording: Recording, seconds: float | None = None) -> Survey:
     """Read each stream of a recording once and summarise it.
 
-    For a damaged recording the summary covers the part before the damage. The ground truth is `Recording.twists`; see
-    geometry.twists.
+    For a damaged recording the summary covers what can be read; `faults` says what could not. The ground truth is
+    `Recording.twists`; see geometry.twists.
 
     Args:
         recording: the recording to read.
@@ -136,7 +139,8 @@ def survey(recording: Recording, seconds: float | None = None) -> Survey:
         triggers=edges.n,
         imu=imu.summary(),
         truth=None if truth is None else _truth(truth, "poses" if "poses" in recording.streams else "twists"),
-        broken=broken,
+        broken=broken or next(map(str, recording.faults.unread), None),
+        faults=recording.faults.found,
     )
     return Survey(summary, *tally.picture(), *tally.rate(), truth)
 

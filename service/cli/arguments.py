@@ -3,14 +3,18 @@
 import argparse
 import math
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from neurove_protocol import Sensor
 from neurove_protocol.errors import NeuroVEError
 from neurove_service import logs
 from neurove_service.config import ClientConfig, ServiceConfig, load
+
+if TYPE_CHECKING:
+    from neurove_core.io import Recording
 
 Run = Callable[[argparse.Namespace], int]
 """Runs one command and returns its exit code."""
@@ -121,6 +125,12 @@ def seconds(text: str) -> float:
     if not value > 0:
         raise argparse.ArgumentTypeError(f"{text!r}: give seconds above 0")
     return value
+
+
+def tell_faults(recording: "Recording") -> None:
+    """Print to stderr what a recording's reader skipped, discarded or could not read: one line for each reason."""
+    for fault in recording.faults.found:
+        print(f"neurove: {recording.name}: {fault}", file=sys.stderr)
 
 
 def commit() -> str:

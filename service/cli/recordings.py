@@ -13,7 +13,14 @@ from typing import Any, Final
 
 from neurove_protocol.errors import EXIT_FAILURE, InvalidField, NeuroVEError
 from neurove_protocol.keys import check_name
-from neurove_service.cli.arguments import add_client_flags, add_recording_flags, client_config, command, seconds
+from neurove_service.cli.arguments import (
+    add_client_flags,
+    add_recording_flags,
+    client_config,
+    command,
+    seconds,
+    tell_faults,
+)
 from neurove_service.lifecycle import stop_on_signals
 
 Progress = Callable[[int], None]
@@ -128,13 +135,15 @@ def _write(recording: Any, path: Path, *, as_json: bool) -> int:
             show(events)
 
         WRITERS[path.suffix](recording, path, progress)
+    tell_faults(recording)
     size = path.stat().st_size
     summary = {"file": str(path), "bytes": size, "events": counted["events"], "streams": recording.streams}
+    summary["faults"] = [fault.as_json() for fault in recording.faults.found]
     if as_json:
         print(json.dumps(summary))
     else:
         print(f"{path}: {counted['events']:,} events of {recording.name}, {size:,} bytes")
-    return 0
+    return EXIT_FAILURE if recording.faults.unread else 0
 
 
 def info(args: argparse.Namespace) -> int:
@@ -159,9 +168,10 @@ def info(args: argparse.Namespace) -> int:
         Console().print(survey_table(found))
     if args.plot:
         print(f"wrote {args.plot}", file=sys.stderr)
-    if found.broken:
+    if found.broken and not recording.faults.unread:
         print(f"neurove: {found.broken}", file=sys.stderr)
-    return EXIT_FAILURE if found.broken else 0
+    tell_faults(recording)
+    return EXIT_FAILURE if found.broken or found.faults else 0
 
 
 def simulate(args: argparse.Namespace) -> int:

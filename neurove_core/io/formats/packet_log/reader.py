@@ -1,15 +1,16 @@
 """Reader of NeuroVE recordings: it gives events, or the packets as published."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Self, TypeVar
 
 import numpy as np
 
 from neurove_core.geometry.motion import Poses, Twists
-from neurove_core.io.checked import checked
+from neurove_core.io.checked import cleaned
 from neurove_core.io.errors import BrokenRecording, UnknownSource
+from neurove_core.io.faults import Faults, Reason, Tally
 from neurove_core.io.format import Format
 from neurove_core.io.formats.containers.mcap import McapFile, Record
 from neurove_core.io.formats.packet_log import layout
@@ -43,6 +44,7 @@ class McapRecording(EventsOnly):
     stream: str
     file: McapFile
     endless: bool = False
+    faults: Faults = field(default_factory=Faults, compare=False, repr=False)
 
     @classmethod
     def open(cls, path: Path, sensor: Sensor | None = None, topic: str | None = None) -> Self:
@@ -84,13 +86,8 @@ class McapRecording(EventsOnly):
         return ("events", *(kind for kind in kinds if self._topic(kind) in self.file.topics))
 
     def chunks(self) -> Iterator[Events]:
-        """Yield all events from the beginning; see `Recording`.
-
-        Raises:
-            BrokenRecording: the file is truncated or corrupt, or a packet is invalid, has another sensor than the first
-                packet, or is earlier than the packet before it. The error names the byte.
-        """
-        return checked(self.path, self._pieces(0), self.sensor)
+        """Yield all events; see `Recording`. An invalid packet is skipped, and so is one of another sensor."""
+        return self._cleaned(0)
 
     def since(self, t_us: int) -> Iterator[Events]:
         """Yield the events from this time [us] on, as `chunks` does. Bisects the index of the file."""
@@ -103,17 +100,26 @@ class McapRecording(EventsOnly):
                 low = middle
             else:
                 high = middle
-        return later(checked(self.path, self._pieces(chunks[low] if chunks else 0), self.sensor), t_us)
+        return later(self._cleaned(chunks[low] if chunks else 0), t_us)
 
-    def _pieces(self, first_chunk: int) -> Iterator[tuple[str, Events]]:
-        first: EventPacket | None = None
+    def _cleaned(self, first_chunk: int) -> Iterator[Events]:
+        tally = self.faults.begin("events")
+        return cleaned(self._pieces(first_chunk, tally), self.sensor, tally)
+
+    def _pieces(self, first_chunk: int, tally: Tally) -> Iterator[tuple[str, Events]]:
+        first: Sensor | None = None
         for record in self.file.records((self._topic("events"),), first_chunk):
-            packet = _decoded(self.path, record)
-            first = first or packet
-            if packet.sensor != first.sensor:
-                why = f"a packet has sensor {packet.sensor}, but the first packet has {first.sensor}"
-                raise BrokenRecording(self.path, record.where, why)
-            yield record.where, packet.events
+            try:
+                packet = _decoded(self.path, record)
+            except BrokenRecording as error:
+                tally.add(Reason.DAMAGED, error.where, error.why)
+                continue
+            first = first or packet.sensor
+            if packet.sensor == first:
+                yield record.where, packet.events
+            else:
+                why = f"a packet has sensor {packet.sensor}, but the first packet has {first}"
+                tally.add(Reason.INVALID, record.where, why)
 
     def packets(self, stream: str | None = None) -> Iterator[RecordedPacket]:
         """Yield the packets of one stream, or of all streams, in recorded order. They are not decoded or checked.

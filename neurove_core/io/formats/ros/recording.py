@@ -1,7 +1,7 @@
 """One camera of a ROS bag: a .bag file (ROS 1), or a .db3 file, an .mcap file or a folder of them (ROS 2)."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import takewhile
 from pathlib import Path
 from typing import Final, Self, TypeVar
@@ -10,8 +10,9 @@ import numpy as np
 
 from neurove_core.geometry import motion
 from neurove_core.geometry.motion import Poses, Twists
-from neurove_core.io.checked import checked
+from neurove_core.io.checked import cleaned
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
+from neurove_core.io.faults import Faults
 from neurove_core.io.format import Format
 from neurove_core.io.formats.containers.bags import BagFile, BagFolder, BagMessage, SqliteBag, in_recorded_order
 from neurove_core.io.formats.containers.mcap import McapFile
@@ -69,6 +70,7 @@ class RosbagRecording(EventsOnly):
     bag: BagFile
     first: EventMessage
     endless: bool = False
+    faults: Faults = field(default_factory=Faults, compare=False, repr=False)
 
     @classmethod
     def open(cls, path: Path, sensor: Sensor | None = None, topic: str | None = None) -> Self:
@@ -122,7 +124,7 @@ class RosbagRecording(EventsOnly):
             BrokenRecording: the file is truncated or corrupt, a message is invalid, or an event is outside the sensor
                 or earlier than the event before it. The error names the message or the byte.
         """
-        return checked(self.path, self._pieces(None, None), self.sensor)
+        return cleaned(self._pieces(None, None), self.sensor, self.faults.begin("events"))
 
     def since(self, t_us: int) -> Iterator[Events]:
         """Yield the events from this time [us] on, as `chunks` does. Uses the index of the bag if there is one."""
@@ -136,7 +138,7 @@ class RosbagRecording(EventsOnly):
         return self._since_indexed(t_us, anchor, since_ns)
 
     def _since_indexed(self, t_us: int, anchor: Anchor, since_ns: int) -> Iterator[Events]:
-        chunks = checked(self.path, self._pieces(since_ns, anchor), self.sensor)
+        chunks = cleaned(self._pieces(since_ns, anchor), self.sensor, self.faults.begin("events"))
         chunk = next(chunks, None)
         if chunk is None or chunk.t[0] > t_us:  # the clocks drifted by more than the margin
             yield from later(self.chunks(), t_us)
