@@ -33,7 +33,8 @@ from neurove_service.models.slot import ModelSlot
 from neurove_service.models.store import ModelStore
 from neurove_service.node.handlers import Handlers
 from neurove_service.node.health import stream_status
-from neurove_service.streams.stream import Arrival, Stream
+from neurove_service.streams.intake import Arrival
+from neurove_service.streams.stream import Stream
 from tests.builders import make_packets
 from tests.service.conftest import SMALL
 
@@ -56,8 +57,8 @@ def handlers(slot, stream, clock):
 
 
 def feed(stream, clock, packets):
-    for packet in packets:
-        for estimate in stream.accept(packet, Arrival(clock[0], clock[0])):
+    for packet in packets:  # of a source whose own clock does not run
+        for estimate in stream.accept(packet, Arrival(clock[0], clock[0], clock[0] // 1000)):
             stream.activity.published(estimate)
 
 
