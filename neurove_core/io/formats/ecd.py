@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from neurove_core.geometry.motion import Poses, Twists, twists
 from neurove_core.io.archive import Place, folder_in_zip, read_image
-from neurove_core.io.checked import Piece, as_recorded, cleaned, ordered, unread
+from neurove_core.io.checked import Piece, as_recorded, cleaned, ordered, until_broken
 from neurove_core.io.errors import BrokenRecording
 from neurove_core.io.faults import Faults, Reason, Tally
 from neurove_core.io.format import Format
@@ -149,10 +149,7 @@ class EcdRecording(EventsOnly):
         if "frames" not in self.streams:
             return
         tally = self.faults.begin("frames")
-        try:
-            yield from self._frames(tally)
-        except BrokenRecording as error:
-            unread(tally, error)
+        yield from until_broken(self._frames(tally), tally)
 
     def _frames(self, tally: Tally) -> Iterator[Frame]:
         not_before_us: int | None = None
