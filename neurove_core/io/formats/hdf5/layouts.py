@@ -133,9 +133,10 @@ def _sensor(path: Path, file: Any, layout: str) -> Sensor | None:
             return None
         value = file.attrs[name]
         if name == "geometry":
-            width, height = (value.decode() if isinstance(value, bytes) else str(value)).split("x")
-            return Sensor(int(width), int(height))
-        height, width = sorted(int(number) for number in np.asarray(value).ravel()[:2])
+            text = value.decode() if isinstance(value, bytes) else str(value)
+            width, height = (int(number) for number in text.split("x"))
+        else:
+            height, width = sorted(int(number) for number in np.asarray(value).ravel()[:2])
         return Sensor(width, height)
     except (*FAULTS, InvalidField) as error:
         raise BrokenRecording(path, f"attribute {name}", f"it is not a valid sensor: {error}") from None
