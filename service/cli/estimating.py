@@ -67,7 +67,7 @@ class Offline:
         if self._newest_us is not None:
             self._now_ns += max(0, newest_us - self._newest_us) * 1000
         self._newest_us = newest_us
-        found = self.stream.accept(replace(packet, sent_us=None), Arrival(self._now_ns, self._now_ns))
+        found = self.stream.accept(packet, Arrival(self._now_ns, self._now_ns))
         return [one.model_copy(update={"host": None}) for one in found]
 
     def refuse(self, why: str) -> None:
