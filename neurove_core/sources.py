@@ -69,7 +69,7 @@ def open_source(source: str, sensor: Sensor | None = None, topic: str | None = N
     try:
         return _open_path(path, sensor, topic)
     except OSError as error:
-        raise UnknownSource(source, error.strerror or str(error), supported()) from None
+        raise UnknownSource(source, error.strerror or str(error)) from None
 
 
 def supported() -> tuple[str, ...]:
@@ -81,7 +81,7 @@ def supported() -> tuple[str, ...]:
 
 def _open_path(path: Path, sensor: Sensor | None, topic: str | None) -> Recording:
     if not path.exists():
-        raise UnknownSource(path, "no such file or folder", supported())
+        raise UnknownSource(path, "no such file or folder")
     for one in _table().formats:
         if one.fits(path):
             return one.open(path, sensor, topic)
