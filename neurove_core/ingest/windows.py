@@ -24,6 +24,7 @@ class Window(NamedTuple):
     counts: NDArray[np.uint8]  # (2n, H, W), saturating at 255: channel 2i is OFF, 2i + 1 is ON of bin i
     events: int  # of the whole sensor
     outside: int  # those whose pixel has no cell of the grid
+    bridged: bool = False  # windows before it were left out on purpose: the network state goes on over them
 
 
 class WindowsState(NamedTuple):
@@ -34,6 +35,7 @@ class WindowsState(NamedTuple):
     counts: NDArray[np.uint8] | None = None  # None while the open window is empty
     events: int = 0
     outside: int = 0
+    bridged: bool = False  # as in Window
 
 
 class Pushed(NamedTuple):
@@ -100,7 +102,7 @@ class _Open:
 
     def __init__(self, start_us: int, state: WindowsState, config: WindowConfig, canonical: CanonicalConfig) -> None:
         self.start_us, self.counts, self.events, self.outside = start_us, state.counts, state.events, state.outside
-        self._bin_us = config.bin_us
+        self._bridged, self._bin_us = state.bridged, config.bin_us
         self._shape = (2 * config.bins, canonical.height, canonical.width)
 
     def add(self, events: Events | WireEvents, lut: NDArray[np.int32]) -> None:
@@ -116,7 +118,7 @@ class _Open:
         return self.counts
 
     def close(self) -> Window:
-        return Window(self.start_us, self._grid(), self.events, self.outside)
+        return Window(self.start_us, self._grid(), self.events, self.outside, self._bridged)
 
     def state(self, horizon_us: int) -> WindowsState:
-        return WindowsState(self.start_us, horizon_us, self.counts, self.events, self.outside)
+        return WindowsState(self.start_us, horizon_us, self.counts, self.events, self.outside, self._bridged)

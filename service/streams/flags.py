@@ -22,7 +22,7 @@ class Flags:
         self._missing = self._recoverable = False
 
     def set_next(self, flag: Flag) -> None:
-        """Set a flag on the next estimate; OVERLOAD waits until the gap that it caused is known."""
+        """Set a flag on the next estimate; OVERLOAD belongs to the windows of a gap if there is one."""
         self._pending.add(flag)
 
     def missing(self, *, recoverable: bool = False) -> None:

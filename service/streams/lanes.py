@@ -65,6 +65,23 @@ class Lanes:
         """Whether the standby model has a backlog."""
         return self.standby is not None and self.standby.has_backlog
 
+    @property
+    def window_us(self) -> int | None:
+        """Duration of the windows of the serving model [us]; None before the first packet."""
+        return self.serving_lane.estimator.config.window.duration_us if self.serving_lane else None
+
+    @property
+    def open_us(self) -> int | None:
+        """Start of the open window [us]; None before the first packet."""
+        return self.serving_lane.next_us if self.serving_lane else None
+
+    def leave_out_until(self, start_us: int) -> None:
+        """Leave out all windows before `start_us`, the open one included; the network state goes on over them."""
+        lane = self.serving_lane
+        assert lane is not None, "call assign first"
+        lane.state = lane.state._replace(windows=WindowsState(start_us, start_us, bridged=True))
+        self._unanswered = None
+
     def restart(self) -> None:
         """Forget all state of every model; the next packet begins a new sequence."""
         self.serving_lane = self.standby = self._unanswered = self._roles = None

@@ -32,22 +32,24 @@ class Repetition:
         """Compare a packet with the newest ones; a packet with few events says nothing."""
         if packet.events.n < MIN_EVENTS:
             return
-        sample = _hash(packet, _SAMPLE)
+        sample = hash(_bytes(packet, _SAMPLE))
         if sample not in self._samples:
             self._samples.append(sample)
             self._repeated = 0
             return
-        whole = _hash(packet, packet.events.n)
+        whole = zlib.crc32(_bytes(packet, packet.events.n))
         self._repeated = self._repeated + 1 if whole in self._whole else 0
         if whole not in self._whole:
             self._whole.append(whole)
 
 
-def _hash(packet: Packet, events: int) -> int:
-    """Hash of the first events of a packet, with times relative to its begin, and of their number in all."""
-    part = packet.events.span(0, events)
-    columns = part.columns() if isinstance(part, WireEvents) else part
-    found = packet.events.n
-    for column in (columns.t - packet.t0_us, columns.x, columns.y, columns.p):
-        found = zlib.crc32(column.tobytes(), found)
-    return found
+def _bytes(packet: Packet, events: int) -> bytes:
+    """The first events of a packet, with times relative to its begin, and the number of all."""
+    found = packet.events
+    count = found.n.to_bytes(4, "little")
+    if isinstance(found, WireEvents):
+        if events < found.n:
+            return count + found.blob[: events * (4 if found.wide else 2)].tobytes()  # times are enough
+        return count + found.blob.tobytes()
+    part = found.span(0, events)
+    return count + b"".join(column.tobytes() for column in (part.t - packet.t0_us, part.x, part.y, part.p))

@@ -69,8 +69,8 @@ class Stream:
         if packet.stream != self.name:
             raise InvalidField("event packet", "stream", packet.stream, f"received on the key of stream {self.name!r}")
         activity, intake = self.activity, self._intake
-        activity.add("packets_received", 1)
-        activity.add("events_received", packet.events.n)
+        self.counters.packets_received += 1
+        self.counters.events_received += packet.events.n
         activity.heard(arrival.received_ns)
         activity.taken_ns = arrival.queued_ns
         order = intake.order(packet, arrival.received_ns)
@@ -87,8 +87,8 @@ class Stream:
         elif self._is_too_late(packet):
             activity.lost("out_of_order_packets", 1)
             return []
-        pushing = self._push(packet)
-        activity.add("outside_events", pushing.outside_events)
+        pushing = self._push(self._intake.without_shed_events(packet, self.lanes.open_us))
+        self.counters.outside_events += pushing.outside_events
         if pushing.late_events:
             activity.lost("late_events", pushing.late_events)
         if pushing.skipped_windows:
@@ -131,6 +131,22 @@ class Stream:
         self._intake.skip(packets, Flag.OVERLOAD)
         self.activity.lost("overload_packets", packets)
 
+    def shed(self, packets: int, start_us: int) -> None:
+        """Leave out all windows before `start_us`, because this node cannot keep up.
+
+        Args:
+            packets: whole packets of these windows that will not be accepted.
+            start_us: start of the window that the next packet belongs to; after the open window.
+        """
+        open_us, window_us = self.lanes.open_us, self.lanes.window_us
+        assert open_us is not None
+        assert window_us is not None
+        self._intake.shed(packets)
+        self.activity.lost("shed_windows", (start_us - open_us) // window_us)
+        if packets:
+            self.activity.lost("overload_packets", packets)
+        self.lanes.leave_out_until(start_us)
+
     def set_camera(self, camera: CameraInfo) -> None:
         """Use this CameraInfo from the next packet on."""
         if camera == self.camera:
@@ -143,8 +159,7 @@ class Stream:
 
     def _is_too_late(self, packet: Packet) -> bool:
         """Whether all windows of a packet that was missing are answered."""
-        lane = self.lanes.serving_lane
-        open_us = lane.next_us if lane is not None else None
+        open_us = self.lanes.open_us
         return open_us is not None and newest_us(packet) < open_us
 
     def _restart(self) -> None:

@@ -17,13 +17,8 @@ def sample(number, received_ns=0, size=0):
 
 
 def drain(inbox):
-    taken, dropped = [], 0
-    while True:
-        one, lost = inbox.take(0)
-        dropped += lost
-        if one is None:
-            return taken, dropped
-        taken.append(one.payload[0])
+    samples, dropped = inbox.take_all(0)
+    return [one.payload[0] for one in samples], dropped
 
 
 def test_an_inbox_keeps_the_order_and_loses_nothing_within_its_bounds():
