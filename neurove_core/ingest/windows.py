@@ -69,6 +69,9 @@ def push(
         the windows that end at or before the newest known time, oldest first, and the next state.
     """
     duration = config.duration_us
+    after = _inside(events, horizon_us, state, lut, config)
+    if after is not None:
+        return Pushed([], after, 0, 0)
     first_us, newest_us = horizon_us, horizon_us
     if events.n:
         first_us, newest_us = min(first_us, events.first_us), max(newest_us, events.last_us)
@@ -95,6 +98,22 @@ def push(
         open_window = _Open(end_us, WindowsState(), config, canonical)
     open_window.add(events, lut)
     return Pushed(windows, open_window.state(newest_us), late, skipped)
+
+
+def _inside(
+    events: Events | WireEvents, horizon_us: int, state: WindowsState, lut: NDArray[np.int32], config: WindowConfig
+) -> WindowsState | None:
+    """The state after events that all belong to the open window, as most small packets do; None for other events."""
+    start_us, counts = state.start_us, state.counts
+    if counts is None or start_us is None or not events.n:
+        return None
+    newest_us = max(events.last_us, horizon_us)
+    if newest_us >= start_us + config.duration_us or events.first_us < start_us:
+        return None
+    where = start_us, config.bin_us, lut, counts
+    outside = count_wire(events, *where) if isinstance(events, WireEvents) else count_events(events, *where)
+    horizon_us = max(newest_us, state.horizon_us)
+    return WindowsState(start_us, horizon_us, counts, state.events + events.n, state.outside + outside, state.bridged)
 
 
 class _Open:

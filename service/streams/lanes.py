@@ -130,6 +130,8 @@ class Lanes:
         assert lane is not None, "call assign first"
         pushed = self._unanswered or lane.estimator.to_windows(packet.events, lane.state, packet.t0_us)
         lane.state = lane.state._replace(windows=pushed.state)
+        if standby is None and not pushed.windows:
+            return Pushing([], lane.serving, pushed.late_events, 0, pushed.skipped_windows)
         try:
             answers = lane.follow(pushed.windows, checked=standby is not None)
         except Exception as error:

@@ -172,7 +172,7 @@ class Stream:
 
     def _restart_if_changed(self, packet: Packet) -> None:
         """Restart if the packet comes from another sensor or another clock than the previous one."""
-        if self.sensor != packet.sensor:
+        if self.sensor is not packet.sensor and self.sensor != packet.sensor:
             if self.sensor is not None:
                 log.warning("sensor changed", stream=self.name, before=str(self.sensor), now=str(packet.sensor))
                 self._flags.set_next(Flag.SENSOR_CHANGED)
