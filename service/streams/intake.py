@@ -81,15 +81,24 @@ class Intake:
             log.info("driver restarted", stream=self._stream, seq=packet.seq)
         return order
 
-    def is_stale(self, packet: Packet, arrival: Arrival) -> bool:
-        """Learn from the times of a packet that is in order; whether it is too old to be processed."""
+    @property
+    def expected(self) -> int | None:
+        """Number of the next packet; None before the first one."""
+        return self._sequence.expected
+
+    def advance_run(self, marks: list[tuple[int, int]], received_ns: int) -> None:
+        """Accept packets that are all the expected ones, see Sequence.advance_run."""
+        self._sequence.advance_run(marks, received_ns)
+
+    def is_stale(self, packet: Packet, arrival: Arrival, packets: int = 1) -> bool:
+        """Learn from the times of a packet, or a run of packets, in order; whether it is too old to be processed."""
         self._delay_ns = self.ages.learn(
             newest_us(packet) if arrival.sent_us is None else arrival.sent_us, arrival.received_ns
         )
         if self._delay_ns + arrival.queued_ns - arrival.received_ns <= self._max_age_ns:
             self._repetition.add(packet)
             return False
-        self._activity.lost("stale_packets", 1)
+        self._activity.lost("stale_packets", packets)
         self._flags.missing()
         return True
 

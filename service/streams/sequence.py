@@ -83,6 +83,23 @@ class Sequence:
         self._expect_after(packet, received_ns)
         return True
 
+    @property
+    def expected(self) -> int | None:
+        """Number of the next packet; None before the first one."""
+        return self._expected
+
+    def advance_run(self, marks: list[tuple[int, int]], received_ns: int) -> None:
+        """Accept packets that are all the expected ones.
+
+        Args:
+            marks: number and t0_us of each.
+            received_ns: when the last one arrived [ns].
+        """
+        for seq, t0_us in marks:
+            self._recent[seq % _REMEMBERED] = (seq, t0_us)
+        self._length += len(marks) - 1
+        self._accept(*marks[-1], received_ns)
+
     def place(self, packet: Packet, received_ns: int = 0) -> tuple[Order, int]:
         """The order of a packet that is not the expected one.
 
@@ -165,9 +182,13 @@ class Sequence:
         return order
 
     def _expect_after(self, packet: Packet, received_ns: int) -> None:
-        self._expected, self._unread = packet.seq + 1, 0
-        self._t0_us, self._newest_ns = packet.t0_us, received_ns
-        self._remember(packet)
+        self._accept(packet.seq, packet.t0_us, received_ns)
+
+    def _accept(self, seq: int, t0_us: int, received_ns: int) -> None:
+        self._expected, self._unread = seq + 1, 0
+        self._t0_us, self._newest_ns = t0_us, received_ns
+        self._recent[seq % _REMEMBERED] = (seq, t0_us)
+        self._length += 1
         self._repeats = None
         if self._other is not None:
             self._other.interleaved, self._other.consecutive = True, 0

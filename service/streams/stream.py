@@ -1,11 +1,11 @@
 """Stream: the state of one camera stream; packet in, estimates out. It has no sockets and no threads."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from neurove_protocol import CameraInfo, Flag, Sensor, TwistEstimate
 from neurove_protocol.errors import InvalidField
-from neurove_protocol.events import Packet
+from neurove_protocol.events import Packet, PacketLimits
 from neurove_service import logs
 from neurove_service.streams.activity import Activity
 from neurove_service.streams.age import newest_us
@@ -15,6 +15,7 @@ from neurove_service.streams.history import RingSize
 from neurove_service.streams.intake import Arrival, Intake
 from neurove_service.streams.lanes import Lanes, Pushing, ServingModelFailed
 from neurove_service.streams.model_source import ModelSource
+from neurove_service.streams.runs import Run, collect
 from neurove_service.streams.sequence import Order
 from neurove_service.streams.verdict import Verdicts
 
@@ -68,26 +69,63 @@ class Stream:
         """
         if packet.stream != self.name:
             raise InvalidField("event packet", "stream", packet.stream, f"received on the key of stream {self.name!r}")
-        activity, intake = self.activity, self._intake
-        self.counters.packets_received += 1
-        self.counters.events_received += packet.events.n
-        activity.heard(arrival.received_ns)
-        activity.taken_ns = arrival.queued_ns
-        order = intake.order(packet, arrival.received_ns)
+        self._heard(packet, arrival, 1)
+        order = self._intake.order(packet, arrival.received_ns)
         if order not in _PROCESSED:
             return []
         if order is Order.AFTER_RESTART:
             self._restart()
-            intake.ages.forget()
+            self._intake.ages.forget()
         self._restart_if_changed(packet)
-        if order is not Order.RECOVERED:  # its delay is that of a detour
-            if intake.is_stale(packet, arrival):
+        if order is Order.RECOVERED:  # its delay is that of a detour
+            if self._is_too_late(packet):
+                self.activity.lost("out_of_order_packets", 1)
                 return []
-            self._flags.close_gap(self.lanes.horizon_us, packet.t0_us)
-        elif self._is_too_late(packet):
-            activity.lost("out_of_order_packets", 1)
+        elif self._intake.is_stale(packet, arrival):
             return []
-        pushing = self._push(self._intake.without_shed_events(packet, self.lanes.open_us))
+        else:
+            self._flags.close_gap(self.lanes.horizon_us, packet.t0_us)
+        return self._process(self._intake.without_shed_events(packet, self.lanes.open_us), arrival)
+
+    def collect(self, payloads: Sequence[bytes], limits: PacketLimits) -> Run | None:
+        """The packets at the begin of some payloads that `accept_run` takes at once; None if there are none.
+
+        Args:
+            payloads: of packets, in order of arrival.
+            limits: limits of packets.
+        """
+        open_us, window_us, expected = self.lanes.open_us, self.lanes.window_us, self._intake.expected
+        if open_us is None or window_us is None or expected is None:
+            return None
+        run = collect(payloads, limits, expected, open_us + window_us)
+        if run is None or run.packet.stream != self.name or run.packet.sensor != self.sensor:
+            return None
+        return run if run.packet.t0_us >= open_us else None
+
+    def accept_run(self, run: Run, arrival: Arrival) -> list[TwistEstimate]:
+        """Process a run of packets with the results of `accept` for each.
+
+        Args:
+            run: from `collect`.
+            arrival: of its last packet.
+        """
+        packet, marks = run
+        self._heard(packet, arrival, len(marks))
+        self._intake.advance_run(marks, arrival.received_ns)
+        if self._intake.is_stale(packet, arrival, len(marks)):
+            return []
+        self._flags.close_gap(self.lanes.horizon_us, packet.t0_us)
+        return self._process(self._intake.without_shed_events(packet, self.lanes.open_us), arrival)
+
+    def _heard(self, packet: Packet, arrival: Arrival, packets: int) -> None:
+        self.counters.packets_received += packets
+        self.counters.events_received += packet.events.n
+        self.activity.heard(arrival.received_ns)
+        self.activity.taken_ns = arrival.queued_ns
+
+    def _process(self, packet: Packet, arrival: Arrival) -> list[TwistEstimate]:
+        activity = self.activity
+        pushing = self._push(packet)
         self.counters.outside_events += pushing.outside_events
         if pushing.late_events:
             activity.lost("late_events", pushing.late_events)
@@ -120,9 +158,9 @@ class Stream:
         self.activity.add("refused_cameras", 1)
         self.activity.refusal = why
 
-    def failed(self) -> None:
-        """Count a packet that an internal error lost, and restart: the state may be half updated."""
-        self.activity.lost("failed_packets", 1)
+    def failed(self, packets: int = 1) -> None:
+        """Count packets that an internal error lost, and restart: the state may be half updated."""
+        self.activity.lost("failed_packets", packets)
         self._restart()
         self._flags.missing()
 

@@ -1,5 +1,6 @@
 """The queue and the thread of one stream: bytes in from Zenoh's thread, estimates out."""
 
+import itertools
 import threading
 import time
 from collections import deque
@@ -14,6 +15,7 @@ from neurove_protocol.velocity import TwistEstimate
 from neurove_service import logs
 from neurove_service.streams.intake import Arrival
 from neurove_service.streams.overload import Overload, Reached
+from neurove_service.streams.runs import MAX_RUN, SMALL_BYTES
 from neurove_service.streams.stream import Stream
 
 log = logs.get(__name__)
@@ -170,7 +172,29 @@ class StreamWorker:
         if self._overload.must_shed(now_ns - self._pending[0].received_ns, now_ns):
             self._take(0)
             self._shed()
-        self._work(self._pending.popleft(), now_ns, outlet)
+        if len(self._pending) == 1 or not self._work_run(now_ns, outlet):
+            self._work(self._pending.popleft(), now_ns, outlet)
+
+    def _work_run(self, now_ns: int, outlet: Outlet) -> bool:
+        """Process the small packets at the begin of the queue at once; whether there are any."""
+        first = self._pending[0]
+        if first.is_camera or len(first.payload) > SMALL_BYTES:
+            return False
+        alike = itertools.takewhile(
+            lambda one: not one.is_camera and (one.sent_us is None) == (first.sent_us is None), self._pending
+        )
+        run = self.stream.collect([one.payload for one in itertools.islice(alike, MAX_RUN)], self._limits)
+        if run is None:
+            return False
+        packets = [self._pending.popleft() for _ in run.marks]
+        arrival = Arrival(packets[-1].received_ns, now_ns, packets[-1].sent_us)
+        try:
+            for estimate in self.stream.accept_run(run, arrival):
+                self._publish(estimate, outlet)
+        except Exception:  # as for a single packet
+            self.stream.failed(len(packets))
+            log.exception("packets failed", stream=self.stream.name, packets=len(packets))
+        return True
 
     def _shed(self) -> None:
         """Leave out all windows before the newest one whose events have all arrived."""
