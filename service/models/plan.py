@@ -70,6 +70,7 @@ class SharedPlan:
         self.rollbacks = 0  # automatic ones
         self.rolled_back: Serving | None = None  # the newest model that was rolled back
         self.condition = threading.Condition()  # notified at each new plan
+        self.passed: set[str] = set()  # digests of the models that need no probation any more
         self.closing = threading.Event()
         self._one_change = threading.Lock()
         self._streams: weakref.WeakSet[StreamView] = weakref.WeakSet()

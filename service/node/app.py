@@ -78,6 +78,7 @@ class Service:
             on_changed=self._save_active,
             pushed=self._store.files,
             kept=self._last_active(),
+            trained_only=bool(config.trusted_keys),
         )
 
     def run(self) -> None:
