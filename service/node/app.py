@@ -50,6 +50,8 @@ def _stream_settings(config: ServiceConfig) -> StreamSettings:
         queue_bytes=config.queue_mib << 20,
         ring=RingSize(config.ring_windows, config.ring_mib << 20),
         limits=config.limits,
+        node=config.node,
+        max_age_s=config.max_age_s,
     )
 
 

@@ -33,6 +33,8 @@ class StreamSettings(NamedTuple):
     queue_bytes: int
     ring: RingSize
     limits: PacketLimits
+    node: str | None = None
+    max_age_s: float = 1.0
 
 
 class StreamRegistry:
@@ -120,7 +122,7 @@ class StreamRegistry:
             return None
         settings = self._settings
         worker = StreamWorker(
-            Stream(name, self._models, ring=settings.ring),
+            Stream(name, self._models, ring=settings.ring, node=settings.node, max_age_s=settings.max_age_s),
             lambda: self._open_outlet(name),
             Inbox(settings.queue_s, settings.queue_bytes),
             settings.limits,

@@ -12,7 +12,8 @@ from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.events import PacketLimits
 from neurove_protocol.velocity import TwistEstimate
 from neurove_service import logs
-from neurove_service.streams.stream import Arrival, Stream
+from neurove_service.streams.intake import Arrival
+from neurove_service.streams.stream import Stream
 
 log = logs.get(__name__)
 
@@ -173,7 +174,7 @@ class StreamWorker:
             for estimate in self.stream.accept(packet, arrival):
                 self._publish(estimate, outlet)
         except NeuroVEError as error:
-            total = self.stream.refused(sample.received_ns)
+            total = self.stream.refused(sample.received_ns, error.message)
             if total & (total - 1) == 0:  # log the 1st, 2nd, 4th, 8th, ...: packets are only counted
                 log.warning("packet refused", stream=self.stream.name, why=error.message, total=total)
         except Exception:  # an internal error on one packet must not end the stream
@@ -191,6 +192,7 @@ class StreamWorker:
             camera = get()
         except NeuroVEError as error:
             log.warning("camera info refused", stream=self.stream.name, why=error.message)
+            self.stream.refused_camera(error.message)
             return
         if camera is not None:
             self.stream.set_camera(camera)

@@ -1,9 +1,12 @@
+import time
+
 import pytest
 
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.models import bundle
 from neurove_service.models.change import Rules
 from neurove_service.models.slot import ModelSlot
+from neurove_service.streams.intake import Arrival
 
 SMALL = ModelConfig(
     canonical=CanonicalConfig(width=24, height=16),
@@ -26,3 +29,9 @@ def slot(models_dir):
     slot = ModelSlot("one", models_dir, Rules(probation_s=0.2))
     yield slot
     slot.close()
+
+
+def arrived():
+    """A packet that arrived now and did not wait."""
+    now_ns = time.monotonic_ns()
+    return Arrival(now_ns, now_ns)

@@ -14,8 +14,9 @@ from neurove_protocol.errors import Diverged
 from neurove_service.models.change import Rules
 from neurove_service.models.slot import ModelSlot
 from neurove_service.streams.history import RingSize
+from neurove_service.streams.intake import Arrival
 from neurove_service.streams.lane import windows_to_prime
-from neurove_service.streams.stream import Arrival, Stream
+from neurove_service.streams.stream import Stream
 from tests.builders import make_packets
 from tests.service.conftest import SMALL
 from tests.service.models.test_swap import LAX, feed, motion, wait_until

@@ -14,9 +14,9 @@ from neurove_protocol.errors import Conflict, Diverged, InvalidField, NoMemory, 
 from neurove_service.models.change import Rules
 from neurove_service.models.slot import ModelSlot
 from neurove_service.streams.comparison import TrialLimits
-from neurove_service.streams.stream import Arrival, Stream
+from neurove_service.streams.stream import Stream
 from tests.builders import make_packets
-from tests.service.conftest import SMALL
+from tests.service.conftest import SMALL, arrived
 
 WINDOW_US = 50_000
 LAX = TrialLimits(divergence=1e9, rate_ratio=1e9, latency_share=1e9)
@@ -60,7 +60,7 @@ def slots(folder):
 def feed(stream, packets):
     estimates = []
     for packet in packets:
-        estimates += stream.accept(packet, Arrival(1, 2))
+        estimates += stream.accept(packet, arrived())
         while packet.seq % 40 and stream.lanes.has_backlog:  # now and then the standby model lags
             stream.lanes.run_standby()
     return estimates
@@ -319,7 +319,7 @@ def test_a_shadow_that_the_node_has_no_time_for_stops_and_the_stream_continues(s
     change = threading.Thread(target=activate)
     change.start()
     wait_until(lambda: slot.plan.phase == "shadow")
-    estimates = [one for packet in packets[50:] for one in stream.accept(packet, Arrival(1, 2))]  # never a pause
+    estimates = [one for packet in packets[50:] for one in stream.accept(packet, arrived())]  # never a pause
     change.join()
     assert "fell behind" in result[0].message
     assert [one.start_us for one in estimates] == list(range(estimates[0].start_us, estimates[-1].end_us, WINDOW_US))

@@ -1,5 +1,6 @@
 import hashlib
 import threading
+from dataclasses import replace
 
 import pytest
 
@@ -33,7 +34,8 @@ from neurove_service.models.slot import ModelSlot
 from neurove_service.models.store import ModelStore
 from neurove_service.node.handlers import Handlers
 from neurove_service.node.health import stream_status
-from neurove_service.streams.stream import Arrival, Stream
+from neurove_service.streams.intake import Arrival
+from neurove_service.streams.stream import Stream
 from tests.builders import make_packets
 from tests.service.conftest import SMALL
 
@@ -56,7 +58,8 @@ def handlers(slot, stream, clock):
 
 
 def feed(stream, clock, packets):
-    for packet in packets:
+    for packet in packets:  # of a source whose own clock does not run
+        packet = replace(packet, sent_us=clock[0] // 1000)
         for estimate in stream.accept(packet, Arrival(clock[0], clock[0])):
             stream.activity.published(estimate)
 
