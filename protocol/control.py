@@ -40,6 +40,7 @@ class Request(Message):
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 
+
 class HealthRequest(Request):
     """Query the health of a node."""
 

@@ -16,6 +16,7 @@ from neurove_service.models.slot import ModelSlot
 from neurove_service.streams.comparison import TrialLimits
 from neurove_service.streams.stream import Stream
 from tests.builders import make_packets
+from tests.bundles import proven
 from tests.service.conftest import SMALL, arrived
 
 WINDOW_US = 50_000
@@ -26,10 +27,13 @@ LAX = TrialLimits(divergence=1e9, rate_ratio=1e9, latency_share=1e9)
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("swap")
     for seed, name in ((1, "one"), (2, "two"), (3, "three")):
-        bundle.save(bundle.untrained(seed, SMALL, name), folder / f"{name}.safetensors")
+        bundle.save(proven(bundle.untrained(seed, SMALL, name)), folder / f"{name}.safetensors")
     one = bundle.load(folder / "one.safetensors")
-    bundle.save(replace(one, name="similar", offset=torch.full((6,), 1e-4)), folder / "similar.safetensors")
-    bundle.save(replace(one, name="wild", scale=torch.full((6,), 1e4)), folder / "wild.safetensors")
+    plain = replace(one, golden=None)  # the golden test is that of other scales
+    bundle.save(replace(plain, name="similar", offset=torch.full((6,), 1e-4)), folder / "similar.safetensors")
+    bundle.save(replace(plain, name="wild", scale=torch.full((6,), 50.0)), folder / "wild.safetensors")
+    bundle.save(replace(plain, name="absurd", scale=torch.full((6,), 1e4)), folder / "absurd.safetensors")
+    bundle.save(bundle.untrained(7, SMALL, "random"), folder / "random.safetensors")
     short = SMALL.model_copy(update={"window": WindowConfig(duration_us=20_000, bins=5)})
     bundle.save(bundle.untrained(4, short, "short"), folder / "short.safetensors")
     wide = SMALL.model_copy(update={"canonical": SMALL.canonical.model_copy(update={"width": 30})})
