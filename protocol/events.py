@@ -5,9 +5,8 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, NamedTuple, cast
+from typing import Annotated, Any, ClassVar, NamedTuple
 
-import msgpack
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
@@ -199,7 +198,6 @@ class EventPacket:
     sensor: Sensor
     t0_us: int  # sensor clock; no event of this packet is earlier
     events: Events
-    sent_us: int | None = None  # clock of the driver's host at sending [us]; see README.md of this package
 
 
 class WirePacket(NamedTuple):
@@ -210,7 +208,6 @@ class WirePacket(NamedTuple):
     sensor: Sensor
     t0_us: int
     events: WireEvents
-    sent_us: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,7 +236,6 @@ class _Header(Message):
     width: Annotated[int, Field(ge=1)]
     height: Annotated[int, Field(ge=1)]
     t0_us: Annotated[int, Field(ge=-(1 << 62), lt=1 << 62)]
-    sent_us: Annotated[int, Field(ge=-(1 << 62), lt=1 << 62)] | None = None
     n: Count
     format: str
     data: bytes
@@ -279,15 +275,11 @@ def encode_packet(packet: EventPacket, blob_format: str | None = None) -> bytes:
         "width": packet.sensor.width,
         "height": packet.sensor.height,
         "t0_us": packet.t0_us,
-        "sent_us": packet.sent_us,
         "n": packet.events.n,
         "format": blob_format,
         "data": blob,
     }
-    fields = validate(_Header, header).model_dump()
-    if packet.sent_us is None:
-        del fields["sent_us"]
-    return cast(bytes, msgpack.packb(fields))
+    return validate(_Header, header).encode()
 
 
 def decode_packet(data: bytes, limits: PacketLimits = DEFAULT_LIMITS) -> EventPacket:
@@ -300,7 +292,7 @@ def decode_packet(data: bytes, limits: PacketLimits = DEFAULT_LIMITS) -> EventPa
     packet = open_packet(data, limits)
     events = packet.events.columns()
     check_events(events, packet.sensor)
-    return EventPacket(packet.stream, packet.seq, packet.sensor, packet.t0_us, events, packet.sent_us)
+    return EventPacket(packet.stream, packet.seq, packet.sensor, packet.t0_us, events)
 
 
 def open_packet(data: bytes, limits: PacketLimits = DEFAULT_LIMITS) -> WirePacket:
@@ -324,5 +316,4 @@ def open_packet(data: bytes, limits: PacketLimits = DEFAULT_LIMITS) -> WirePacke
     if len(header.data) != header.n * record_bytes:
         raise BlobLength(len(header.data), header.n, record_bytes)
     events = WireEvents(header.t0_us, np.frombuffer(header.data, np.uint8), wide, 0, header.n)
-    sensor = Sensor(header.width, header.height)
-    return WirePacket(header.stream, header.seq, sensor, header.t0_us, events, header.sent_us)
+    return WirePacket(header.stream, header.seq, Sensor(header.width, header.height), header.t0_us, events)

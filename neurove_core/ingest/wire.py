@@ -37,8 +37,7 @@ def read_packet(data: bytes, limits: PacketLimits = DEFAULT_LIMITS) -> WirePacke
         stream = data[found.name : found.name_end].decode("ascii", "replace")
         if found.blob and is_name(stream):
             events = WireEvents(found.t0_us, raw[found.blob :], found.wide, 0, found.n)
-            sent_us = found.sent_us if found.timed else None
-            return WirePacket(stream, found.seq, _sensor(found.width, found.height), found.t0_us, events, sent_us)
+            return WirePacket(stream, found.seq, _sensor(found.width, found.height), found.t0_us, events)
     packet = open_packet(data, limits)
     if not _valid(packet.events.blob, packet.events.wide, packet.sensor.width, packet.sensor.height):
         decode_packet(data, limits)  # raises an error that names the wrong event
@@ -79,17 +78,15 @@ class _Found(NamedTuple):
     t0_us: int = 0
     n: int = 0
     wide: bool = False
-    timed: bool = False  # whether the packet has the field sent_us
-    sent_us: int = 0
 
 
 def _key(text: bytes) -> NDArray[np.uint8]:
     return np.frombuffer(text, np.uint8)
 
 
-_TO_STREAM, _TO_SEQ, _TO_WIDTH, _TO_HEIGHT, _TO_T0, _TO_SENT, _TO_N, _TO_FORMAT, _TO_DATA = (
-    _key(b"\xa1v\x01\xa6stream"),  # version 1
-    *(_key(bytes([160 + len(name)]) + name) for name in (b"seq", b"width", b"height", b"t0_us", b"sent_us", b"n")),
+_TO_STREAM, _TO_SEQ, _TO_WIDTH, _TO_HEIGHT, _TO_T0, _TO_N, _TO_FORMAT, _TO_DATA = (
+    _key(bytes([128 + 9]) + b"\xa1v\x01\xa6stream"),  # a map of nine, version 1
+    *(_key(bytes([160 + len(name)]) + name) for name in (b"seq", b"width", b"height", b"t0_us", b"n")),
     _key(b"\xa6format\xa4soa"),
     _key(b"\xa4data"),
 )
@@ -98,9 +95,8 @@ _TO_STREAM, _TO_SEQ, _TO_WIDTH, _TO_HEIGHT, _TO_T0, _TO_SENT, _TO_N, _TO_FORMAT,
 @compiled
 def _read(data: NDArray[np.uint8], max_events: int, max_side: int) -> _Found:  # pragma: no cover (machine code)
     """Read a valid packet with the field order of our encoder; any other packet is left to the reference reader."""
-    nothing = _Found(0, 0, 0, 0, 0, 0, 0, 0, False, False, 0)
-    timed = data.size > 0 and data[0] == _MAP_OF_TEN
-    name = _past(data, 1, _TO_STREAM) if timed or (data.size > 0 and data[0] == _MAP_OF_NINE) else -1
+    nothing = _Found(0, 0, 0, 0, 0, 0, 0, 0, False)
+    name = _past(data, 0, _TO_STREAM)
     if name < 0 or not 160 < data[name] < 192:
         return nothing
     name_end = name + 1 + data[name] - 160
@@ -108,11 +104,6 @@ def _read(data: NDArray[np.uint8], max_events: int, max_side: int) -> _Found:  #
     width, at = _integer(data, _past(data, at, _TO_WIDTH))
     height, at = _integer(data, _past(data, at, _TO_HEIGHT))
     t0_us, at = _integer(data, _past(data, at, _TO_T0))
-    sent_us: Any = np.int64(0)
-    sent_good = True
-    if timed:
-        sent_us, at = _integer(data, _past(data, at, _TO_SENT))
-        sent_good = -(1 << 62) <= sent_us < 1 << 62
     n, at = _integer(data, _past(data, at, _TO_N))
     at = _past(data, at, _TO_FORMAT)
     if at < 0 or (data[at] != _SIX and data[at] != _EIGHT):
@@ -123,12 +114,11 @@ def _read(data: NDArray[np.uint8], max_events: int, max_side: int) -> _Found:  #
     most = min(max_side, 1 << 15)
     good = seq >= 0 and 1 <= width <= most and 1 <= height <= most and 0 <= n <= max_events
     good = good and -(1 << 62) <= t0_us < 1 << 62 and size == n * (8 if wide else 6) and size == data.size - blob
-    if blob < 0 or not good or not sent_good or not _valid(data[blob:], wide, width, height):
+    if blob < 0 or not good or not _valid(data[blob:], wide, width, height):
         return nothing
-    return _Found(blob, name + 1, name_end, seq, width, height, t0_us, n, wide, timed, sent_us)
+    return _Found(blob, name + 1, name_end, seq, width, height, t0_us, n, wide)
 
 
-_MAP_OF_NINE, _MAP_OF_TEN = 128 + 9, 128 + 10
 _SIX, _EIGHT = ord("6"), ord("8")
 
 

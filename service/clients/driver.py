@@ -117,7 +117,7 @@ class Driver:
 
     def _send(self, seq: int, piece: Slice) -> None:
         packet = EventPacket(self._stream, seq, self._recording.sensor, piece.t0_us, piece.events)
-        self._publisher.put(encode_packet(packet))
+        self._publisher.put(encode_packet(packet), sent_us=time.monotonic_ns() // 1000)
 
 
 def _stopped(stop: threading.Event, due: float) -> bool:

@@ -24,7 +24,7 @@ from neurove_service.streams.comparison import TrialLimits
 from neurove_service.streams.history import RingSize
 from neurove_service.streams.registry import StreamRegistry, StreamSettings
 from neurove_service.streams.worker import Outlet
-from neurove_service.transport import EndpointError, OnSample, Report, Transport, open_transport
+from neurove_service.transport import EndpointError, OnTimedSample, Report, Transport, open_transport
 
 log = logs.get(__name__)
 
@@ -133,8 +133,8 @@ class Service:
             self._active_file,
             lambda: not self._stop.is_set() and registry.alive(),
         )
-        transport.subscribe(keys.camera(), self._route(registry, registry.put_camera))
-        transport.subscribe(keys.events(), self._route(registry, registry.put_packet))
+        transport.subscribe_timed(keys.camera(), self._route(registry, registry.put_camera))
+        transport.subscribe_timed(keys.events(), self._route(registry, registry.put_packet))
         transport.answer(keys.health(node), handlers.health)
         transport.answer(keys.models(node), handlers.models)
         for key, handle in (
@@ -145,17 +145,17 @@ class Service:
             transport.answer_streaming(key, handle, after=memory.release_memory)
         transport.token(keys.alive(node))
 
-    def _route(self, registry: StreamRegistry, put: Callable[[str, bytes, int], None]) -> OnSample:
+    def _route(self, registry: StreamRegistry, put: Callable[[str, bytes, int, int | None], None]) -> OnTimedSample:
         """A subscriber's callback: queue each message in the worker of its stream."""
         stream_of = self._keys.stream_of
 
-        def on_sample(key: str, payload: bytes, received_ns: int) -> None:
+        def on_sample(key: str, payload: bytes, received_ns: int, sent_us: int | None) -> None:
             try:
                 name = stream_of(key)
             except NeuroVEError:  # not a valid name
                 registry.refuse(key)
                 return
-            put(name, payload, received_ns)
+            put(name, payload, received_ns, sent_us)
 
         return on_sample
 

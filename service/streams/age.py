@@ -21,7 +21,7 @@ class Ages:
     The offset is that of the quickest packet, because a packet cannot arrive before its events happened. It grows by no
     more than the drift of two crystals, so a delay that grows is seen as age. A delay that all packets share is not
     seen.
-    The clock of a stream is that of the sensor, or `sent_us` where the driver gives it.
+    The clock of a stream is that of the sensor, or the driver's time of sending where it is given.
 
     A source may also pause together with its clock, as a player does. Then the packets after the silence look old, but
     they do not arrive faster than they were made. After PAUSE_NS the offset is learned anew.
@@ -43,9 +43,13 @@ class Ages:
         self._offset_ns = self._resumed = None
         self._delays_ns.clear()
 
-    def learn(self, packet: Packet, received_ns: int) -> int:
-        """The delay of a packet beyond the quickest one, from its newest event to its arrival [ns]."""
-        clock_us = packet.sent_us if packet.sent_us is not None else newest_us(packet)
+    def learn(self, clock_us: int, received_ns: int) -> int:
+        """The delay of a packet beyond the quickest one [ns].
+
+        Args:
+            clock_us: clock of the stream at the newest event of the packet, or when it was sent [us].
+            received_ns: when it arrived [ns].
+        """
         offset_ns = received_ns - clock_us * 1000
         drifted_ns = offset_ns
         silent = self._offset_ns is not None and received_ns - self._learned_ns > PAUSE_NS

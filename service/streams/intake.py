@@ -6,7 +6,7 @@ from neurove_protocol import Flag
 from neurove_protocol.events import Packet
 from neurove_service import logs
 from neurove_service.streams.activity import Activity
-from neurove_service.streams.age import Ages
+from neurove_service.streams.age import Ages, newest_us
 from neurove_service.streams.flags import Flags
 from neurove_service.streams.repetition import Repetition
 from neurove_service.streams.sequence import Order, Sequence
@@ -25,6 +25,7 @@ class Arrival(NamedTuple):
 
     received_ns: int
     queued_ns: int  # when it was taken out of the queue
+    sent_us: int | None = None  # when the driver sent it, on a clock of its host; None if the driver does not say
 
 
 class Intake:
@@ -79,7 +80,9 @@ class Intake:
 
     def is_stale(self, packet: Packet, arrival: Arrival) -> bool:
         """Learn from the times of a packet that is in order; whether it is too old to be processed."""
-        self._delay_ns = self.ages.learn(packet, arrival.received_ns)
+        self._delay_ns = self.ages.learn(
+            newest_us(packet) if arrival.sent_us is None else arrival.sent_us, arrival.received_ns
+        )
         if self._delay_ns + arrival.queued_ns - arrival.received_ns <= self._max_age_ns:
             self._repetition.add(packet)
             return False

@@ -54,14 +54,14 @@ class StreamRegistry:
         self._lock = threading.Lock()  # of both dicts; only its worker changes a stream
         self._closed = False
 
-    def put_packet(self, stream: str, payload: bytes, received_ns: int) -> None:
+    def put_packet(self, stream: str, payload: bytes, received_ns: int, sent_us: int | None = None) -> None:
         """Queue an event packet, on Zenoh's thread: this finds or starts a worker and appends, nothing else."""
         with self._lock:
             worker = self._worker_of(stream)
             if worker is not None:
-                worker.put_packet(payload, received_ns)
+                worker.put_packet(payload, received_ns, sent_us)
 
-    def put_camera(self, stream: str, payload: bytes, received_ns: int) -> None:
+    def put_camera(self, stream: str, payload: bytes, received_ns: int, _sent_us: int | None = None) -> None:
         """Queue a CameraInfo, as put_packet."""
         with self._lock:
             worker = self._worker_of(stream)

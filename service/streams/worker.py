@@ -29,6 +29,7 @@ class Sample(NamedTuple):
     payload: bytes
     received_ns: int
     is_camera: bool
+    sent_us: int | None = None  # as in Arrival
 
     @property
     def size(self) -> int:
@@ -118,9 +119,9 @@ class StreamWorker:
         self._thread = threading.Thread(target=self._run, name=f"stream {stream.name}", daemon=True)
         self._thread.start()
 
-    def put_packet(self, payload: bytes, received_ns: int) -> None:
+    def put_packet(self, payload: bytes, received_ns: int, sent_us: int | None = None) -> None:
         """Queue an event packet."""
-        self._inbox.put(Sample(payload, received_ns, is_camera=False))
+        self._inbox.put(Sample(payload, received_ns, is_camera=False, sent_us=sent_us))
 
     def put_camera(self, payload: bytes, received_ns: int) -> None:
         """Queue a CameraInfo."""
@@ -169,7 +170,7 @@ class StreamWorker:
             self._set_camera(lambda: CameraInfo.decode(sample.payload))
             return
         try:
-            arrival = Arrival(sample.received_ns, time.monotonic_ns())
+            arrival = Arrival(sample.received_ns, time.monotonic_ns(), sample.sent_us)
             packet = read_packet(sample.payload, self._limits)
             for estimate in self.stream.accept(packet, arrival):
                 self._publish(estimate, outlet)

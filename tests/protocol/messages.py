@@ -232,7 +232,7 @@ MODELS: tuple[type[Message], ...] = (
     RollbackRequest,
     ErrorReply,
 )
-EVENT_PACKET = Kind("EventPacket", decode_packet, encode_packet, strict=False, optional=frozenset({"sent_us"}))
+EVENT_PACKET = Kind("EventPacket", decode_packet, encode_packet, strict=False, optional=frozenset())
 KINDS = (EVENT_PACKET, *map(_kind, MODELS))
 BY_NAME = {kind.name: kind for kind in KINDS}
 
@@ -450,8 +450,7 @@ def packets(draw: st.DrawFn, max_events: int = 40, max_span_us: int = 2**32 - 1)
     )
     t, x, y, p = zip(*sorted(rows), strict=True) if rows else ((), (), (), ())
     events = Events.from_columns([t0_us + offset for offset in t], x, y, p)
-    sent_us = draw(st.none() | st.integers(-(2**62), 2**62 - 1))
-    return EventPacket(draw(names), draw(counts), sensor, t0_us, events, sent_us)
+    return EventPacket(draw(names), draw(counts), sensor, t0_us, events)
 
 
 def same(left: object, right: object) -> bool:
@@ -469,8 +468,7 @@ def same(left: object, right: object) -> bool:
 
 def assert_same_packet(left: EventPacket, right: EventPacket) -> None:
     """Bit for bit: all columns, their types, and everything in the header."""
-    for name in ("stream", "seq", "sensor", "t0_us", "sent_us"):
-        assert getattr(left, name) == getattr(right, name), name
+    assert (left.stream, left.seq, left.sensor, left.t0_us) == (right.stream, right.seq, right.sensor, right.t0_us)
     assert_same_events(left.events, right.events)
 
 

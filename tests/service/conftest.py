@@ -33,6 +33,6 @@ def slot(models_dir):
 
 
 def arrived():
-    """A packet that arrived now and did not wait."""
+    """A packet of a replay that arrived now and did not wait."""
     now_ns = time.monotonic_ns()
-    return Arrival(now_ns, now_ns)
+    return Arrival(now_ns, now_ns, now_ns // 1000)

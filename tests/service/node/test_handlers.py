@@ -1,6 +1,5 @@
 import hashlib
 import threading
-from dataclasses import replace
 
 import pytest
 
@@ -59,8 +58,7 @@ def handlers(slot, stream, clock):
 
 def feed(stream, clock, packets):
     for packet in packets:  # of a source whose own clock does not run
-        packet = replace(packet, sent_us=clock[0] // 1000)
-        for estimate in stream.accept(packet, Arrival(clock[0], clock[0])):
+        for estimate in stream.accept(packet, Arrival(clock[0], clock[0], clock[0] // 1000)):
             stream.activity.published(estimate)
 
 

@@ -1,19 +1,14 @@
-from dataclasses import replace
-
 import pytest
 
 from neurove_service.streams.age import Ages
-from tests.builders import make_packet
 
 MS = 1_000_000
 S = 1000 * MS
 
 
 def delays(ages, times_ms):
-    """The delay of each packet [ms], from (time of its tick, arrival) [ms]."""
-    return [
-        round(ages.learn(make_packet(0, t0_us=1000 * sensor), int(arrival * MS)) / MS) for sensor, arrival in times_ms
-    ]
+    """The delay of each packet [ms], from (clock of the stream, arrival) [ms]."""
+    return [round(ages.learn(1000 * sensor, int(arrival * MS)) / MS) for sensor, arrival in times_ms]
 
 
 def test_the_quickest_packet_has_no_delay_and_a_slower_one_has_the_difference():
@@ -43,15 +38,6 @@ def test_a_source_that_pauses_with_its_clock_is_fresh_again_after_a_second():
     found = delays(Ages(), times)
     assert min(found[50:100]) >= 5998
     assert set(found[101:]) == {0}
-
-
-def test_the_clock_of_the_host_of_a_driver_counts_where_it_is_given():
-    ages = Ages()
-    found = [
-        ages.learn(replace(make_packet(0, t0_us=20_000 * i), sent_us=200_000 * i), 5 * S + 200 * MS * i)
-        for i in range(100)
-    ]
-    assert set(found) == {0}
 
 
 def test_the_uncertainty_is_the_usual_delay():

@@ -326,8 +326,7 @@ def test_a_replay_that_is_slower_than_real_time_is_not_old(slot):
     stream = Stream("cam0", slot, max_age_s=0.5)
     for packet in make_packets(200):
         now_us = 10 * packet.t0_us + 1_000_000
-        feed_at = Arrival(1000 * (now_us + 50), 1000 * (now_us + 50))
-        stream.accept(replace(packet, sent_us=now_us), feed_at)
+        stream.accept(packet, Arrival(1000 * (now_us + 50), 1000 * (now_us + 50), now_us))
     assert stream.counters.losses().nonzero() == {}
 
 
