@@ -415,7 +415,7 @@ ANY: dict[str, st.SearchStrategy[Fields]] = {
             "expect": st.none() | prefixes,
             "shadow_s": st.floats(0, 3600),
             "canary": st.lists(names, max_size=3),
-            "force": sentences.filter(bool).map(lambda text: text[:200]),
+            "force": st.none() | sentences.filter(bool).map(lambda text: text[:200]),
         }
     ),
     "RollbackRequest": st.fixed_dictionaries({"expect": st.none() | prefixes}),

@@ -47,6 +47,7 @@ NULLABLE = {
     ("ModelsReply", "previous"),
     ("PushRequest", "signature"),
     ("ActivateRequest", "expect"),
+    ("ActivateRequest", "force"),
     ("RollbackRequest", "expect"),
 }
 FREE_MAPS = ("details", "unreadable", "figures", "partial")
