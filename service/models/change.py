@@ -17,7 +17,7 @@ from neurove_service import logs
 from neurove_service.models import admission, swap
 from neurove_service.models.library import MIN_DIGEST, Library
 from neurove_service.models.plan import Plan, SharedPlan
-from neurove_service.models.probation import Probation
+from neurove_service.models.probation import OnTrial, Probation, no_trial
 from neurove_service.models.progress import OnProgress, Progress, Step
 from neurove_service.models.record import Judgement, check_trained, judgement
 from neurove_service.streams.comparison import TrialLimits
@@ -46,6 +46,7 @@ class Context(NamedTuple):
     on_changed: Callable[[Bundle], None]
     free_bytes: Callable[[], int | None]
     trained_only: bool = False  # untrained models are refused
+    on_trial: OnTrial = no_trial
 
 
 class Change:
@@ -57,7 +58,8 @@ class Change:
     """
 
     def __init__(self, context: Context, on_progress: OnProgress) -> None:
-        self._plan, self._library, self._rules, self._on_changed, self._free_bytes, self._trained_only = context
+        self._context = context
+        self._plan, self._library, self._rules = context.plan, context.library, context.rules
         self._on_progress = on_progress
         self._judged = Judgement()
 
@@ -70,7 +72,7 @@ class Change:
             if self._is_active(found):
                 return found, self._keep_active(found)
             _check_expected(self._plan.current, expect)
-            check_trained(found, required=self._trained_only)
+            check_trained(found, required=self._context.trained_only)
             candidate = _running_canary(self._plan.current, found, canary)
             active = self._plan.current.active.estimator.bundle
             self._judged = judgement(found, active, passed=active.digest in self._plan.passed, force=force)
@@ -84,8 +86,9 @@ class Change:
                 self._end_trial()
                 raise
             limits = self._limits(self._rules.probation, candidate)
-            probation_s = self._rules.probation_s
-            Probation(self._plan, candidate, probation_s, limits, self._on_changed, self._on_progress).start()
+            context, probation_s = self._context, self._rules.probation_s
+            calls = context.on_changed, self._on_progress, context.on_trial
+            Probation(self._plan, candidate, probation_s, limits, *calls).start()
             return before.estimator.bundle, candidate
 
     def rollback(self, expect: str | None) -> tuple[Bundle, Serving]:
@@ -105,7 +108,7 @@ class Change:
             raise NothingBefore
         removed = plan.active.estimator.bundle
         with self._reporting(previous.name):
-            check_trained(previous, required=self._trained_only)
+            check_trained(previous, required=self._context.trained_only)
             estimator = self._load(previous)
             self._plan.epoch += 1
             serving = Serving(estimator, self._plan.epoch)
@@ -117,7 +120,7 @@ class Change:
             self._plan.set(Plan(serving), f"{removed.name} was rolled back")
             self._plan.previous = None
             self._report("rolled_back", f"to {previous.name}; it was primed, because it did not run in standby")
-        self._on_changed(estimator.bundle)
+        self._context.on_changed(estimator.bundle)
         return removed, serving
 
     def _is_active(self, found: Bundle) -> bool:
@@ -159,7 +162,7 @@ class Change:
 
     def _load(self, found: Bundle) -> Estimator:
         """Load a model, warm it up, and check its memory, its golden test and its speed."""
-        admission.check_memory(found.name, admission.weight_bytes(found), self._free_bytes())
+        admission.check_memory(found.name, admission.weight_bytes(found), self._context.free_bytes())
         estimator = Estimator(found)
         self._report("loaded", f"{found.info.parameters:,} parameters")
         estimator.warm_up()

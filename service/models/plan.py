@@ -6,6 +6,7 @@ import weakref
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
+from neurove_core.estimator import Estimator
 from neurove_core.models.bundle import Bundle
 from neurove_protocol.errors import Conflict
 from neurove_service import logs
@@ -40,6 +41,11 @@ class Plan(NamedTuple):
         if self.phase == "canary":
             return Roles(self.other, self.active, probation=True)
         return Roles(self.active, self.other, probation=self.phase == "probation")
+
+    @classmethod
+    def resumed(cls, tried: Estimator, proven: Estimator) -> "Plan":
+        """A probation that goes on after a restart."""
+        return cls(Serving(tried, 0), Serving(proven, 0), phase="probation")
 
     @property
     def tried(self) -> Serving | None:

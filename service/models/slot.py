@@ -6,14 +6,15 @@ from pathlib import Path
 from neurove_core.estimator import Estimator
 from neurove_core.models.bundle import Bundle
 from neurove_protocol.control import ModelInfo
-from neurove_protocol.errors import BadModel, UnknownModel, Untrained
+from neurove_protocol.errors import Untrained
 from neurove_service import logs
-from neurove_service.models import admission
+from neurove_service.models import admission, restart
 from neurove_service.models.change import Change, Context, Rules
 from neurove_service.models.library import Available, Files, Library, nothing_pushed
 from neurove_service.models.plan import Plan, SharedPlan
+from neurove_service.models.probation import OnTrial, no_trial
 from neurove_service.models.progress import OnProgress, silent
-from neurove_service.models.record import check_trained, golden_fault
+from neurove_service.models.record import golden_fault
 from neurove_service.streams.model_source import StreamView
 from neurove_service.streams.roles import Roles, Serving
 
@@ -34,6 +35,8 @@ class ModelSlot:
         kept: digests of the last active model and the one before; if they can be loaded, they take precedence over
             `model`.
         trained_only: whether the node refuses untrained models.
+        trial: digest of the model whose probation waited for windows; it serves first, on probation.
+        on_trial: see `probation.OnTrial`.
 
     Raises:
         BadModel, UnknownModel: the first model cannot be loaded.
@@ -50,10 +53,12 @@ class ModelSlot:
         pushed: Files = nothing_pushed,
         kept: tuple[str | None, str | None] = (None, None),
         trained_only: bool = False,
+        trial: str | None = None,
+        on_trial: OnTrial = no_trial,
     ) -> None:
         library = Library(models_dir, pushed)
-        active, previous = (_kept(library, digest, trained_only) if digest else None for digest in kept)
-        estimator = Estimator(_first(library, model, active, trained_only))
+        active, previous = (restart.kept(library, digest, trained_only) if digest else None for digest in kept)
+        estimator = Estimator(restart.first(library, model, active, trained_only))
         estimator.warm_up()
         self._shared = SharedPlan(Serving(estimator, 0), previous)
         self._golden_fault = golden_fault(estimator)
@@ -63,7 +68,14 @@ class ModelSlot:
             self._shared.passed.add(estimator.bundle.digest)
         self._first = estimator
         self.closing = self._shared.closing  # set when the node stops; a probation then ends without a last step
-        self._context = Context(self._shared, library, rules, on_changed, free_bytes, trained_only)
+        self._context = Context(self._shared, library, rules, on_changed, free_bytes, trained_only, on_trial)
+        tried = restart.kept(library, trial, trained_only) if trial else None
+        if tried is not None and tried.digest != estimator.bundle.digest:
+            restart.try_again(self._shared, tried)
+
+    def resume(self) -> None:
+        """Go on with the probation that waited for windows before a restart; does nothing without one."""
+        restart.resume(self._context)
 
     @property
     def active(self) -> Serving:
@@ -191,29 +203,3 @@ class ModelSlot:
     def close(self) -> None:
         """Stop waiting in a change or a probation; no probation passes after this."""
         self._shared.close()
-
-
-def _first(library: Library, model: str, kept: Bundle | None, trained_only: bool) -> Bundle:
-    """The model that a node starts with."""
-    try:
-        configured = library.open(model)
-        check_trained(configured, required=trained_only and kept is None)
-    except (BadModel, UnknownModel) as error:
-        if kept is None:
-            raise
-        log.warning("configured model not loaded", model=model, why=error.message, serving=kept.name)
-        return kept
-    if kept is not None and kept.digest != configured.digest:
-        why = "it was activated on this node; `neurove activate` changes it"
-        log.warning("another model than the configured one serves", configured=model, serving=kept.name, why=why)
-    return kept or configured
-
-
-def _kept(library: Library, digest: str, trained_only: bool) -> Bundle | None:
-    try:
-        found = library.find(digest)
-        check_trained(found, required=trained_only)
-        return found
-    except (BadModel, UnknownModel, Untrained) as error:
-        log.warning("cannot restore the last active model", digest=digest, why=error.message)
-        return None

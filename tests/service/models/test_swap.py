@@ -531,6 +531,34 @@ def test_a_probation_without_windows_waits_for_them_and_says_so(slots):
     assert steps(progress).count("waiting") == 1
 
 
+def test_a_model_whose_probation_waits_serves_on_probation_after_a_restart(slots):
+    kept, trials = [], []
+
+    def on_trial(tried, proven):
+        trials.append((tried and tried.name, proven.name))
+
+    first = slots(probation_s=0.1, on_trial=on_trial)
+    first.activate("two")
+    wait_until(lambda: trials == [("two", "one")])
+    one, two = first.previous.digest, first.active.estimator.bundle.digest
+    first.close()
+    again = slots(
+        probation_s=0.1,
+        kept=(one, None),
+        trial=two,
+        on_changed=lambda model: kept.append(model.name),
+        on_trial=on_trial,
+    )
+    assert (again.active.estimator.bundle.name, again.previous.name, again.plan.phase) == ("two", "one", "probation")
+    again.resume()
+    wait_until(lambda: len(trials) == 2)
+    stream = Stream("cam0", again)
+    feed(stream, make_packets(40, n=50, step_us=25_000))
+    wait_until(lambda: kept == ["two"])
+    assert trials == [("two", "one"), ("two", "one"), (None, "one")]
+    assert again.rollback()[1].estimator.bundle.name == "one"
+
+
 def test_activating_the_active_model_changes_nothing_and_keeps_the_previous_one(slots):
     slot, progress = slots(), []
     slot.activate("two")
