@@ -1,6 +1,7 @@
 """Make valid chunks of the events that a reader decodes, and count what is not valid."""
 
 from collections.abc import Iterator
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -10,13 +11,25 @@ from neurove_core.io.order import Order, T, Where
 from neurove_core.io.recording import CHUNK_EVENTS, in_chunks
 from neurove_protocol.events import Events, Sensor
 
+V = TypeVar("V")
+
 _MIN_EVENTS = CHUNK_EVENTS // 4
 
 Piece = tuple[str | Where, Events]
 """Some events as they were recorded, and their place: a text, or a function that gives the place of event i.
 
-The columns of these events may have any integer type, so that a reader need not wrap a coordinate that does not fit.
+The columns of these events may have any integer type, see `as_recorded`.
 """
+
+
+def numbered(first: int, noun: str = "event") -> Where:
+    """The place of item i of a piece that begins with item number `first` of the recording, counted from 0."""
+    return lambda i: f"{noun} {first + i:,}"
+
+
+def as_recorded(t: Any, x: Any, y: Any, p: Any) -> Events:
+    """Events with columns of any integer type, so that a coordinate that does not fit is not wrapped; for `cleaned`."""
+    return Events(t, x, y, p)
 
 
 def cleaned(pieces: Iterator[Piece], sensor: Sensor, tally: Tally, note: str = "") -> Iterator[Events]:
@@ -60,6 +73,14 @@ def ordered(pieces: Iterator[tuple[str | Where, T]], tally: Tally) -> Iterator[T
     except BrokenRecording as error:
         unread(tally, error)
     yield from order.finish()
+
+
+def until_broken(items: Iterator[V], tally: Tally) -> Iterator[V]:
+    """The same items, for example images. An error that ends them is counted as `UNREAD` and not raised."""
+    try:
+        yield from items
+    except BrokenRecording as error:
+        unread(tally, error)
 
 
 def unread(tally: Tally, error: BrokenRecording) -> None:

@@ -107,8 +107,7 @@ def survey(recording: Recording, seconds: float | None = None) -> Survey:
         seconds: maximum duration of the events [s], from the first event. An endless recording needs it.
 
     Raises:
-        InvalidField: the recording is endless and `seconds` is not given, `seconds` is not above 0, or its ground truth
-            is not valid.
+        InvalidField: the recording is endless and `seconds` is not given, or `seconds` is not above 0.
     """
     if seconds is None and recording.endless:
         raise InvalidField("info", "seconds", None, f"{recording.name} never ends: give the number of seconds")
@@ -150,7 +149,7 @@ def _drain(parts: Iterator[T], add: Callable[[T], None]) -> str | None:
     try:
         for part in parts:
             add(part)
-    except BrokenRecording as error:
+    except (BrokenRecording, InvalidField) as error:  # such as a truth that is not valid
         return error.message
     return None
 
