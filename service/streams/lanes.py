@@ -8,7 +8,7 @@ from neurove_protocol.events import Packet
 from neurove_service import logs
 from neurove_service.streams.comparison import Comparison
 from neurove_service.streams.history import History, Optics, Primed, RingSize, prime, zero_lane
-from neurove_service.streams.lane import Lane, Pace, TimedEstimate, replay
+from neurove_service.streams.lane import Lane, OpenWindow, Pace, TimedEstimate, replay
 from neurove_service.streams.ring import PackedWindow, pack
 from neurove_service.streams.roles import Roles, Serving
 from neurove_service.streams.standby import Standby
@@ -51,29 +51,14 @@ class Lanes:
         self._unanswered: Pushed | None = None  # windows on which the serving model failed
 
     @property
-    def horizon_us(self) -> int | None:
-        """Sensor time up to which all events are known [us]; None before the first packet."""
-        return self.serving_lane.state.windows.horizon_us if self.serving_lane else None
-
-    @property
-    def open_events(self) -> int:
-        """Number of events in the open window."""
-        return self.serving_lane.state.windows.events if self.serving_lane else 0
+    def open_window(self) -> OpenWindow | None:
+        """The open window of the serving lane; None before the first packet."""
+        return self.serving_lane.open_window if self.serving_lane else None
 
     @property
     def has_backlog(self) -> bool:
         """Whether the standby model has a backlog."""
         return self.standby is not None and self.standby.has_backlog
-
-    @property
-    def window_us(self) -> int | None:
-        """Duration of the windows of the serving model [us]; None before the first packet."""
-        return self.serving_lane.estimator.config.window.duration_us if self.serving_lane else None
-
-    @property
-    def open_us(self) -> int | None:
-        """Start of the open window [us]; None before the first packet."""
-        return self.serving_lane.next_us if self.serving_lane else None
 
     def leave_out_until(self, start_us: int) -> None:
         """Leave out all windows before `start_us`, the open one included; the network state goes on over them."""

@@ -1,9 +1,12 @@
 """Overload: a worker that cannot keep up leaves out whole windows and goes on with the newest data."""
 
+from typing import NamedTuple
+
 from neurove_core.ingest.wire import read_packet
 from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.events import PacketLimits
 from neurove_service.streams.age import newest_us
+from neurove_service.streams.lane import OpenWindow
 
 BEHIND_NS, FAR_BEHIND_NS = 100_000_000, 200_000_000
 """A packet that waits longer is behind; far behind is needed to begin."""
@@ -13,6 +16,10 @@ PATIENCE_NS = 1_000_000_000
 
 RELIEF_NS = 2_000_000_000
 """The overload has ended when the worker was not behind for this time."""
+
+
+MAX_SHED_US = 60_000_000
+"""A larger jump is one of the sensor clock [us]."""
 
 
 class Overload:
@@ -42,36 +49,40 @@ class Overload:
         return True
 
 
-class Reached:
-    """The sensor times that packets in a queue have reached.
+class WholeWindow(NamedTuple):
+    """The newest window whose events have all arrived."""
+
+    start_us: int
+    packets: int  # messages at the begin of the queue that belong to earlier windows
+
+
+def newest_whole_window(payloads: list[bytes | None], limits: PacketLimits, window: OpenWindow) -> WholeWindow | None:
+    """Where to go on after leaving out windows; None if the open window must not be left out.
 
     Args:
-        payloads: of the packets, oldest first; None for a message that is no packet.
+        payloads: of the packets in the queue, oldest first; None for a message that is no packet.
         limits: limits of packets.
+        window: the open one.
     """
+    times = (_reached_us(payload, limits) for payload in reversed(payloads))
+    newest_us = next((time_us for time_us in times if time_us is not None), None)
+    if newest_us is None:
+        return None
+    start_us = (newest_us // window.duration_us - 1) * window.duration_us
+    if not window.start_us < start_us < window.start_us + MAX_SHED_US:
+        return None
+    for index in reversed(range(len(payloads))):
+        time_us = _reached_us(payloads[index], limits)
+        if time_us is not None and time_us < start_us:
+            return WholeWindow(start_us, index + 1)
+    return WholeWindow(start_us, 0)
 
-    def __init__(self, payloads: list[bytes | None], limits: PacketLimits) -> None:
-        self._payloads, self._limits = payloads, limits
 
-    @property
-    def newest_us(self) -> int | None:
-        """Sensor time that the newest valid packet has reached [us]; None without one."""
-        times = (self._at(index) for index in reversed(range(len(self._payloads))))
-        return next((time_us for time_us in times if time_us is not None), None)
-
-    def first_index(self, start_us: int) -> int:
-        """Index of the first packet of the run at the end of the queue that has reached `start_us`."""
-        for index in reversed(range(len(self._payloads))):
-            time_us = self._at(index)
-            if time_us is not None and time_us < start_us:
-                return index + 1
-        return 0
-
-    def _at(self, index: int) -> int | None:
-        payload = self._payloads[index]
-        if payload is None:
-            return None
-        try:
-            return newest_us(read_packet(payload, self._limits))
-        except NeuroVEError:
-            return None
+def _reached_us(payload: bytes | None, limits: PacketLimits) -> int | None:
+    """Sensor time that a packet has reached [us]; None if it is not valid."""
+    if payload is None:
+        return None
+    try:
+        return newest_us(read_packet(payload, limits))
+    except NeuroVEError:
+        return None

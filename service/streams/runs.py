@@ -6,8 +6,10 @@ from typing import NamedTuple
 import numpy as np
 
 from neurove_core.ingest.wire import read_packet
+from neurove_protocol import Sensor
 from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.events import PacketLimits, WireEvents, WirePacket
+from neurove_service.streams.lane import OpenWindow
 
 SMALL_BYTES = 4096
 """A larger packet is not merged: it costs less than its events."""
@@ -23,25 +25,31 @@ class Run(NamedTuple):
     marks: list[tuple[int, int]]  # number and t0_us of each
 
 
-def collect(payloads: Sequence[bytes], limits: PacketLimits, expected: int, end_us: int) -> Run | None:
+class Wanted(NamedTuple):
+    """Which packets a run may have."""
+
+    stream: str
+    sensor: Sensor
+    seq: int  # of the first one
+    window: OpenWindow  # that all of their events belong to
+
+
+def collect(payloads: Sequence[bytes], limits: PacketLimits, wanted: Wanted) -> Run | None:
     """The run of packets at the begin of some payloads; None if fewer than two can be merged.
 
     Args:
         payloads: of packets of one stream, in order of arrival.
         limits: limits of packets.
-        expected: number of the next packet.
-        end_us: end of the open window; only packets that reach less are merged [us].
+        wanted: which packets the run may have.
     """
     packets: list[WirePacket] = []
-    reached_us = -(1 << 63)
+    reached_us = wanted.window.start_us
     for payload in payloads[:MAX_RUN]:
         packet = _small(payload, limits)
-        if packet is None or packet.seq != expected + len(packets) or packet.t0_us < reached_us:
-            break
-        if packets and (packet.stream, packet.sensor) != (packets[0].stream, packets[0].sensor):
+        if packet is None or packet.seq != wanted.seq + len(packets) or packet.t0_us < reached_us:
             break
         reached_us = packet.events.last_us
-        if reached_us >= end_us:
+        if (packet.stream, packet.sensor) != (wanted.stream, wanted.sensor) or reached_us >= wanted.window.end_us:
             break
         packets.append(packet)
     return _merged(packets) if len(packets) > 1 else None

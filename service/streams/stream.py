@@ -15,7 +15,7 @@ from neurove_service.streams.history import RingSize
 from neurove_service.streams.intake import Arrival, Intake
 from neurove_service.streams.lanes import Lanes, Pushing, ServingModelFailed
 from neurove_service.streams.model_source import ModelSource
-from neurove_service.streams.runs import Run, collect
+from neurove_service.streams.runs import Run, Wanted, collect
 from neurove_service.streams.sequence import Order
 from neurove_service.streams.verdict import Verdicts
 
@@ -77,15 +77,16 @@ class Stream:
             self._restart()
             self._intake.ages.forget()
         self._restart_if_changed(packet)
+        window = self.lanes.open_window
         if order is Order.RECOVERED:  # its delay is that of a detour
-            if self._is_too_late(packet):
+            if window is not None and newest_us(packet) < window.start_us:  # all of its windows are answered
                 self.activity.lost("out_of_order_packets", 1)
                 return []
         elif self._intake.is_stale(packet, arrival):
             return []
         else:
-            self._flags.close_gap(self.lanes.horizon_us, packet.t0_us)
-        return self._process(self._intake.without_shed_events(packet, self.lanes.open_us), arrival)
+            self._flags.close_gap(self.lanes.open_window, packet.t0_us)
+        return self._process(packet, arrival)
 
     def collect(self, payloads: Sequence[bytes], limits: PacketLimits) -> Run | None:
         """The packets at the begin of some payloads that `accept_run` takes at once; None if there are none.
@@ -94,28 +95,20 @@ class Stream:
             payloads: of packets, in order of arrival.
             limits: limits of packets.
         """
-        open_us, window_us, expected = self.lanes.open_us, self.lanes.window_us, self._intake.expected
-        if open_us is None or window_us is None or expected is None:
+        window, expected = self.lanes.open_window, self._intake.expected
+        if window is None or expected is None or self.sensor is None:
             return None
-        run = collect(payloads, limits, expected, open_us + window_us)
-        if run is None or run.packet.stream != self.name or run.packet.sensor != self.sensor:
-            return None
-        return run if run.packet.t0_us >= open_us else None
+        return collect(payloads, limits, Wanted(self.name, self.sensor, expected, window))
 
     def accept_run(self, run: Run, arrival: Arrival) -> list[TwistEstimate]:
-        """Process a run of packets with the results of `accept` for each.
-
-        Args:
-            run: from `collect`.
-            arrival: of its last packet.
-        """
+        """Process a run of packets, the last of which arrived then, with the results of `accept` for each."""
         packet, marks = run
         self._heard(packet, arrival, len(marks))
         self._intake.advance_run(marks, arrival.received_ns)
         if self._intake.is_stale(packet, arrival, len(marks)):
             return []
-        self._flags.close_gap(self.lanes.horizon_us, packet.t0_us)
-        return self._process(self._intake.without_shed_events(packet, self.lanes.open_us), arrival)
+        self._flags.close_gap(self.lanes.open_window, packet.t0_us)
+        return self._process(packet, arrival)
 
     def _heard(self, packet: Packet, arrival: Arrival, packets: int) -> None:
         self.counters.packets_received += packets
@@ -124,8 +117,8 @@ class Stream:
         self.activity.taken_ns = arrival.queued_ns
 
     def _process(self, packet: Packet, arrival: Arrival) -> list[TwistEstimate]:
-        activity = self.activity
-        pushing = self._push(packet)
+        activity, window = self.activity, self.lanes.open_window
+        pushing = self._push(self._intake.without_shed_events(packet, window.start_us if window else None))
         self.counters.outside_events += pushing.outside_events
         if pushing.late_events:
             activity.lost("late_events", pushing.late_events)
@@ -170,17 +163,11 @@ class Stream:
         self.activity.lost("overload_packets", packets)
 
     def shed(self, packets: int, start_us: int) -> None:
-        """Leave out all windows before `start_us`, because this node cannot keep up.
-
-        Args:
-            packets: whole packets of these windows that will not be accepted.
-            start_us: start of the window that the next packet belongs to; after the open window.
-        """
-        open_us, window_us = self.lanes.open_us, self.lanes.window_us
-        assert open_us is not None
-        assert window_us is not None
+        """Leave out all windows before `start_us`, with so many whole packets, because this node cannot keep up."""
+        window = self.lanes.open_window
+        assert window is not None
         self._intake.shed(packets)
-        self.activity.lost("shed_windows", (start_us - open_us) // window_us)
+        self.activity.lost("shed_windows", (start_us - window.start_us) // window.duration_us)
         if packets:
             self.activity.lost("overload_packets", packets)
         self.lanes.leave_out_until(start_us)
@@ -195,14 +182,10 @@ class Stream:
             self._restart()
         log.info("camera info set", stream=self.name, sensor=str(camera.sensor), lens=camera.lens)
 
-    def _is_too_late(self, packet: Packet) -> bool:
-        """Whether all windows of a packet that was missing are answered."""
-        open_us = self.lanes.open_us
-        return open_us is not None and newest_us(packet) < open_us
-
     def _restart(self) -> None:
         """Forget the recurrent state and the open window; the next packet begins a new sequence."""
-        if self.lanes.open_events:
+        window = self.lanes.open_window
+        if window is not None and window.events:
             self.activity.lost("restart_windows", 1)
         self.lanes.restart()
         self._flags.forget_gaps()
@@ -218,9 +201,9 @@ class Stream:
             self.sensor = packet.sensor
             if self.camera is not None and self.calibration is None:
                 self.refused_camera(f"the camera info is for {self.camera.sensor}, the stream sends {packet.sensor}")
-        horizon_us = self.lanes.horizon_us
-        if horizon_us is not None and packet.t0_us < horizon_us - CLOCK_RESET_US:
-            log.warning("sensor clock went backwards", stream=self.name, by_us=horizon_us - packet.t0_us)
+        window = self.lanes.open_window
+        if window is not None and packet.t0_us < window.horizon_us - CLOCK_RESET_US:
+            log.warning("sensor clock went backwards", stream=self.name, by_us=window.horizon_us - packet.t0_us)
             self._restart()
             self._intake.ages.forget()
 

@@ -14,7 +14,7 @@ from neurove_protocol.events import PacketLimits
 from neurove_protocol.velocity import TwistEstimate
 from neurove_service import logs
 from neurove_service.streams.intake import Arrival
-from neurove_service.streams.overload import Overload, Reached
+from neurove_service.streams.overload import Overload, newest_whole_window
 from neurove_service.streams.runs import MAX_RUN, SMALL_BYTES
 from neurove_service.streams.stream import Stream
 
@@ -23,7 +23,6 @@ log = logs.get(__name__)
 _IDLE_BEAT_S = 0.5
 _RETRY_STANDBY_S = 0.002
 _MAX_PAUSE_S = 0.02
-_MAX_SHED_US = 60_000_000  # a larger jump is one of the sensor clock
 _SAMPLE_BYTES = 256
 
 
@@ -198,17 +197,14 @@ class StreamWorker:
 
     def _shed(self) -> None:
         """Leave out all windows before the newest one whose events have all arrived."""
-        open_us, window_us = self.stream.lanes.open_us, self.stream.lanes.window_us
-        if open_us is None or window_us is None:
+        window = self.stream.lanes.open_window
+        payloads = [None if one.is_camera else one.payload for one in self._pending]
+        found = newest_whole_window(payloads, self._limits, window) if window is not None else None
+        if found is None:
             return
-        reached = Reached([None if one.is_camera else one.payload for one in self._pending], self._limits)
-        newest_us = reached.newest_us
-        start_us = (newest_us // window_us - 1) * window_us if newest_us is not None else open_us
-        if not open_us < start_us < open_us + _MAX_SHED_US:
-            return
-        left_out = [self._pending.popleft() for _ in range(reached.first_index(start_us))]
+        left_out = [self._pending.popleft() for _ in range(found.packets)]
         self._pending.extendleft(reversed([sample for sample in left_out if sample.is_camera]))
-        self.stream.shed(sum(not sample.is_camera for sample in left_out), start_us)
+        self.stream.shed(sum(not sample.is_camera for sample in left_out), found.start_us)
 
     def _run_standby(self) -> float:
         """Run one step of the standby model; return the pause after it [s], which leaves the processor to others."""

@@ -14,6 +14,7 @@ from neurove_service.streams.overload import Overload
 from neurove_service.streams.stream import Stream
 from neurove_service.streams.worker import Inbox, Outlet, Sample, StreamWorker
 from tests.builders import make_packet, make_packets
+from tests.live.conftest import wait_until
 
 
 def sample(number, received_ns=0, size=0):
@@ -175,6 +176,7 @@ def test_packets_that_wait_together_give_the_same_estimates_as_one_by_one(slot):
         worker.put_packet(payload, now_ns, now_ns // 1000)
     gate.set()
     published.wait_for(expected.counters.estimates)
+    wait_until(lambda: worker.stream.counters.packets_received == expected.counters.packets_received)
     worker.stop()
     worker.join(5)
     counters = worker.stream.counters
