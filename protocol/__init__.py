@@ -7,7 +7,7 @@ README.md in this folder is the contract.
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.events import EVENT_DTYPE, EventPacket, Events, Sensor
-from neurove_protocol.velocity import Flag, Trace, Twist, TwistEstimate
+from neurove_protocol.velocity import Flag, HostTime, Trace, Twist, TwistEstimate
 
 __all__ = [
     "EVENT_DTYPE",
@@ -15,6 +15,7 @@ __all__ = [
     "EventPacket",
     "Events",
     "Flag",
+    "HostTime",
     "NeuroVEError",
     "Sensor",
     "Trace",

@@ -1,13 +1,14 @@
 """Requests and replies of a node: health, models, push, activate, rollback; the status of a stream; the error reply."""
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, cast
 
+import msgpack
 from pydantic import ConfigDict, Field
 
 from neurove_protocol.codec import Count, Message, Name, Part
 from neurove_protocol.errors import EXIT_CONFLICT, EXIT_FAILURE, Conflict, NeuroVEError
 
-Verdict = Literal["ok", "lossy", "stalled", "idle"]
+Verdict = Literal["ok", "lossy", "stalled", "idle", "unstable", "uncertain"]
 
 STATUS_SCHEMA = "application/msgpack;neurove.status.1"
 """Zenoh Encoding of a StreamStatus."""
@@ -61,6 +62,11 @@ class ActivateRequest(Request):
     expect: DigestPrefix | None = None  # of the active model: conflict if another one is active
     shadow_s: Annotated[float, Field(ge=0, le=3600)] = 0.0  # time in shadow before activation [s]
     canary: Annotated[tuple[Name, ...], Field(strict=False)] = ()  # streams that change; empty means all
+    force: Annotated[str, Field(min_length=1, max_length=200)] | None = None  # why no difference may refuse the model
+
+    def encode(self) -> bytes:
+        """This request as a msgpack map; without `force` where it is nil, because older nodes refuse unknown fields."""
+        return cast(bytes, msgpack.packb(self.model_dump(exclude={"force"} if self.force is None else None)))
 
 
 class RollbackRequest(Request):
@@ -98,10 +104,14 @@ class Losses(Part):
     overload_packets: Count = 0  # dropped here, oldest first, because the queue was full
     duplicate_packets: Count = 0  # a sequence number that arrived before
     out_of_order_packets: Count = 0  # older than a packet already processed
+    foreign_packets: Count = 0  # of a second driver on this stream; the first one is followed
+    stale_packets: Count = 0  # older than max_age_s when their turn came
     malformed_packets: Count = 0  # refused: they break a rule of the contract
     failed_packets: Count = 0  # an internal error; the log has the traceback
     late_events: Count = 0  # of a window that is already answered
     skipped_windows: Count = 0  # windows in a gap of the sensor's time that is too long to bridge
+    shed_windows: Count = 0  # left out whole by an overloaded node, which goes on with the newest data
+    restart_windows: Count = 0  # open when the stream restarted, with the events that they had
 
     def nonzero(self) -> dict[str, int]:
         """The causes with a count above 0."""
@@ -137,6 +147,10 @@ class StreamStatus(Message):
     lost: Losses
     latency_ms: Latency | None  # None before the first estimate
     last_packet_age_s: float
+    recovered_packets: Count = 0  # of gap_packets: they arrived later, in time for their window
+    uncounted_packets: Count = 0  # all had the sequence number 0, so losses before this node cannot be counted
+    refused_cameras: Count = 0  # CameraInfo messages that were refused or do not belong to the sensor
+    refusal: str = ""  # why the newest packet or CameraInfo was refused
 
 
 class ModelInfo(Part):
@@ -215,8 +229,9 @@ class ActivateReply(Message):
 
     node: Name
     active: ModelInfo
-    previous: ModelInfo
+    previous: ModelInfo  # that it replaced; the active model itself if nothing changed
     epoch: Count
+    changed: bool = True  # false: the model was active before, and nothing changed
 
 
 class ErrorReply(Message):

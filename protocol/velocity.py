@@ -26,10 +26,12 @@ class Flag(StrEnum):
     SETTLING = "settling"  # the recurrent state is younger than the model's settling time
     RESET = "reset"  # the recurrent state was reset in this window
     SENSOR_CHANGED = "sensor_changed"  # cause of the reset: the stream's geometry or CameraInfo changed
-    GAP = "gap"  # packets of this window were lost
-    OVERLOAD = "overload"  # this node dropped them because it could not keep up
+    GAP = "gap"  # packets of this window are missing, whatever the cause
+    OVERLOAD = "overload"  # the node dropped packets of this window, or skipped windows before it: it cannot keep up
+    LATE = "late"  # published long after the end of the window, see HostTime
     LOW_ACTIVITY = "low_activity"  # fewer events than the model needs to see motion
     SATURATED = "saturated"  # the event count of a cell reached its maximum
+    FROZEN = "frozen"  # the camera repeats the same events
     UNCERTAIN = "uncertain"  # sigma of the linear velocity, as a share of the speed, is above the model's bound
 
 
@@ -78,6 +80,18 @@ class Trace(Part):
         return (self.published_ns - self.received_ns) / 1e6
 
 
+class HostTime(Part):
+    """When the window ended on the clocks of the node, as far as the node can know.
+
+    The node learns the offset between the clock of the sensor and its own from the packets that arrive quickest. A
+    delay that all packets share cannot be seen, so the true end of the window is at `end_ns` or earlier.
+    """
+
+    end_ns: Int64  # end of the window on the node's wall clock [ns since 1970-01-01 UTC]
+    uncertainty_ns: Count  # typical delay of a packet beyond the quickest one
+    age_ns: Count  # from the end of the window to publishing its estimate
+
+
 class TwistEstimate(Message):
     """The estimate of one window: n twists, one per chronological bin (the paper's [n, 6])."""
 
@@ -97,6 +111,8 @@ class TwistEstimate(Message):
     flags: Annotated[tuple[str, ...], Field(strict=False)] = ()
     covariance: Covariance | None = None  # of each twist; None if the model has no calibrated uncertainty
     trace: Trace
+    node: Name | None = None  # the node that made the estimate
+    host: HostTime | None = None  # None if the driver gives no time to learn from
 
     @model_validator(mode="after")
     def _one_twist_per_bin(self) -> Self:

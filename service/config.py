@@ -128,6 +128,12 @@ class ServiceConfig(_Settings):
     queue_s: float = Field(
         1.0, gt=0, le=60, description="Packets that wait longer in the queue are dropped, oldest first [s]."
     )
+    max_age_s: float = Field(
+        1.0,
+        gt=0,
+        le=3600,
+        description="Packets whose newest event is older are dropped and counted; a quarter of it is late [s].",
+    )
     queue_mib: int = Field(64, ge=1, le=4096, description="Maximum size of the queue of a stream [MiB].")
     max_streams: int = Field(
         16, ge=1, le=1024, description="Maximum number of streams; further ones are refused and counted."

@@ -7,6 +7,7 @@ callbacks that only append, every query answered, every session closed.
 import contextlib
 import json
 import re
+import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -31,10 +32,14 @@ _SETTINGS = {
     "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 20_000,  # us: ride out a stall of the receiver
 }
 _RETRY_S = 0.5
+_SENT = struct.Struct("<q")  # the attachment of a packet: time of sending [us]
 _SYSTEM_ERROR = re.compile(r"([^:\[\]]+) \(os error \d+\)")
 
 OnSample = Callable[[str, bytes, int], None]
 """Key, payload, and time of reception (monotonic) [ns]. Runs on Zenoh's thread: it must only append and return."""
+
+OnTimedSample = Callable[[str, bytes, int, int | None], None]
+"""As OnSample, with the time of sending on a clock of the sender's host [us], or None."""
 
 
 class EndpointError(NeuroVEError):
@@ -65,9 +70,14 @@ class Publisher:
     def __init__(self, publisher: zenoh.Publisher) -> None:
         self._publisher = publisher
 
-    def put(self, payload: bytes) -> None:
-        """Publish a message; if it is dropped, the receiver sees a gap in the sequence numbers."""
-        self._publisher.put(payload)
+    def put(self, payload: bytes, sent_us: int | None = None) -> None:
+        """Publish a message; if it is dropped, the receiver sees a gap in the sequence numbers.
+
+        Args:
+            payload: the message.
+            sent_us: the time of sending, for a packet whose sensor clock may not run in real time [us].
+        """
+        self._publisher.put(payload, attachment=None if sent_us is None else _SENT.pack(sent_us))
 
     @property
     def matching(self) -> bool:
@@ -131,6 +141,17 @@ class Transport:
 
         def receive(sample: zenoh.Sample) -> None:
             on_sample(str(sample.key_expr), sample.payload.to_bytes(), time.monotonic_ns())
+
+        self._kept.append(self._session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
+
+    def subscribe_timed(self, key: str, on_sample: OnTimedSample) -> None:
+        """As subscribe, with the time of sending, if the driver attaches it [us]."""
+
+        def receive(sample: zenoh.Sample) -> None:
+            received_ns = time.monotonic_ns()
+            attached = sample.attachment.to_bytes() if sample.attachment is not None else b""
+            sent_us = _SENT.unpack(attached)[0] if len(attached) == _SENT.size else None
+            on_sample(str(sample.key_expr), sample.payload.to_bytes(), received_ns, sent_us)
 
         self._kept.append(self._session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
 

@@ -43,14 +43,15 @@ def read(recording: Recording) -> Events:
 
 
 def read_broken(recording: Recording) -> tuple[Events, BrokenRecording | None]:
-    """Return the valid events and the error that ended the recording, or None."""
+    """Return the valid events and the first fault of the events as an error, or None."""
     parts = []
     try:
         for chunk in recording.chunks():
             parts.append(chunk)  # noqa: PERF402  # keeps the chunks before the error
     except BrokenRecording as error:
         return Events.join(parts), error
-    return Events.join(parts), None
+    found = [fault for fault in recording.faults.found if fault.stream == "events"]
+    return Events.join(parts), BrokenRecording(Path(recording.name), found[0].where, found[0].why) if found else None
 
 
 def all_samples(recording: Recording) -> Imu:

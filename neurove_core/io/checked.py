@@ -1,69 +1,139 @@
-"""Join the pieces of a recording into chunks of events and check the events."""
+"""Make valid chunks of the events that a reader decodes, and count what is not valid."""
 
 from collections.abc import Iterator
-from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
 
 from neurove_core.io.errors import BrokenRecording
-from neurove_core.io.recording import CHUNK_EVENTS, in_chunks, valid_prefix
-from neurove_protocol.errors import EventOutsideSensor, TimeBackwards
-from neurove_protocol.events import Events, Sensor, check_events
+from neurove_core.io.faults import Reason, Tally
+from neurove_core.io.order import Order, T, Where
+from neurove_core.io.recording import CHUNK_EVENTS, in_chunks
+from neurove_protocol.events import Events, Sensor
+
+V = TypeVar("V")
 
 _MIN_EVENTS = CHUNK_EVENTS // 4
 
+Piece = tuple[str | Where, Events]
+"""Some events as they were recorded, and their place: a text, or a function that gives the place of event i.
 
-def checked(path: Path, pieces: Iterator[tuple[str, Events]], sensor: Sensor) -> Iterator[Events]:
-    """Join the events of all pieces into chunks that are neither empty nor very small.
+The columns of these events may have any integer type, see `as_recorded`.
+"""
+
+
+def numbered(first: int, noun: str = "event") -> Where:
+    """The place of item i of a piece that begins with item number `first` of the recording, counted from 0."""
+    return lambda i: f"{noun} {first + i:,}"
+
+
+def as_recorded(t: Any, x: Any, y: Any, p: Any) -> Events:
+    """Events with columns of any integer type, so that a coordinate that does not fit is not wrapped; for `cleaned`."""
+    return Events(t, x, y, p)
+
+
+def cleaned(pieces: Iterator[Piece], sensor: Sensor, tally: Tally, note: str = "") -> Iterator[Events]:
+    """Valid events of all pieces, ordered by time, in chunks that are neither empty nor very small.
+
+    Events outside the sensor and late events are left out, see `Order`; `tally` counts them. An error that ends the
+    pieces ends the chunks too: it is counted as `UNREAD` and not raised, and all events before it are given.
 
     Args:
-        path: the recording, named in errors.
-        pieces: for each piece its place in the recording and its events.
+        pieces: what the reader decoded, in recorded order. A piece may be empty.
         sensor: the pixel array.
-
-    Raises:
-        BrokenRecording: a piece has an event that is outside the sensor or earlier than the event before it, or
-            `pieces` raises the error. All events before were yielded.
+        tally: of this pass.
+        note: on the sensor; ends the text for an event outside it.
     """
-    not_before_us: int | None = None
-    for batch, broken in _batches(pieces):
-        events = Events.join([piece for _, piece in batch])
-        try:
-            check_events(events, sensor, not_before_us)
-        except (EventOutsideSensor, TimeBackwards):
-            yield from in_chunks(valid_prefix(events, sensor, not_before_us))
-            raise _error_of(path, batch, sensor, not_before_us) from None
-        yield from in_chunks(events)
-        if broken is not None:
-            raise broken
-        not_before_us = int(events.t[-1]) if events.n else not_before_us
+    order: Order[Events] = Order(tally)
+    for batch in _batches(pieces, tally):
+        events = _joined(batch)
+        if events is not None and _inside(events, sensor).all() and order.is_plain(events):
+            order.passed(events)
+            yield from in_chunks(_typed(events))
+            continue
+        parts = [part for where, piece in batch for part in order.push(*_on_sensor(where, piece, sensor, tally, note))]
+        yield from in_chunks(_typed(Events.join(parts)))
+    yield from in_chunks(_typed(Events.join(list(order.finish()))))
 
 
-def _batches(
-    pieces: Iterator[tuple[str, Events]],
-) -> Iterator[tuple[list[tuple[str, Events]], BrokenRecording | None]]:
-    """Batches of at least _MIN_EVENTS events, except the last, which has the error that ended the pieces, if any."""
-    batch: list[tuple[str, Events]] = []
+def ordered(pieces: Iterator[tuple[str | Where, T]], tally: Tally) -> Iterator[T]:
+    """The samples of all pieces ordered by time, in batches that are not empty; for streams other than the events.
+
+    What is late is left out and counted, and so is everything after a restart of the clock; see `Order`. An error that
+    ends the pieces is counted as `UNREAD` and not raised.
+
+    Args:
+        pieces: for each its place, as in `cleaned`, and its samples.
+        tally: of this pass.
+    """
+    order: Order[T] = Order(tally, restart=False)
+    try:
+        for where, rows in pieces:
+            yield from order.push(rows, _where(where))
+    except BrokenRecording as error:
+        unread(tally, error)
+    yield from order.finish()
+
+
+def until_broken(items: Iterator[V], tally: Tally) -> Iterator[V]:
+    """The same items, for example images. An error that ends them is counted as `UNREAD` and not raised."""
+    try:
+        yield from items
+    except BrokenRecording as error:
+        unread(tally, error)
+
+
+def unread(tally: Tally, error: BrokenRecording) -> None:
+    """Count an error that ends the reading of a stream."""
+    tally.add(Reason.UNREAD, error.where, error.why)
+
+
+def _batches(pieces: Iterator[Piece], tally: Tally) -> Iterator[list[Piece]]:
+    """Batches of at least _MIN_EVENTS events, except the last."""
+    batch: list[Piece] = []
     n = 0
     try:
         for piece in pieces:
             batch.append(piece)
             n += piece[1].n
             if n >= _MIN_EVENTS:
-                yield batch, None
+                yield batch
                 batch, n = [], 0
     except BrokenRecording as error:
-        yield batch, error
-        return
-    yield batch, None
+        unread(tally, error)
+    if batch:
+        yield batch
 
 
-def _error_of(
-    path: Path, batch: list[tuple[str, Events]], sensor: Sensor, not_before_us: int | None
-) -> BrokenRecording:
-    """The error for the first bad piece. One of the pieces must be bad."""
-    for where, events in batch:
-        try:
-            check_events(events, sensor, not_before_us)
-        except (EventOutsideSensor, TimeBackwards) as error:
-            return BrokenRecording(path, where, f"in this piece, {error.message}")
-        not_before_us = int(events.t[-1]) if events.n else not_before_us
-    raise AssertionError("the joined pieces are bad, but no single piece is")
+def _joined(batch: list[Piece]) -> Events | None:
+    return Events.join([piece for _, piece in batch]) if batch else None
+
+
+def _inside(events: Events, sensor: Sensor) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Which events lie on the sensor."""
+    x, y = events.x, events.y
+    inside = (x < sensor.width) & (y < sensor.height)
+    for column in (x, y):
+        if column.dtype.kind != "u":
+            inside &= column >= 0
+    return inside
+
+
+def _on_sensor(where: str | Where, events: Events, sensor: Sensor, tally: Tally, note: str) -> tuple[Events, Where]:
+    """The events on the sensor, and their places."""
+    place, inside = _where(where), _inside(events, sensor)
+    if inside.all():
+        return events, place
+    kept, outside = np.flatnonzero(inside), np.flatnonzero(~inside)
+    first = int(outside[0])
+    why = f"x={events.x[first]} y={events.y[first]} lies outside the sensor {sensor}{note}"
+    tally.add(Reason.OUTSIDE, place(first), why, outside.size)
+    return Events(events.t[kept], events.x[kept], events.y[kept], events.p[kept]), lambda i: place(int(kept[i]))
+
+
+def _where(where: str | Where) -> Where:
+    return (lambda _: where) if isinstance(where, str) else where
+
+
+def _typed(events: Events) -> Events:
+    return Events.from_columns(*events)

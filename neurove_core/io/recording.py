@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from neurove_core.geometry.motion import Poses, Twists
 from neurove_core.io.errors import UnknownSource
+from neurove_core.io.faults import Faults
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.events import Events, Sensor
 
@@ -65,6 +66,10 @@ class Recording(Protocol):
     def streams(self) -> tuple[str, ...]:
         """The kinds of data in the recording: some of events, imu, frames, triggers, poses and twists."""
 
+    @property
+    def faults(self) -> Faults:
+        """What the newest pass over each stream skipped, discarded or could not read."""
+
     def camera(self, stream: str) -> CameraInfo | None:
         """The camera parameters to use for this stream, or None if the recording does not have them."""
 
@@ -74,8 +79,7 @@ class Recording(Protocol):
         Times are in the sensor's clock [us]. A chunk has at most CHUNK_EVENTS events. Memory use is bounded for a
         recording of any length.
 
-        Raises:
-            BrokenRecording: the recording is damaged; all valid events before the damage were yielded.
+        What cannot be used is skipped and counted in `faults`, and the reading goes on where it can.
         """
 
     def since(self, t_us: int) -> Iterator[Events]:
@@ -102,9 +106,17 @@ class Recording(Protocol):
 
 
 class EventsOnly:
-    """Base class of a recording that has only events. Readers of other formats override the methods for their data."""
+    """Base class of a recording that has only events. Readers of other formats override the methods for their data.
+
+    A reader that counts faults has a field `faults: Faults`.
+    """
 
     __slots__ = ()
+
+    @property
+    def faults(self) -> Faults:
+        """None: this source has no faults, or its reader does not count them."""
+        return Faults()
 
     @property
     def streams(self) -> tuple[str, ...]:

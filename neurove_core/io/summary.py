@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from neurove_core.geometry.motion import Twists
 from neurove_core.io.errors import BrokenRecording
+from neurove_core.io.faults import Fault
 from neurove_core.io.recording import Imu, Recording
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
@@ -73,10 +74,12 @@ class Summary:
     imu: ImuSummary | None
     truth: TruthSummary | None
     broken: str | None  # the error that ended the reading, if any
+    faults: tuple[Fault, ...] = ()  # what was skipped, discarded or not read, by reason
 
     def as_json(self) -> dict[str, Any]:
         """The summary as a dict for `json.dumps`."""
         fields = asdict(self)
+        fields["faults"] = [fault.as_json() for fault in self.faults]
         if self.truth is not None:
             truth = fields["truth"]
             fields["truth"] = {"from": truth.pop("source"), **truth}
@@ -97,8 +100,8 @@ class Survey(NamedTuple):
 def survey(recording: Recording, seconds: float | None = None) -> Survey:
     """Read each stream of a recording once and summarise it.
 
-    For a damaged recording the summary covers the part before the damage. The ground truth is `Recording.twists`; see
-    geometry.twists.
+    For a damaged recording the summary covers what can be read; `faults` says what could not. The ground truth is
+    `Recording.twists`; see geometry.twists.
 
     Args:
         recording: the recording to read.
@@ -106,8 +109,7 @@ def survey(recording: Recording, seconds: float | None = None) -> Survey:
             needs it.
 
     Raises:
-        InvalidField: the recording is endless and `seconds` is not given, `seconds` is not above 0, or its ground truth
-            is not valid.
+        InvalidField: the recording is endless and `seconds` is not given, or `seconds` is not above 0.
     """
     if seconds == math.inf:
         seconds = None
@@ -140,7 +142,8 @@ def survey(recording: Recording, seconds: float | None = None) -> Survey:
         triggers=edges.n,
         imu=imu.summary(),
         truth=None if truth is None else _truth(truth, "poses" if "poses" in recording.streams else "twists"),
-        broken=broken,
+        broken=broken or next(map(str, recording.faults.unread), None),
+        faults=recording.faults.found,
     )
     return Survey(summary, *tally.picture(), *tally.rate(), truth)
 
@@ -150,7 +153,7 @@ def _drain(parts: Iterator[T], add: Callable[[T], None]) -> str | None:
     try:
         for part in parts:
             add(part)
-    except BrokenRecording as error:
+    except (BrokenRecording, InvalidField) as error:  # such as a truth that is not valid
         return error.message
     return None
 

@@ -3,14 +3,18 @@
 import argparse
 import math
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from neurove_protocol import Sensor
-from neurove_protocol.errors import NeuroVEError
+from neurove_protocol.errors import InvalidField, NeuroVEError
 from neurove_service import logs
 from neurove_service.config import ClientConfig, ServiceConfig, load
+
+if TYPE_CHECKING:
+    from neurove_core.io import Recording
 
 MAX_SECONDS: Final = 1e9
 """Longest time of a flag [s]: 31 years, which clocks and timers can hold."""
@@ -96,6 +100,17 @@ def flags(args: argparse.Namespace, kind: type[ServiceConfig] | type[ClientConfi
     return {name: getattr(args, name, None) for name in kind.model_fields}
 
 
+def metres(text: str) -> float:
+    """A number of metres above 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r}: give metres above 0")
+    return value
+
+
 def sensor_size(text: str) -> Sensor:
     """A sensor size from the text WIDTHxHEIGHT."""
     width, _, height = text.partition("x")
@@ -130,6 +145,33 @@ def seconds(text: str) -> float:
 def duration(text: str) -> float:
     """A number of seconds as `seconds`, or infinity for the text inf: no bound."""
     return math.inf if text in ("inf", "max") else seconds(text)
+
+
+def tell_faults(recording: "Recording") -> None:
+    """Print to stderr what a recording's reader skipped, discarded or could not read: one line for each reason."""
+    for fault in recording.faults.found:
+        print(f"neurove: {recording.name}: {fault}", file=sys.stderr)
+
+
+def refuse_existing(what: str, field: str, path: Path, source: str | None, *, force: bool) -> None:
+    """Refuse a file to write that exists, unless the user gives --force, and that is the input in any case.
+
+    Args:
+        what: the command.
+        field: name of the argument.
+        path: the file.
+        source: the recording that is read; None if none is.
+        force: whether an existing file may be replaced.
+
+    Raises:
+        InvalidField: the file exists.
+    """
+    if not path.exists():
+        return
+    if source is not None and Path(source).exists() and path.samefile(source):
+        raise InvalidField(what, field, str(path), "it is the input recording")
+    if not force:
+        raise InvalidField(what, field, str(path), "the file exists; --force replaces it")
 
 
 def commit() -> str:

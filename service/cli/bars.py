@@ -36,6 +36,26 @@ def progress() -> Iterator[Callable[[str, int, int, str], None]]:
         yield show
 
 
+@contextlib.contextmanager
+def event_count(name: str) -> Iterator[Callable[[int], None]]:
+    """Show the events read so far on a terminal; the length of a recording is unknown before its end."""
+    if not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    from neurove_service.cli.console import console
+
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*columns, console=console(stderr=True)) as bar:
+        task = bar.add_task(name, total=None)
+
+        def show(events: int) -> None:
+            bar.update(task, description=f"{name}: {events:,} events")
+
+        yield show
+
+
 def _print_line(task: str, done: int, of: int, detail: str) -> None:
     if task.startswith(_EACH_STEP) or done % 100 < 4 or done == of:
         sys.stderr.write(f"{task} {done}/{of}: {detail}\n")

@@ -19,8 +19,11 @@ from neurove_service.cli.arguments import (
     client_config,
     command,
     duration,
+    refuse_existing,
     seconds,
+    tell_faults,
 )
+from neurove_service.cli.bars import event_count
 from neurove_service.lifecycle import stop_on_signals
 
 Progress = Callable[[int], None]
@@ -91,23 +94,24 @@ def _status_line(path: Path) -> Iterator[Callable[[Any], None] | None]:
         yield show
 
 
-def _write_mcap(recording: Any, path: Path, progress: Progress) -> None:
+def _write_mcap(recording: Any, path: Path, progress: Progress) -> tuple[str, ...]:
     from neurove_core.io.formats.packet_log.writer import write_mcap
 
     write_mcap(recording, path, progress=lambda events, _: progress(events))
+    return ()
 
 
-def _write_dsec(recording: Any, path: Path, progress: Progress) -> None:
+def _write_dsec(recording: Any, path: Path, progress: Progress) -> tuple[str, ...]:
     from neurove_core.io.formats.hdf5.dsec_write import write_dsec
 
     try:
-        write_dsec(recording, path, progress)
+        return write_dsec(recording, path, progress).left_out
     except OSError as error:
         raise InvalidField("recording", "FILE", str(path), error.strerror or str(error)) from None
 
 
-WRITERS: Final[dict[str, Callable[[Any, Path, Progress], None]]] = {".mcap": _write_mcap, ".h5": _write_dsec}
-"""The writer for each suffix: (recording, path, progress)."""
+WRITERS: Final[dict[str, Callable[[Any, Path, Progress], tuple[str, ...]]]] = {".mcap": _write_mcap, ".h5": _write_dsec}
+"""The writer for each suffix: (recording, path, progress) to the streams that the format cannot hold."""
 
 _ENDLESS_S: Final = 5.0  # that `info` reads of a source without end
 
@@ -120,27 +124,32 @@ def convert(args: argparse.Namespace) -> int:
     if path.suffix not in WRITERS:
         raise InvalidField("convert", "OUT", str(path), f"its name must end in {' or '.join(WRITERS)}")
     recording = open_source(args.source, args.sensor, args.topic)
-    if path.exists() and Path(args.source).exists() and path.samefile(args.source):
-        raise InvalidField("convert", "OUT", str(path), "it is the input recording")
+    refuse_existing("convert", "OUT", path, args.source, force=args.force)
     return _write(recording, path, as_json=args.json)
 
 
 def _write(recording: Any, path: Path, *, as_json: bool) -> int:
     counted = {"events": 0}
-    with _bar(recording.name) as show:
+    with event_count(recording.name) as show:
 
         def progress(events: int) -> None:
             counted["events"] = events
             show(events)
 
-        WRITERS[path.suffix](recording, path, progress)
+        left_out = WRITERS[path.suffix](recording, path, progress)
+    if left_out:
+        print(
+            f"neurove: {path} lacks {', '.join(left_out)}: {path.suffix} cannot hold them, .mcap can", file=sys.stderr
+        )
+    tell_faults(recording)
     size = path.stat().st_size
     summary = {"file": str(path), "bytes": size, "events": counted["events"], "streams": recording.streams}
+    summary |= {"left_out": left_out, "faults": [fault.as_json() for fault in recording.faults.found]}
     if as_json:
         print(json.dumps(summary))
     else:
         print(f"{path}: {counted['events']:,} events of {recording.name}, {size:,} bytes")
-    return 0
+    return EXIT_FAILURE if recording.faults.unread else 0
 
 
 def info(args: argparse.Namespace) -> int:
@@ -164,20 +173,23 @@ def info(args: argparse.Namespace) -> int:
         console().print(survey_table(found))
     if args.plot:
         print(f"wrote {args.plot}", file=sys.stderr)
-    if found.broken:
+    if found.broken and not recording.faults.unread:
         print(f"neurove: {found.broken}", file=sys.stderr)
-    return EXIT_FAILURE if found.broken else 0
+    tell_faults(recording)
+    return EXIT_FAILURE if found.broken or found.faults else 0
 
 
 def simulate(args: argparse.Namespace) -> int:
     """Record a simulated event camera with its exact motion."""
     from neurove_core.sources import open_source
 
-    if args.scene == "carla":
-        return _simulate_carla(args)
     path: Path = args.out
+    if args.scene == "carla":
+        refuse_existing("simulate", "--out", path, None, force=args.force)
+        return _simulate_carla(args)
     if path.suffix not in WRITERS:
         raise InvalidField("simulate", "--out", str(path), f"its name must end in {' or '.join(WRITERS)}")
+    refuse_existing("simulate", "--out", path, None, force=args.force)
     query = {name: getattr(args, name) for name in ("trajectory", "camera", "height", "pitch", "seed", "seconds")}
     given = {name: value for name, value in query.items() if value is not None}
     recording = open_source(f"sim://{args.scene}?{urllib.parse.urlencode(given)}")
@@ -195,24 +207,6 @@ def _simulate_carla(args: argparse.Namespace) -> int:
     summary = {"file": str(args.out), "events": events}
     print(json.dumps(summary) if args.json else f"{args.out}: {events:,} events")
     return 0
-
-
-@contextlib.contextmanager
-def _bar(name: str) -> Iterator[Progress]:
-    """Show the events converted so far on a terminal; the length of a recording is unknown before its end."""
-    from rich.progress import Progress as Bar
-    from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
-
-    from neurove_service.cli.console import console
-
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with Bar(*columns, console=console(stderr=True), disable=not sys.stderr.isatty()) as bar:
-        task = bar.add_task(name, total=None)
-
-        def show(events: int) -> None:
-            bar.update(task, description=f"{name}: {events:,} events")
-
-        yield show
 
 
 def add_record(parser: argparse.ArgumentParser) -> None:
@@ -233,6 +227,7 @@ def add_convert(parser: argparse.ArgumentParser) -> None:
         "out", type=Path, metavar="OUT", help="file to write, ending in .mcap (packet log) or .h5 (DSEC)"
     )
     add_recording_flags(parser)
+    parser.add_argument("--force", action="store_true", help="replace OUT if it exists")
 
 
 def add_info(parser: argparse.ArgumentParser) -> None:
@@ -252,6 +247,7 @@ def add_simulate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", metavar="SCENE", help=scenes)
     about = "file to write: .mcap (packet log) or .h5 (DSEC); .npz for carla"
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help=about)
+    parser.add_argument("--force", action="store_true", help="replace FILE if it exists")
     parser.add_argument("--seconds", type=seconds, default=10.0, metavar="S", help="seconds to simulate; default 10 s")
     about = "seed of scene, trajectory and pixels; default 0"
     parser.add_argument("--seed", type=int, default=0, metavar="N", help=about)

@@ -19,6 +19,7 @@ from neurove_service.cli.arguments import (
     flags,
     seconds,
     subcommand,
+    tell_faults,
 )
 from neurove_service.cli.parser import Parser
 from neurove_service.config import ServiceConfig, load
@@ -65,15 +66,19 @@ def drive(args: argparse.Namespace) -> int:
             raise ask.NoService(f"no service subscribed to stream {player.label} within {args.wait:g} s{hint}")
         duration_s = math.inf if args.seconds is None else args.seconds
         sent = player.play(stop, speed=args.speed, loop=args.loop, duration_s=duration_s)
-    broken = sent.broken.message if sent.broken else None
+    faults = recording.faults
+    broken = sent.broken.message if sent.broken else next(map(str, faults.unread), None)
     if args.json:
         sensor = {"width": recording.sensor.width, "height": recording.sensor.height}
-        print(json.dumps({"sensor": sensor, "packets": sent.packets, "events": sent.events, "broken": broken}))
+        found = [fault.as_json() for fault in faults.found]
+        played = {"packets": sent.packets, "events": sent.events, "broken": broken, "faults": found}
+        print(json.dumps({"sensor": sensor, **played}))
     else:
         about = f"{recording.name} ({recording.sensor})"
         print(f"{player.label}: {sent.packets:,} packets, {sent.events:,} events of {about}")
-    if broken:
+    if sent.broken:
         print(f"neurove: {broken}", file=sys.stderr)
+    tell_faults(recording)
     return EXIT_FAILURE if broken else 0
 
 

@@ -19,7 +19,14 @@ from neurove_service.latency import latency
 if TYPE_CHECKING:
     from neurove_core.io.summary import Summary
 
-_VERDICT_STYLE = {"ok": "green", "lossy": "yellow", "stalled": "bold red", "idle": "dim"}
+_VERDICT_STYLE = {
+    "ok": "green",
+    "lossy": "yellow",
+    "stalled": "bold red",
+    "idle": "dim",
+    "unstable": "bold red",
+    "uncertain": "yellow",
+}
 _RATE_ESTIMATES = 40
 _BLOCKS = "▁▂▃▄▅▆▇█"
 _PLAIN: dict[str, Any] = {"box": None, "padding": (0, 2, 0, 0), "header_style": "dim"}

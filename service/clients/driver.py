@@ -105,7 +105,7 @@ class Driver:
                 if sent.first_us is None:
                     began = time.monotonic()  # not earlier: opening and decoding take time
                 first_us = piece.t0_us if sent.first_us is None else sent.first_us
-                elapsed_s = (piece.end_us - first_us) / 1e6
+                elapsed_s = (piece.end_us - first_us - piece.skipped_us) / 1e6
                 if elapsed_s > duration_s or _stopped(stop, began + elapsed_s / speed):
                     break
                 self._send(sent.packets, piece)
@@ -117,7 +117,7 @@ class Driver:
 
     def _send(self, seq: int, piece: Slice) -> None:
         packet = EventPacket(self._stream, seq, self._recording.sensor, piece.t0_us, piece.events)
-        self._publisher.put(encode_packet(packet))
+        self._publisher.put(encode_packet(packet), sent_us=time.monotonic_ns() // 1000)
 
 
 def _stopped(stop: threading.Event, due: float) -> bool:

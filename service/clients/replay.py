@@ -113,7 +113,7 @@ class Replay:
                     first_us = packet.t0_us if sent.first_us is None else sent.first_us
                     last_us = int(packet.events.t[-1]) if packet.events.n else sent.last_us
                     sent = sent._replace(events=sent.events + packet.events.n, first_us=first_us, last_us=last_us)
-                self._publishers[recorded.stream].put(recorded.payload)
+                self._publishers[recorded.stream].put(recorded.payload, sent_us=time.monotonic_ns() // 1000)
                 sent = sent._replace(packets=sent.packets + 1)
         except BrokenRecording as error:
             return sent._replace(broken=error)

@@ -4,13 +4,18 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from neurove_protocol import TwistEstimate
+from neurove_protocol import Flag, TwistEstimate
 from neurove_protocol.control import Losses
 
 IDLE_NS = 1_000_000_000
 """A stream is idle after this time without a packet."""
 
+MAX_COUNT = (1 << 63) - 1
+"""A counter stops here, because it could not be sent otherwise."""
+
 _LATENCIES = 512
+_RESETS = 64
+_UNSURE = frozenset((Flag.UNCERTAIN, Flag.SETTLING, Flag.FROZEN))
 
 
 @dataclass
@@ -27,10 +32,17 @@ class Counters:
     overload_packets: int = 0
     duplicate_packets: int = 0
     out_of_order_packets: int = 0
+    foreign_packets: int = 0
+    stale_packets: int = 0
     malformed_packets: int = 0
     failed_packets: int = 0
     late_events: int = 0
     skipped_windows: int = 0
+    shed_windows: int = 0
+    restart_windows: int = 0
+    recovered_packets: int = 0
+    uncounted_packets: int = 0
+    refused_cameras: int = 0
 
     def losses(self) -> Losses:
         """The counters of data that is not part of an estimate."""
@@ -50,6 +62,10 @@ class Activity:
         self.last_packet_ns = self.last_estimate_ns = self.flow_began_ns = now_ns()
         self.last_loss_ns: int | None = None
         self.taken_ns = 0  # when the newest packet was taken out of the queue
+        self.reset_ns: deque[int] = deque(maxlen=_RESETS)  # times of the newest resets
+        self.newest_ns: dict[str, int] = {}  # counter or flag -> when it last grew
+        self.certain_ns = self.last_estimate_ns  # newest estimate that was neither uncertain nor settling
+        self.refusal = ""  # why the newest packet or CameraInfo was refused
         self._now_ns = now_ns
 
     @property
@@ -60,15 +76,33 @@ class Activity:
     def heard(self, received_ns: int) -> None:
         """Record when a packet arrived."""
         if received_ns - self.last_packet_ns > IDLE_NS:
-            self.flow_began_ns = received_ns
+            self.flow_began_ns = self.certain_ns = received_ns
         self.last_packet_ns = received_ns
+
+    def add(self, name: str, number: int) -> None:
+        """Increase a counter, by its name."""
+        setattr(self.counters, name, min(MAX_COUNT, getattr(self.counters, name) + number))
+        self.newest_ns[name] = self._now_ns()
 
     def lost(self, name: str, number: int) -> None:
         """Count a loss, by the name of its counter; `number` is above 0."""
-        setattr(self.counters, name, getattr(self.counters, name) + number)
+        self.add(name, number)
         self.last_loss_ns = self._now_ns()
+
+    def grew_within(self, name: str, seconds: float, now_ns: int) -> bool:
+        """Whether a counter grew in the last seconds."""
+        return name in self.newest_ns and now_ns - self.newest_ns[name] < seconds * 1e9
+
+    def was_reset(self) -> None:
+        """Count a reset of the recurrent state."""
+        self.add("resets", 1)
+        self.reset_ns.append(self._now_ns())
 
     def published(self, estimate: TwistEstimate) -> None:
         """Record the latency of an estimate."""
         self.latencies_ms.append(estimate.trace.latency_ms)
         self.last_estimate_ns = estimate.trace.published_ns
+        if Flag.FROZEN in estimate.flags:
+            self.newest_ns["frozen"] = self.last_estimate_ns
+        if not _UNSURE.intersection(estimate.flags):
+            self.certain_ns = estimate.trace.published_ns

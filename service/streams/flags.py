@@ -10,6 +10,7 @@ class _Gap(NamedTuple):
     start_us: int
     end_us: int
     flags: frozenset[Flag]
+    recoverable: bool  # its packets may still arrive
 
 
 class Flags:
@@ -18,37 +19,59 @@ class Flags:
     def __init__(self) -> None:
         self._gaps: list[_Gap] = []
         self._pending: set[Flag] = set()
+        self._missing = self._recoverable = False
 
     def set_next(self, flag: Flag) -> None:
         """Set a flag on the next estimate; OVERLOAD waits until the gap that it caused is known."""
         self._pending.add(flag)
 
-    def add_gap(self, start_us: int | None, end_us: int, lost: int) -> None:
-        """Flag the windows of a gap.
+    def missing(self, *, recoverable: bool = False) -> None:
+        """Packets are missing between the newest one and the next one.
+
+        Args:
+            recoverable: whether they may still arrive; then `recovered` says so.
+        """
+        self._recoverable = recoverable and not self._missing
+        self._missing = True
+
+    def close_gap(self, start_us: int | None, end_us: int) -> None:
+        """The next packet arrived: flag the windows of the gap before it, if packets were missing.
 
         Args:
             start_us: sensor time up to which all events are known [us]; None before the first packet.
-            end_us: start of the first packet after the gap [us].
-            lost: packets lost before this node.
+            end_us: start of the packet [us].
         """
-        flags = {Flag.GAP} if lost else set()
+        if not self._missing:
+            return
+        flags = {Flag.GAP}
         if Flag.OVERLOAD in self._pending:
-            flags |= {Flag.OVERLOAD, Flag.GAP}
+            flags.add(Flag.OVERLOAD)
             self._pending.discard(Flag.OVERLOAD)
-        if start_us is not None and flags:
-            self._gaps.append(_Gap(start_us, end_us, frozenset(flags)))
+        start_us = end_us if start_us is None else start_us
+        self._gaps.append(_Gap(start_us, max(end_us, start_us + 1), frozenset(flags), self._recoverable))
+        self._missing = self._recoverable = False
+
+    def recovered(self) -> None:
+        """The packets of the newest gap have arrived after all."""
+        if self._gaps and self._gaps[-1].recoverable:
+            self._gaps.pop()
 
     def forget_gaps(self) -> None:
         """Forget all gaps: the stream restarts."""
         self._gaps.clear()
+        self._missing = self._recoverable = False
 
-    def of(self, window: WindowEstimate, camera: CameraInfo | None, *, trained: bool) -> tuple[str, ...]:
+    def of(
+        self, window: WindowEstimate, camera: CameraInfo | None, *, trained: bool, late: bool, frozen: bool
+    ) -> tuple[str, ...]:
         """The flags of an estimate.
 
         Args:
             window: the estimate.
             camera: the calibration of the sensor, if it is known.
             trained: whether the model is trained.
+            late: whether it is published long after the end of the window.
+            frozen: whether the camera repeats the same events.
         """
         conditions = {
             Flag.UNTRAINED: not trained,
@@ -59,6 +82,8 @@ class Flags:
             Flag.LOW_ACTIVITY: window.low_activity,
             Flag.SATURATED: window.saturated,
             Flag.UNCERTAIN: window.uncertain,
+            Flag.LATE: late,
+            Flag.FROZEN: frozen,
         }
         flags = {flag for flag, holds in conditions.items() if holds} | self._pending
         self._pending.clear()

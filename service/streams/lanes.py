@@ -56,6 +56,11 @@ class Lanes:
         return self.serving_lane.state.windows.horizon_us if self.serving_lane else None
 
     @property
+    def open_events(self) -> int:
+        """Number of events in the open window."""
+        return self.serving_lane.state.windows.events if self.serving_lane else 0
+
+    @property
     def has_backlog(self) -> bool:
         """Whether the standby model has a backlog."""
         return self.standby is not None and self.standby.has_backlog

@@ -33,6 +33,8 @@ class StreamSettings(NamedTuple):
     queue_bytes: int
     ring: RingSize
     limits: PacketLimits
+    node: str | None = None
+    max_age_s: float = 1.0
 
 
 class StreamRegistry:
@@ -52,14 +54,14 @@ class StreamRegistry:
         self._lock = threading.Lock()  # of both dicts; only its worker changes a stream
         self._closed = False
 
-    def put_packet(self, stream: str, payload: bytes, received_ns: int) -> None:
+    def put_packet(self, stream: str, payload: bytes, received_ns: int, sent_us: int | None = None) -> None:
         """Queue an event packet, on Zenoh's thread: this finds or starts a worker and appends, nothing else."""
         with self._lock:
             worker = self._worker_of(stream)
             if worker is not None:
-                worker.put_packet(payload, received_ns)
+                worker.put_packet(payload, received_ns, sent_us)
 
-    def put_camera(self, stream: str, payload: bytes, received_ns: int) -> None:
+    def put_camera(self, stream: str, payload: bytes, received_ns: int, _sent_us: int | None = None) -> None:
         """Queue a CameraInfo, as put_packet."""
         with self._lock:
             worker = self._worker_of(stream)
@@ -120,7 +122,7 @@ class StreamRegistry:
             return None
         settings = self._settings
         worker = StreamWorker(
-            Stream(name, self._models, ring=settings.ring),
+            Stream(name, self._models, ring=settings.ring, node=settings.node, max_age_s=settings.max_age_s),
             lambda: self._open_outlet(name),
             Inbox(settings.queue_s, settings.queue_bytes),
             settings.limits,

@@ -12,7 +12,8 @@ from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.events import PacketLimits
 from neurove_protocol.velocity import TwistEstimate
 from neurove_service import logs
-from neurove_service.streams.stream import Arrival, Stream
+from neurove_service.streams.intake import Arrival
+from neurove_service.streams.stream import Stream
 
 log = logs.get(__name__)
 
@@ -28,6 +29,7 @@ class Sample(NamedTuple):
     payload: bytes
     received_ns: int
     is_camera: bool
+    sent_us: int | None = None  # as in Arrival
 
     @property
     def size(self) -> int:
@@ -117,9 +119,9 @@ class StreamWorker:
         self._thread = threading.Thread(target=self._run, name=f"stream {stream.name}", daemon=True)
         self._thread.start()
 
-    def put_packet(self, payload: bytes, received_ns: int) -> None:
+    def put_packet(self, payload: bytes, received_ns: int, sent_us: int | None = None) -> None:
         """Queue an event packet."""
-        self._inbox.put(Sample(payload, received_ns, is_camera=False))
+        self._inbox.put(Sample(payload, received_ns, is_camera=False, sent_us=sent_us))
 
     def put_camera(self, payload: bytes, received_ns: int) -> None:
         """Queue a CameraInfo."""
@@ -168,12 +170,12 @@ class StreamWorker:
             self._set_camera(lambda: CameraInfo.decode(sample.payload))
             return
         try:
-            arrival = Arrival(sample.received_ns, time.monotonic_ns())
+            arrival = Arrival(sample.received_ns, time.monotonic_ns(), sample.sent_us)
             packet = read_packet(sample.payload, self._limits)
             for estimate in self.stream.accept(packet, arrival):
                 self._publish(estimate, outlet)
         except NeuroVEError as error:
-            total = self.stream.refused(sample.received_ns)
+            total = self.stream.refused(sample.received_ns, error.message)
             if total & (total - 1) == 0:  # log the 1st, 2nd, 4th, 8th, ...: packets are only counted
                 log.warning("packet refused", stream=self.stream.name, why=error.message, total=total)
         except Exception:  # an internal error on one packet must not end the stream
@@ -191,6 +193,7 @@ class StreamWorker:
             camera = get()
         except NeuroVEError as error:
             log.warning("camera info refused", stream=self.stream.name, why=error.message)
+            self.stream.refused_camera(error.message)
             return
         if camera is not None:
             self.stream.set_camera(camera)

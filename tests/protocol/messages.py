@@ -76,13 +76,21 @@ STATUS: Fields = {
         "overload_packets": 0,
         "duplicate_packets": 0,
         "out_of_order_packets": 0,
+        "foreign_packets": 0,
+        "stale_packets": 0,
         "malformed_packets": 0,
         "failed_packets": 0,
         "late_events": 41,
         "skipped_windows": 0,
+        "shed_windows": 0,
+        "restart_windows": 0,
     },
     "latency_ms": {"p50": 3.25, "p95": 5.5, "p99": 9.75},
     "last_packet_age_s": 0.004,
+    "recovered_packets": 0,
+    "uncounted_packets": 0,
+    "refused_cameras": 1,
+    "refusal": "t0_us=-1: must be 0 or more",
 }
 EXAMPLES: dict[str, Fields] = {
     "EventPacket": {
@@ -125,6 +133,8 @@ EXAMPLES: dict[str, Fields] = {
         "flags": ["settling", "uncalibrated"],
         "covariance": [0.25 if i == j else 0.125 if i + j == 2 else 0.0 for i in range(6) for j in range(6)],
         "trace": {"received_ns": 1_000, "queued_ns": 2_000, "computed_ns": 3_000, "published_ns": 4_000},
+        "node": "rover-1",
+        "host": {"end_ns": 1_700_000_000_000_000_000, "uncertainty_ns": 200_000, "age_ns": 4_000_000},
     },
     "StreamStatus": STATUS,
     "HealthRequest": {"v": 1},
@@ -159,9 +169,16 @@ EXAMPLES: dict[str, Fields] = {
     "ChunkRequest": {"v": 1, "offset": 1_048_576, "length": 478_208},
     "ProgressReply": {"v": 1, "node": "rover-1", "step": "fetching", "text": "1.0 of 1.5 MiB"},
     "PushReply": {"v": 1, "node": "rover-1", "model": MODEL, "fetched": 1_526_784},
-    "ActivateRequest": {"v": 1, "model": "spire-7", "expect": "6e0a5e5e", "shadow_s": 30.0, "canary": ["cam0"]},
+    "ActivateRequest": {
+        "v": 1,
+        "model": "spire-7",
+        "expect": "6e0a5e5e",
+        "shadow_s": 30.0,
+        "canary": ["cam0"],
+        "force": "new lens",
+    },
     "RollbackRequest": {"v": 1, "expect": "5e5e5e5e"},
-    "ActivateReply": {"v": 1, "node": "rover-1", "active": MODEL, "previous": MODEL, "epoch": 3},
+    "ActivateReply": {"v": 1, "node": "rover-1", "active": MODEL, "previous": MODEL, "epoch": 3, "changed": True},
     "ErrorReply": {
         "v": 1,
         "code": "unknown_model",
@@ -284,8 +301,9 @@ statuses = st.fixed_dictionaries(
     {
         "node": names,
         "stream": names,
-        "verdict": st.sampled_from(["ok", "lossy", "stalled", "idle"]),
+        "verdict": st.sampled_from(["ok", "lossy", "stalled", "idle", "unstable", "uncertain"]),
         "why": sentences,
+        "refusal": sentences,
         "calibrated": st.booleans(),
         "lost": st.fixed_dictionaries(dict.fromkeys(STATUS["lost"], counts)),
         "latency_ms": st.none() | st.fixed_dictionaries(dict.fromkeys(("p50", "p95", "p99"), floats)),
@@ -341,6 +359,8 @@ def estimates(draw: st.DrawFn) -> Fields:
         "flags": draw(st.lists(sentences, max_size=4)),
         "covariance": draw(st.none() | covariances()),
         "trace": draw(st.fixed_dictionaries(dict.fromkeys(EXAMPLES["TwistEstimate"]["trace"], int64s))),
+        "node": draw(st.none() | names),
+        "host": draw(st.none() | st.fixed_dictionaries({"end_ns": int64s, "uncertainty_ns": counts, "age_ns": counts})),
     }
 
 
@@ -395,10 +415,13 @@ ANY: dict[str, st.SearchStrategy[Fields]] = {
             "expect": st.none() | prefixes,
             "shadow_s": st.floats(0, 3600),
             "canary": st.lists(names, max_size=3),
+            "force": st.none() | sentences.filter(bool).map(lambda text: text[:200]),
         }
     ),
     "RollbackRequest": st.fixed_dictionaries({"expect": st.none() | prefixes}),
-    "ActivateReply": st.fixed_dictionaries({"node": names, "active": models, "previous": models, "epoch": counts}),
+    "ActivateReply": st.fixed_dictionaries(
+        {"node": names, "active": models, "previous": models, "epoch": counts, "changed": st.booleans()}
+    ),
     "ErrorReply": st.fixed_dictionaries(
         {
             "code": sentences,
@@ -426,9 +449,8 @@ def packets(draw: st.DrawFn, max_events: int = 40, max_span_us: int = 2**32 - 1)
         )
     )
     t, x, y, p = zip(*sorted(rows), strict=True) if rows else ((), (), (), ())
-    return EventPacket(
-        draw(names), draw(counts), sensor, t0_us, Events.from_columns([t0_us + offset for offset in t], x, y, p)
-    )
+    events = Events.from_columns([t0_us + offset for offset in t], x, y, p)
+    return EventPacket(draw(names), draw(counts), sensor, t0_us, events)
 
 
 def same(left: object, right: object) -> bool:

@@ -39,16 +39,20 @@ WRONG: dict[type, tuple[Any, ...]] = {
 }
 NULLABLE = {
     ("TwistEstimate", "covariance"),
+    ("TwistEstimate", "node"),
+    ("TwistEstimate", "host"),
     ("CameraInfo", "height_m"),
     ("StreamStatus", "latency_ms"),
     ("HealthReply", "latency_ms"),
     ("ModelsReply", "previous"),
     ("PushRequest", "signature"),
     ("ActivateRequest", "expect"),
+    ("ActivateRequest", "force"),
     ("RollbackRequest", "expect"),
 }
 FREE_MAPS = ("details", "unreadable", "figures", "partial")
 DEFAULTED = {"release", "figures", "signature"}  # of a ModelInfo
+DEFAULTED |= {"recovered_packets", "uncounted_packets", "refused_cameras", "refusal"}  # of a StreamStatus
 OUT_OF_BOUND: dict[str, dict[str, tuple[Any, ...]]] = {
     "EventPacket": {
         "stream": ("", "a/b", "@node", "*", "**", ".", "..", "-a", "a" * 65, "caf\u00e9", "a b", "a\n", "$*", "#", "?"),
@@ -118,6 +122,7 @@ OUT_OF_BOUND: dict[str, dict[str, tuple[Any, ...]]] = {
         "expect": ("", "5e5e5e5", "5E5E5E5E", "5e" * 33),
         "shadow_s": (-0.5, 3600.5),
         "canary": (["a/b"], [""]),
+        "force": ("", "m" * 201),
     },
     "RollbackRequest": {"expect": ("", "5e5e5e5")},
     "ActivateReply": {"node": ("",), "epoch": (-1,)},

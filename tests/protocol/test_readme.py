@@ -18,7 +18,19 @@ import pytest
 from pydantic import BaseModel
 
 import neurove_protocol
-from neurove_protocol import EventPacket, Events, Flag, Sensor, Trace, TwistEstimate, camera, control, events, velocity
+from neurove_protocol import (
+    EventPacket,
+    Events,
+    Flag,
+    HostTime,
+    Sensor,
+    Trace,
+    TwistEstimate,
+    camera,
+    control,
+    events,
+    velocity,
+)
 from neurove_protocol.codec import PROTOCOL_VERSION
 from neurove_protocol.control import Latency, Losses, ModelInfo, Verdict
 from neurove_protocol.events import FORMATS, decode_packet, encode_packet
@@ -43,7 +55,8 @@ def bytes_of(dump: str) -> bytes:
 def packet_of(said: dict[str, Any]) -> EventPacket:
     t, x, y, p = zip(*said["events"], strict=True) if said["events"] else ((), (), (), ())
     sensor = Sensor(said["width"], said["height"])
-    return EventPacket(said["stream"], said["seq"], sensor, said["t0_us"], Events.from_columns(t, x, y, p))
+    events = Events.from_columns(t, x, y, p)
+    return EventPacket(said["stream"], said["seq"], sensor, said["t0_us"], events)
 
 
 def section(heading: str) -> str:
@@ -125,8 +138,8 @@ def test_the_table_of_a_message_has_its_fields_and_says_which_have_a_default(mod
 
 @pytest.mark.parametrize(
     ("heading", "part"),
-    [("`trace`", Trace), ("`lost`", Losses), ("`latency_ms`", Latency), ("ModelInfo", ModelInfo)],
-    ids=["trace", "lost", "latency", "model"],
+    [("`trace`", Trace), ("`host`", HostTime), ("`lost`", Losses), ("`latency_ms`", Latency), ("ModelInfo", ModelInfo)],
+    ids=["trace", "host", "lost", "latency", "model"],
 )
 def test_the_table_of_a_part_has_its_fields_and_says_which_have_a_default(heading: str, part: type[BaseModel]) -> None:
     assert_fields(table(f"field of {heading}"), part)

@@ -15,7 +15,8 @@ from neurove_core.models.bundle import PER_HEIGHT
 from neurove_core.sources import open_source
 from neurove_protocol import EventPacket
 from neurove_service.models.slot import ModelSlot
-from neurove_service.streams.stream import Arrival, Stream
+from neurove_service.streams.intake import Arrival
+from neurove_service.streams.stream import Stream
 
 SMALL = ModelConfig(
     canonical=CanonicalConfig(width=24, height=18), network=NetworkConfig(channels=(4, 4), features=8, hidden=8)

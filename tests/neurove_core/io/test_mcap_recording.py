@@ -224,12 +224,12 @@ def test_a_truncated_file_gives_its_complete_packets_and_then_an_error(tmp_path)
         ),
     ],
 )
-def test_an_invalid_packet_ends_the_events_with_its_place_but_not_the_packets(tmp_path, payloads, why):
-    good = make_packet(t0_us=5000)
-    path = write(tmp_path / "a.mcap", [("cam0", one) for one in (encode_packet(good), *payloads, b"last")])
+def test_an_invalid_packet_is_skipped_and_counted_with_its_place(tmp_path, payloads, why):
+    good, after = make_packet(t0_us=5000), make_packet(t0_us=900_000, seq=2)
+    path = write(tmp_path / "a.mcap", [("cam0", one) for one in (encode_packet(good), *payloads, encode_packet(after))])
     recording = McapRecording.open(path)
     got, error = read_broken(recording)
-    assert_same(got, good.events)
+    assert_same(got, Events.join([good.events, after.events]))
     assert error is not None
     assert why in error.message
     assert "byte" in error.message

@@ -78,10 +78,10 @@ def test_a_file_larger_than_a_block_is_read_completely(tmp_path):
     ("x", "y", "t", "why"),
     [(64, 3, 30, "outside the sensor"), (3, 48, 30, "outside the sensor"), (3, 4, 19, "comes after t=20 us")],
 )
-def test_a_bad_record_ends_the_recording_and_the_error_names_its_byte(x, y, t, why, tmp_path):
+def test_a_bad_record_is_skipped_and_counted_with_its_byte(x, y, t, why, tmp_path):
     events = Events.from_columns([10, 20, t, 40], [1, 2, x, 4], [1, 2, y, 4], [0, 1, 0, 1])
     got, error = read_broken(open_source(put(tmp_path, "a.dat", dat(events))))
-    assert_same(got, events.span(0, 2))
+    assert_same(got, Events(*(np.delete(column, 2) for column in events)))
     assert error is not None
     assert error.details["where"] == f"byte {len(HEADER) + 2 + 16}"
     assert why in error.message
@@ -99,8 +99,8 @@ def test_a_truncated_file_gives_its_complete_records_and_then_names_the_byte(mis
 
 def test_an_incomplete_header_is_refused(tmp_path):
     with pytest.raises(MissingGeometry, match="--sensor"):
-        open_source(put(tmp_path, "a.dat", b"% Version 1\n\x00\x08"))
-    assert open_source(put(tmp_path, "a.dat", b"% Version 1\n\x00\x08"), SENSOR).sensor == SENSOR
+        open_source(put(tmp_path, "a.dat", b"% Version 2\n\x00\x08"))
+    assert open_source(put(tmp_path, "a.dat", b"% Version 2\n\x00\x08"), SENSOR).sensor == SENSOR
     with pytest.raises(UnknownSource, match="records are of type 0x0c and 16 bytes"):
         open_source(put(tmp_path, "a.dat", HEADER + b"\x0c\x10"))
     with pytest.raises(BrokenRecording, match="ends within its header"):
@@ -114,8 +114,10 @@ def test_a_dat_file_of_triggers_has_triggers_and_no_events(tmp_path):
     assert read_broken(recording)[0].n == 0
     assert columns(all_triggers(recording)) == [[(1 << 32) - 1, (1 << 32) + 4], [3, 0], [0, 1]]
     backwards = np.array([(7, 1), (6, 0)], RECORD)
-    with pytest.raises(BrokenRecording, match=f"byte {len(HEADER) + 2 + 8}: time runs backwards"):
-        all_triggers(open_source(put(tmp_path, "a.dat", HEADER + b"\x0e\x08" + backwards.tobytes())))
+    recording = open_source(put(tmp_path, "a.dat", HEADER + b"\x0e\x08" + backwards.tobytes()))
+    assert columns(all_triggers(recording)) == [[7], [0], [1]]
+    (fault,) = recording.faults.found
+    assert (fault.stream, fault.reason, fault.where) == ("triggers", "late", f"byte {len(HEADER) + 2 + 8}")
 
 
 def test_the_triggers_of_a_raw_file_are_found_between_its_events(tmp_path):
@@ -130,14 +132,15 @@ def test_the_triggers_of_a_raw_file_are_found_between_its_events(tmp_path):
     assert columns(all_triggers(recording)) == [[67], [1], [1]]
 
 
-def test_triggers_end_at_an_unknown_or_truncated_word(tmp_path):
+def test_triggers_pass_over_a_reserved_word_and_end_at_a_truncated_one(tmp_path):
     words = evt3((TIME_HIGH, 1), (TRIGGER, 1), (0x9, 1), (TRIGGER, 0))
-    for data, where in ((words.tobytes(), 4), (words[:2].tobytes() + b"\0", 4)):
-        recording = open_source(put(tmp_path, "a.raw", HEADER_EVT3 + data))
-        triggers = recording.triggers()
-        assert columns(next(iter(triggers))) == [[4096], [0], [1]]
-        with pytest.raises(BrokenRecording, match=f"byte {len(HEADER_EVT3) + where}"):
-            next(iter(triggers))
+    recording = open_source(put(tmp_path, "a.raw", HEADER_EVT3 + words.tobytes()))
+    assert columns(all_triggers(recording)) == [[4096, 4096], [0, 0], [1, 0]]
+    assert not recording.faults.found
+    recording = open_source(put(tmp_path, "a.raw", HEADER_EVT3 + words[:2].tobytes() + b"\0"))
+    assert columns(all_triggers(recording)) == [[4096], [0], [1]]
+    (fault,) = recording.faults.found
+    assert (fault.stream, fault.reason, fault.where) == ("triggers", "unread", f"byte {len(HEADER_EVT3) + 4}")
 
 
 def test_the_real_recordings_have_no_triggers():
@@ -197,17 +200,17 @@ def test_words_of_another_format_are_refused(header, why, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("bad", "why"),
+    ("bad", "where", "why"),
     [
-        (0x9123, "0x9123 has an unknown word type"),
-        (ADDR_X << 12 | 64, "x=64 y=7 lies outside the sensor 64x48"),
+        (0x9123, f"byte {len(HEADER_EVT3) + 6}", "the word 0x9123 has a reserved type"),
+        (ADDR_X << 12 | 64, "event 1", "x=64 y=7 lies outside the sensor 64x48"),
     ],
 )
-def test_a_bad_word_ends_the_recording_and_the_error_names_its_byte(bad, why, tmp_path):
+def test_a_bad_word_is_skipped_and_counted_with_its_place(bad, where, why, tmp_path):
     good = evt3((TIME_HIGH, 1), (ADDR_Y, 7), (ADDR_X, 63))
     words = np.concatenate([good, np.array([bad], np.uint16), good])
     events, error = read_broken(open_source(put(tmp_path, "a.raw", HEADER_EVT3 + words.tobytes())))
-    assert events.n == 1
+    assert events.n == 2
     assert error is not None
-    assert error.details["where"] == f"byte {len(HEADER_EVT3) + 6}"
+    assert error.details["where"] == where
     assert why in error.message

@@ -9,8 +9,10 @@ from rich.console import Console
 from neurove_protocol.control import HealthReply, Losses, ModelInfo, ModelsReply
 from neurove_service.cli.views import Board, health_table, models_table
 from neurove_service.node.health import stream_status
-from neurove_service.streams.stream import Arrival, Stream
+from neurove_service.streams.intake import Arrival
+from neurove_service.streams.stream import Stream
 from tests.builders import make_packets
+from tests.service.conftest import arrived
 
 INFO = ModelInfo(name="one", digest="ab" * 32, trained=False, provenance="a test", parameters=1234)
 
@@ -44,7 +46,7 @@ def test_a_board_shows_the_newest_velocity_its_flags_and_every_loss(stream):
 
 def test_a_board_shows_the_standard_deviation_of_each_axis(stream):
     board = Board()
-    for estimate in (one for packet in make_packets(60) for one in stream.accept(packet, Arrival(1, 2))):
+    for estimate in (one for packet in make_packets(60) for one in stream.accept(packet, arrived())):
         covariance = [0.0] * 36
         covariance[0], covariance[35] = 0.0625, 4e8
         board.on_estimate(estimate.model_copy(update={"covariance": tuple(covariance)}))
@@ -54,7 +56,7 @@ def test_a_board_shows_the_standard_deviation_of_each_axis(stream):
 
 def test_a_board_counts_missed_estimates(stream):
     board = Board()
-    estimates = [one for packet in make_packets(60) for one in stream.accept(packet, Arrival(1, 2))]
+    estimates = [one for packet in make_packets(60) for one in stream.accept(packet, arrived())]
     for estimate in (estimates[0], estimates[3]):
         board.on_estimate(estimate)
     assert (board.of("cam0").count, board.of("cam0").missed) == (2, 2)

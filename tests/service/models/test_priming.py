@@ -15,9 +15,9 @@ from neurove_service.models.change import Rules
 from neurove_service.models.slot import ModelSlot
 from neurove_service.streams.history import RingSize
 from neurove_service.streams.lane import windows_to_prime
-from neurove_service.streams.stream import Arrival, Stream
+from neurove_service.streams.stream import Stream
 from tests.builders import make_packets
-from tests.service.conftest import SMALL
+from tests.service.conftest import SMALL, arrived
 from tests.service.models.test_swap import LAX, feed, motion, wait_until
 
 PACKETS = make_packets(6_000, n=50, step_us=25_000)
@@ -62,8 +62,7 @@ class Camera:
 
     def _run(self):
         for packet in PACKETS:
-            now_ns = time.monotonic_ns()
-            self.estimates += self.stream.accept(replace(packet, stream=self.stream.name), Arrival(now_ns, now_ns))
+            self.estimates += self.stream.accept(replace(packet, stream=self.stream.name), arrived())
             until = time.monotonic() + 0.003
             while self.stream.lanes.has_backlog and time.monotonic() < until:
                 self.stream.lanes.run_standby()

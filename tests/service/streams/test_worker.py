@@ -1,4 +1,5 @@
 import threading
+import time
 
 import pytest
 
@@ -89,14 +90,14 @@ def worker(slot, published):
 
 def test_bytes_in_estimates_out(worker, published):
     for packet in make_packets(100):
-        worker.put_packet(encode_packet(packet), 1)
+        worker.put_packet(encode_packet(packet), time.monotonic_ns())
     assert [one.seq for one in published.wait_for(7)] == list(range(7))
     assert all(one.trace.received_ns <= one.trace.queued_ns <= one.trace.computed_ns for one in published.estimates)
 
 
 def test_malformed_packets_are_counted_and_lose_nothing_else(worker, published):
     for packet in make_packets(100):
-        worker.put_packet(encode_packet(packet), 1)
+        worker.put_packet(encode_packet(packet), time.monotonic_ns())
         worker.put_packet(b"\x81garbage", 1)
     published.wait_for(7)
     assert worker.stream.counters.losses().nonzero().keys() <= {"malformed_packets"}
@@ -112,7 +113,7 @@ def test_an_internal_error_on_a_packet_does_not_end_the_stream(worker, published
 
     monkeypatch.setattr(worker.stream, "accept", faulty)
     for packet in make_packets(100):
-        worker.put_packet(encode_packet(packet), 1)
+        worker.put_packet(encode_packet(packet), time.monotonic_ns())
     published.wait_for(6)
     assert worker.stream.counters.failed_packets == 1
 
@@ -122,7 +123,7 @@ def test_a_standby_model_runs_however_often_packets_arrive(worker, monkeypatch):
     monkeypatch.setattr(Lanes, "has_backlog", property(lambda _: True))
     monkeypatch.setattr(worker.stream.lanes, "run_standby", lambda: turns.append(threading.Event().wait(0.03)))
     for packet in make_packets(400, n=5):
-        worker.put_packet(encode_packet(packet), 1)
+        worker.put_packet(encode_packet(packet), time.monotonic_ns())
         threading.Event().wait(0.005)  # a packet arrives in each of its pauses
         if len(turns) == 4:
             return
@@ -139,7 +140,7 @@ def test_an_unreadable_camera_info_is_refused_and_the_stream_continues(slot):
     good = CameraInfo(stream="cam0", width=64, height=48, lens="pinhole", fx=40, fy=40, cx=32, cy=24)
     worker.put_camera(good.encode(), 1)
     for packet in make_packets(30):
-        worker.put_packet(encode_packet(packet), 1)
+        worker.put_packet(encode_packet(packet), time.monotonic_ns())
     assert "uncalibrated" not in published.wait_for(2)[0].flags
     worker.stop()
     worker.join(5)

@@ -1,15 +1,17 @@
 """Reader of NeuroVE recordings: it gives events, or the packets as published."""
 
+import contextlib
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Self, TypeVar
 
 import numpy as np
 
 from neurove_core.geometry.motion import Poses, Twists
-from neurove_core.io.checked import checked
+from neurove_core.io.checked import cleaned, ordered, until_broken
 from neurove_core.io.errors import BrokenRecording, UnknownSource
+from neurove_core.io.faults import Faults, Reason, Tally
 from neurove_core.io.format import Format
 from neurove_core.io.formats.containers.mcap import McapFile, Record
 from neurove_core.io.formats.packet_log import layout
@@ -43,6 +45,7 @@ class McapRecording(EventsOnly):
     stream: str
     file: McapFile
     endless: bool = False
+    faults: Faults = field(default_factory=Faults, compare=False, repr=False)
 
     @classmethod
     def open(cls, path: Path, sensor: Sensor | None = None, topic: str | None = None) -> Self:
@@ -72,10 +75,7 @@ class McapRecording(EventsOnly):
         if wanted is None and len(streams) > 1:
             name = f"{path.name} ({streams[0]}, the first of {len(streams)} streams)"
         stream = wanted or streams[0]
-        first = next(file.records((f"{stream}/events",)), None)
-        if first is None:
-            raise UnknownSource(path, f"stream {stream} has no packet")
-        return cls(path, name, sensor or _decoded(path, first).sensor, stream, file)
+        return cls(path, name, sensor or _sensor_of(path, file, stream), stream, file)
 
     @property
     def streams(self) -> tuple[str, ...]:
@@ -84,13 +84,8 @@ class McapRecording(EventsOnly):
         return ("events", *(kind for kind in kinds if self._topic(kind) in self.file.topics))
 
     def chunks(self) -> Iterator[Events]:
-        """Yield all events from the beginning; see `Recording`.
-
-        Raises:
-            BrokenRecording: the file is truncated or corrupt, or a packet is invalid, has another sensor than the first
-                packet, or is earlier than the packet before it. The error names the byte.
-        """
-        return checked(self.path, self._pieces(0), self.sensor)
+        """Yield all events; see `Recording`. An invalid packet is skipped, and so is one of another sensor."""
+        return self._cleaned(0)
 
     def since(self, t_us: int) -> Iterator[Events]:
         """Yield the events from this time [us] on, as `chunks` does. Bisects the index of the file."""
@@ -103,17 +98,26 @@ class McapRecording(EventsOnly):
                 low = middle
             else:
                 high = middle
-        return later(checked(self.path, self._pieces(chunks[low] if chunks else 0), self.sensor), t_us)
+        return later(self._cleaned(chunks[low] if chunks else 0), t_us)
 
-    def _pieces(self, first_chunk: int) -> Iterator[tuple[str, Events]]:
-        first: EventPacket | None = None
-        for record in self.file.records((self._topic("events"),), first_chunk):
-            packet = _decoded(self.path, record)
-            first = first or packet
-            if packet.sensor != first.sensor:
-                why = f"a packet has sensor {packet.sensor}, but the first packet has {first.sensor}"
-                raise BrokenRecording(self.path, record.where, why)
-            yield record.where, packet.events
+    def _cleaned(self, first_chunk: int) -> Iterator[Events]:
+        tally = self.faults.begin("events")
+        return cleaned(self._pieces(first_chunk, tally), self.sensor, tally)
+
+    def _pieces(self, first_chunk: int, tally: Tally) -> Iterator[tuple[str, Events]]:
+        first: Sensor | None = None
+        for record in self.file.records((self._topic("events"),), first_chunk, tally):
+            try:
+                packet = _decoded(self.path, record)
+            except BrokenRecording as error:
+                tally.add(Reason.DAMAGED, error.where, error.why)
+                continue
+            first = first or packet.sensor
+            if packet.sensor == first:
+                yield record.where, packet.events
+            else:
+                why = f"a packet has sensor {packet.sensor}, but the first packet has {first}"
+                tally.add(Reason.INVALID, record.where, why)
 
     def packets(self, stream: str | None = None) -> Iterator[RecordedPacket]:
         """Yield the packets of one stream, or of all streams, in recorded order. They are not decoded or checked.
@@ -125,7 +129,7 @@ class McapRecording(EventsOnly):
             BrokenRecording: the file is truncated or corrupt. It is raised after all complete packets.
         """
         streams = _streams(self.file) if stream is None else [stream]
-        for record in self.file.records([f"{name}/events" for name in streams]):
+        for record in self.file.records([f"{name}/events" for name in streams], tally=self.faults.begin("packets")):
             name = record.channel.topic.removesuffix("/events")
             yield RecordedPacket(name, record.data, record.log_ns)
 
@@ -138,8 +142,11 @@ class McapRecording(EventsOnly):
         """Return the last CameraInfo of each stream that has one, as published bytes."""
         topics = [f"{name}/camera" for name in _streams(self.file)]
         present = [topic for topic in topics if topic in self.file.topics]
-        found = self.file.records(present) if present else ()
-        return {record.channel.topic.removesuffix("/camera"): record.data for record in found}
+        found: dict[str, bytes] = {}
+        with contextlib.suppress(BrokenRecording):  # reading the events counts it
+            for record in self.file.records(present) if present else ():
+                found[record.channel.topic.removesuffix("/camera")] = record.data
+        return found
 
     def camera(self, stream: str) -> CameraInfo | None:
         """Return the lens that the driver of the stream published, or None.
@@ -152,15 +159,18 @@ class McapRecording(EventsOnly):
 
     def imu(self) -> Iterator[Imu]:
         """Yield the IMU samples of the converted recording."""
-        return self._tables("imu")
+        tally = self.faults.begin("imu")
+        return ordered(self._tables("imu", tally), tally)
 
     def triggers(self) -> Iterator[Triggers]:
         """Yield the trigger edges of the converted recording."""
-        return self._tables("triggers")
+        tally = self.faults.begin("triggers")
+        return ordered(self._tables("triggers", tally), tally)
 
     def frames(self) -> Iterator[Frame]:
         """Yield the images of the converted recording."""
-        return self._messages("frames", layout.unpack_frame)
+        tally = self.faults.begin("frames")
+        return (frame for _, frame in until_broken(self._messages("frames", layout.unpack_frame, tally), tally))
 
     def poses(self) -> Poses | None:
         """Return the poses of the converted recording, or None."""
@@ -173,27 +183,45 @@ class McapRecording(EventsOnly):
     def _topic(self, kind: str) -> str:
         return f"{self.stream}/{kind}"
 
-    def _tables(self, kind: str) -> Iterator[Any]:
-        return self._messages(kind, lambda data: layout.unpack_columns(kind, data))
+    def _tables(self, kind: str, tally: Tally) -> Iterator[tuple[str, Any]]:
+        return self._messages(kind, lambda data: layout.unpack_columns(kind, data), tally)
 
     def _joined(self, kind: str, table: Callable[..., T]) -> T | None:
-        parts = list(self._tables(kind))
+        tally = self.faults.begin(kind)
+        parts = list(ordered(self._tables(kind, tally), tally))
         return table(*(np.concatenate(columns) for columns in zip(*parts, strict=True))) if parts else None
 
-    def _messages(self, kind: str, unpack: Callable[[bytes], T]) -> Iterator[T]:
+    def _messages(self, kind: str, unpack: Callable[[bytes], T], tally: Tally) -> Iterator[tuple[str, T]]:
         topic = self._topic(kind)
         if topic not in self.file.topics:
             return
         chunks = self.file.chunks_of(topic)
-        for record in self.file.records((topic,), chunks[0] if chunks else 0):
+        for record in self.file.records((topic,), chunks[0] if chunks else 0, tally):
             try:
-                yield unpack(record.data)
+                unpacked = unpack(record.data)
             except BadColumns as why:
-                raise BrokenRecording(self.path, record.where, str(why)) from None
+                tally.add(Reason.DAMAGED, record.where, str(why))
+            else:
+                yield record.where, unpacked
 
 
 def _streams(file: McapFile) -> list[str]:
     return sorted(topic.removesuffix("/events") for topic in file.topics if topic.endswith("/events"))
+
+
+def _sensor_of(path: Path, file: McapFile, stream: str) -> Sensor:
+    """The sensor of the first packet that can be decoded.
+
+    Raises:
+        UnknownSource: the stream has no packet. BrokenRecording: it has none that can be decoded.
+    """
+    bad: BrokenRecording | None = None
+    for record in file.records((f"{stream}/events",)):
+        try:
+            return _decoded(path, record).sensor
+        except BrokenRecording as error:
+            bad = bad or error
+    raise bad or UnknownSource(path, f"stream {stream} has no packet")
 
 
 def _decoded(path: Path, record: Record) -> EventPacket:
