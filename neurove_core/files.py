@@ -1,9 +1,12 @@
 """Atomic writes: a file has its new content or its old one, however the process ends."""
 
+import errno
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+import numpy as np
 
 
 @contextmanager
@@ -33,6 +36,23 @@ def write_atomically(path: Path, data: bytes) -> None:
     """
     with atomic_path(path) as part:
         part.write_bytes(data)
+
+
+def read_whole(path: Path) -> memoryview:
+    """The bytes of a file, in memory that may be written to; other threads go on while it is read.
+
+    Raises:
+        OSError: the file cannot be read, or it became shorter meanwhile.
+    """
+    with path.open("rb", buffering=0) as file:
+        data = np.empty(os.fstat(file.fileno()).st_size, np.uint8).data
+        done = 0
+        while done < len(data):
+            read = file.readinto(data[done:])
+            if not read:
+                raise OSError(errno.EIO, f"{done} of {len(data)} bytes could be read")
+            done += read
+    return data
 
 
 def sync(path: Path) -> None:
