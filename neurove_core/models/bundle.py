@@ -16,7 +16,7 @@ from pydantic import Field, ValidationError, ValidationInfo, field_validator
 from torch import Tensor, nn
 
 from neurove_core.config import Config, ModelConfig
-from neurove_core.files import read_whole, write_atomically
+from neurove_core.files import allow_no_temporary_folder, read_whole, write_atomically
 from neurove_core.models import golden
 from neurove_core.models.container import Data, object_without_duplicates, read_container, read_tensors
 from neurove_core.models.golden import Golden
@@ -183,6 +183,7 @@ def from_bytes(data: Data, name: str) -> Bundle:
     Raises:
         BadModel: as `load`.
     """
+    allow_no_temporary_folder()
     header = read_header(data, name)
     tensors = read_tensors(data, name)
     test = golden.from_tensors(tensors, header.config, header.golden_tolerance, name)
