@@ -275,4 +275,4 @@ def _open(path: Path, sensor: Sensor | None, topic: str | None) -> Aedat4Recordi
     return Aedat4Recording.open(path, sensor)
 
 
-FORMAT = Format("FILE.aedat4 (DV)", _open, (".aedat4",))
+FORMAT = Format("FILE.aedat4 (DV)", _open, (".aedat4",), signature=b"#!AER-DAT4")

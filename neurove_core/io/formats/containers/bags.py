@@ -16,6 +16,7 @@ from neurove_core.io.errors import BrokenRecording, UnknownSource
 
 T = TypeVar("T")
 
+SQLITE_MAGIC: Final = b"SQLite format 3\0"
 ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 MAX_RECORD_BYTES: Final = 64 << 20
 """Maximum size of one message or chunk [bytes], compressed and decompressed."""
