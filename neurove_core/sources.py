@@ -14,9 +14,10 @@ from pathlib import Path
 from typing import Final, NamedTuple, cast
 
 from neurove_core.io.errors import UnknownSource
+from neurove_core.io.faults import Reason
 from neurove_core.io.format import Format, UrlFormat
 from neurove_core.io.recording import Recording
-from neurove_core.io.spool import HEAD_BYTES, copied, is_text
+from neurove_core.io.spool import HEAD_BYTES, Plain, compression_of, is_text, piped, plain_file
 from neurove_protocol.events import Sensor
 
 log = logging.getLogger(__name__)
@@ -58,7 +59,7 @@ def open_source(source: str, sensor: Sensor | None = None, topic: str | None = N
 
     Args:
         source: a file, a folder, a pipe such as `/dev/stdin`, `pattern://`, or `sim://SCENE?...`; see `supported`. A
-            pipe is first copied into a temporary file.
+            pipe is first copied into a temporary file; a file compressed with gzip, zstd, bz2 or lz4 is decompressed.
         sensor: size of the pixel array; overrides what the recording says.
         topic: one of several event streams, such as `davis/right` of MVSEC; by default the first.
 
@@ -100,41 +101,49 @@ def _open_path(path: Path, sensor: Sensor | None, topic: str | None) -> Recordin
         raise UnknownSource(path, "the folder has no events.txt", supported())
     if path.is_symlink() and path.is_file() and not path.suffix:  # /dev/stdin of a redirected file
         path = path.resolve()
-    head, path = _plain(path)
-    return _format_of(path, head).open(path, sensor, topic)
+    plain = _plain(path)
+    recording = _format_of(plain.path).open(plain.path, sensor, topic)
+    if plain.why:
+        recording.faults.begin("file").add(Reason.UNREAD, path.name, plain.why)
+    return recording
 
 
-def _plain(path: Path) -> tuple[bytes, Path]:
-    """The first bytes of a file, and a plain file with its content.
+def _plain(path: Path) -> Plain:
+    """A plain file with the content of a file or a pipe, decompressed if it is compressed.
 
     Raises:
-        UnknownSource: it is neither a plain file nor a pipe, the pipe gives no known format or too much, or the file is
-            a Git LFS pointer.
+        UnknownSource: it is neither a plain file nor a pipe, the pipe gives no known format, the content is too large,
+            or the file is a Git LFS pointer.
     """
-    if not (path.is_file() or path.is_fifo()):
+    if path.is_fifo():
+        with path.open("rb") as stream:
+            head = stream.read(HEAD_BYTES)
+            suffix = next((suffix for signature, suffix in _SUFFIXES if re.match(signature, head, re.DOTALL)), "")
+            suffix = suffix or (".txt" if is_text(head) else "")
+            if not suffix and not compression_of(head) and not any(one.recognises(head) for one in _table().formats):
+                why = "its first bytes are of no known format" if head else "it gives nothing"
+                raise UnknownSource(path, f"{why}; a pipe needs a format that its content tells", supported())
+            path = piped(path, stream, head, path.name.removesuffix(path.suffix) + (suffix or path.suffix))
+    if not path.is_file():
         raise UnknownSource(path, "it is no plain file, pipe or folder")
-    with path.open("rb") as stream:
-        head = stream.read(HEAD_BYTES)
-        if head.startswith(LFS_POINTER):
-            raise UnknownSource(path, "this is a Git LFS pointer, not the recording; fetch it with `git lfs pull`")
-        if path.is_file():
-            return head, path
-        suffix = next((suffix for signature, suffix in _SUFFIXES if re.match(signature, head, re.DOTALL)), "")
-        if not suffix and is_text(head):
-            suffix = ".txt"
-        if not suffix and not any(one.recognises(head) for one in _table().formats):
-            why = "its first bytes are of no known format" if head else "it gives nothing"
-            raise UnknownSource(path, f"{why}; a pipe needs a format that its content tells", supported())
-        return head, copied(path, stream, head, path.name.removesuffix(path.suffix) + (suffix or path.suffix))
+    plain = plain_file(path)
+    if _head(plain.path).startswith(LFS_POINTER):
+        raise UnknownSource(path, "this is a Git LFS pointer, not the recording; fetch it with `git lfs pull`")
+    return plain
 
 
-def _format_of(path: Path, head: bytes) -> Format:
+def _head(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(HEAD_BYTES)
+
+
+def _format_of(path: Path) -> Format:
     """The format of a file: by content and suffix, by content, or by suffix.
 
     Raises:
         UnknownSource: no format accepts it.
     """
-    formats = _table().formats
+    formats, head = _table().formats, _head(path)
     by_content = [one for one in formats if one.recognises(head)]
     found = _first_that_fits(path, by_content) or next((one for one in by_content if one.accepts(path)), None)
     found = found or _first_that_fits(path, formats)

@@ -43,7 +43,7 @@ def highs(before: int | None, after: int, period: int) -> list[int]:
     """The TIME_HIGH values that a camera shows between two moments, none of them a step that could be a glitch."""
     if before is None:
         return [after % period]
-    return [high % period for high in (*range(before, after, period // 2), after)[1:]]
+    return [high % period for high in (*range(before, after, period // 8), after)[1:]]
 
 
 def write_evt3(events: Events) -> Written:

@@ -4,7 +4,7 @@
 folder explains how to add a format.
 """
 
-from neurove_core.io.errors import BrokenRecording, MissingGeometry, RecordingError, UnknownSource
+from neurove_core.io.errors import BrokenRecording, MissingFilter, MissingGeometry, RecordingError, UnknownSource
 from neurove_core.io.faults import Fault, Faults, Reason, Tally
 from neurove_core.io.format import Format, UrlFormat
 from neurove_core.io.recording import EventsOnly, Frame, Imu, Recording, Triggers, refuse_topic
@@ -17,6 +17,7 @@ __all__ = [
     "Format",
     "Frame",
     "Imu",
+    "MissingFilter",
     "MissingGeometry",
     "Reason",
     "Recording",

@@ -1,6 +1,7 @@
 """Make valid chunks of the events that a reader decodes, and count what is not valid."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 
@@ -15,8 +16,18 @@ _MIN_EVENTS = CHUNK_EVENTS // 4
 Piece = tuple[str | Where, Events]
 """Some events as they were recorded, and their place: a text, or a function that gives the place of event i.
 
-The columns of these events may have any integer type, so that a reader need not wrap a coordinate that does not fit.
+The columns of these events may have any integer type, see `as_recorded`.
 """
+
+
+def numbered(first: int, noun: str = "event") -> Where:
+    """The place of item i of a piece that begins with item number `first` of the recording, counted from 0."""
+    return lambda i: f"{noun} {first + i:,}"
+
+
+def as_recorded(t: Any, x: Any, y: Any, p: Any) -> Events:
+    """Events with columns of any integer type, so that a coordinate that does not fit is not wrapped; for `cleaned`."""
+    return Events(t, x, y, p)
 
 
 def cleaned(pieces: Iterator[Piece], sensor: Sensor, tally: Tally, note: str = "") -> Iterator[Events]:

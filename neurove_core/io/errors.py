@@ -1,6 +1,7 @@
 """Errors of recordings: RecordingError and its subclasses."""
 
 from pathlib import Path
+from typing import Final
 
 from neurove_protocol.errors import EXIT_FAILURE, NeuroVEError
 
@@ -26,6 +27,28 @@ class MissingGeometry(RecordingError):
 
     def __init__(self, path: Path) -> None:
         super().__init__(f"{path}: its header has no sensor geometry; give --sensor WIDTHxHEIGHT", value=str(path))
+
+
+ECF_FILTER: Final = 0x8ECF
+"""Number of the HDF5 filter of Prophesee's Event Compression Format."""
+
+
+class MissingFilter(RecordingError):
+    """The rows of an HDF5 file are compressed by a filter that is not installed."""
+
+    code = "missing_filter"
+
+    def __init__(self, path: Path, name: str, number: int) -> None:
+        known = number == ECF_FILTER
+        needs = f"ECF (HDF5 filter {number})" if known else f"HDF5 filter {number}"
+        cure = "Prophesee's hdf5_ecf plugin" if known else "the plugin of this filter"
+        super().__init__(
+            f"{path}: {name} is compressed with {needs}, which is not installed: install {cure} and set "
+            "HDF5_PLUGIN_PATH to its folder",
+            value=str(path),
+            where=name,
+            filter=number,
+        )
 
 
 class BrokenRecording(RecordingError):

@@ -9,7 +9,7 @@ import math
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any, Final, NamedTuple, Self
 
@@ -19,12 +19,14 @@ from numpy.typing import NDArray
 from neurove_core.files import atomic_path
 from neurove_core.geometry.motion import Poses, Twists, twists
 from neurove_core.io.archive import BROKEN_ZIP
+from neurove_core.io.checked import Piece, cleaned, numbered
 from neurove_core.io.errors import BrokenRecording, UnknownSource
+from neurove_core.io.faults import Faults
 from neurove_core.io.format import Format
-from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, in_chunks, refuse_topic, valid_prefix
+from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, refuse_topic
 from neurove_protocol.camera import CameraInfo
-from neurove_protocol.errors import EventOutsideSensor, InvalidField, TimeBackwards
-from neurove_protocol.events import Events, Sensor, check_events
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import Events, Sensor
 
 RECORD: Final = np.dtype([("x", "<u2"), ("y", "<u2"), ("t", "<i8"), ("pol", "u1")])
 """One event as CARLA packs it, 13 bytes: x and y [px], t simulated time [ns], pol 1 or 0."""
@@ -89,6 +91,7 @@ class CarlaRecording(EventsOnly):
     fov_deg: float
     streams: tuple[str, ...]
     endless: bool = False
+    faults: Faults = field(default_factory=Faults, compare=False, repr=False)
 
     @classmethod
     def open(cls, path: Path, sensor: Sensor | None = None) -> Self:
@@ -129,12 +132,11 @@ class CarlaRecording(EventsOnly):
         return CameraInfo(stream=stream, width=width, height=height, lens="pinhole", fx=f, fy=f, cx=cx, cy=cy)
 
     def chunks(self) -> Iterator[Events]:
-        """All events from the beginning; see `Recording`. Simulated time, rounded down to whole us.
+        """All events from the beginning; see `Recording`. Simulated time, rounded down to whole us."""
+        return cleaned(self._pieces(), self.sensor, self.faults.begin("events"))
 
-        Raises:
-            BrokenRecording: an event is truncated, outside the sensor, or before the previous one; the error names it.
-        """
-        n, not_before_us = 0, None
+    def _pieces(self) -> Iterator[Piece]:
+        n = 0
         with _member(self.path, "events") as (file, shape, dtype):
             if len(shape) != 1 or dtype.itemsize != RECORD.itemsize:
                 raise BrokenRecording(self.path, "events", f"{dtype} {shape} are not events of {RECORD.itemsize} bytes")
@@ -142,19 +144,12 @@ class CarlaRecording(EventsOnly):
                 block = file.read(min(BLOCK_BYTES // RECORD.itemsize, shape[0] - n) * RECORD.itemsize)
                 records = np.frombuffer(block, RECORD, len(block) // RECORD.itemsize)
                 events = Events.from_columns(records["t"] // 1000, records["x"], records["y"], records["pol"] > 0)
-                try:
-                    check_events(events, self.sensor, not_before_us)
-                except (EventOutsideSensor, TimeBackwards) as error:
-                    good = valid_prefix(events, self.sensor, not_before_us)
-                    yield from in_chunks(good)
-                    raise BrokenRecording(self.path, f"event {n + good.n}", error.message) from None
-                yield from in_chunks(events)
+                yield numbered(n), events
                 n += events.n
                 if not events.n or len(block) % RECORD.itemsize:
                     raise BrokenRecording(
                         self.path, f"event {n}", f"there are fewer events than the {shape[0]} in the header"
                     )
-                not_before_us = int(events.t[-1])
 
     def poses(self) -> Poses | None:
         """Poses of the optical frame, see `to_optical`; None if they were not recorded.

@@ -4,34 +4,43 @@ The same folder, or the .zip in which the data set is distributed, may also hold
 images.txt with images.
 """
 
-from bisect import bisect_left
+import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.geometry.motion import Poses, Twists, twists
 from neurove_core.io.archive import Place, folder_in_zip, read_image
+from neurove_core.io.checked import Piece, as_recorded, cleaned, ordered, unread
 from neurove_core.io.errors import BrokenRecording
+from neurove_core.io.faults import Faults, Reason, Tally
 from neurove_core.io.format import Format
-from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Frame, Imu, in_chunks, refuse_topic
+from neurove_core.io.order import Where
+from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Frame, Imu, refuse_topic
 from neurove_protocol.camera import CameraInfo
-from neurove_protocol.errors import EventOutsideSensor, InvalidField, TimeBackwards
-from neurove_protocol.events import Events, Sensor, check_events
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import Events, Sensor
 
 DAVIS240C = Sensor(240, 180)
 """The sensor that recorded the data set."""
 
 MAX_T_S = 1e12  # [s]; a larger time is invalid
 UNIT_WITHIN = 1e-2  # accepted distance from 1 of a quaternion's length, for files with few digits
-_NO_T, _NO_POSES = np.empty(0, np.int64), np.empty((0, 7))
 _FILES = {"imu": "imu.txt", "frames": "images.txt", "poses": "groundtruth.txt"}
-_BAD = (ValueError, EventOutsideSensor, TimeBackwards)
-_LINE = np.dtype([("t", "f8"), ("x", "u2"), ("y", "u2"), ("p", "u1")])
+_LINE = np.dtype([("t", "f8"), ("x", "i8"), ("y", "i8"), ("p", "i8")])
+_EVENT_LINE = re.compile(rb"\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?(\s+[-+]?\d{1,10}){2}\s+\+?[01]\s*")
 _CALIB = "expected nine numbers: fx fy cx cy k1 k2 p1 p2 k3, focal lengths above 0"
+
+
+class _Rows(NamedTuple):
+    """Rows of a text file of numbers."""
+
+    t: NDArray[np.int64]  # (N,) [us]
+    values: NDArray[np.float64]  # (N, columns - 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +58,7 @@ class EcdRecording(EventsOnly):
     events_file: str
     streams: tuple[str, ...]
     endless: bool = False
+    faults: Faults = field(default_factory=Faults, compare=False, repr=False)
 
     @classmethod
     def open(cls, path: Path, name: str, sensor: Sensor | None = None) -> Self:
@@ -84,55 +94,46 @@ class EcdRecording(EventsOnly):
         return self.lens and CameraInfo(**(self.lens.model_dump() | {"stream": stream}))
 
     def chunks(self) -> Iterator[Events]:
-        """All events from the beginning; see `Recording`. Times are rounded to the nearest us.
+        """All events from the beginning; see `Recording`. Times are rounded to the nearest us."""
+        tally = self.faults.begin("events")
+        return cleaned(self._pieces(tally), self.sensor, tally)
 
-        Raises:
-            BrokenRecording: a line is not an event, or its event is outside the sensor or before the previous one; the
-                error names the line.
-        """
-        first, not_before_us = 1, None
-        for lines in self._blocks(self.events_file):
-            n, why = len(lines), ""
+    def _pieces(self, tally: Tally) -> Iterator[Piece]:
+        for first, lines in self._blocks(self.events_file):
             try:
-                events = _parse(lines, self.sensor, not_before_us)
-            except _BAD:
-                n, why = _first_bad(lines, self.sensor, not_before_us)
-                events = _parse(lines[:n], self.sensor, not_before_us)
-            yield from in_chunks(events)
-            if why:
-                text = lines[n][:60].decode("ascii", "backslashreplace")
-                raise BrokenRecording(self.path, f"line {first + n}", f"{why}: {text!r}")
-            first += len(lines)
-            not_before_us = int(events.t[-1]) if events.n else not_before_us
+                events = _parse(lines)
+            except ValueError:
+                valid = [_is_event(line) or _is_blank(line) for line in lines]
+                _count_lines(tally, first, lines, valid, "the line is not `t[s] x y p`")
+                lines = [line if good else b"" for line, good in zip(lines, valid, strict=True)]
+                events = _parse(lines)
+            yield _line_of(first, lines), events
 
     def imu(self) -> Iterator[Imu]:
         """The samples of imu.txt, `t ax ay az gx gy gz` [s, m/s2, rad/s]; see `Recording`.
 
         The axes are those of the IMU. On these cameras they match the optical frame to within a few degrees.
-
-        Raises:
-            BrokenRecording: a line is not a sample, or is before the previous one; the error names the line.
         """
         if "imu" in self.streams:
-            for t, rows in self._table(_FILES["imu"], 7):
+            tally = self.faults.begin("imu")
+            for t, rows in ordered(self._table(_FILES["imu"], 7, tally), tally):
                 yield Imu(t, rows[:, :3].copy(), rows[:, 3:].copy())
 
     def poses(self) -> Poses | None:
-        """The poses of groundtruth.txt, `t px py pz qx qy qz qw` [s, m], or None without one.
-
-        Raises:
-            BrokenRecording: a line is not a pose, or is before the previous one; the error names the line.
-        """
+        """The poses of groundtruth.txt, `t px py pz qx qy qz qw` [s, m], or None without one."""
         if "poses" not in self.streams:
             return None
-        blocks = list(self._table(_FILES["poses"], 8))
-        t, rows = (np.concatenate(columns) for columns in zip(*blocks, strict=True)) if blocks else (_NO_T, _NO_POSES)
+        tally = self.faults.begin("poses")
+        blocks = list(ordered(self._table(_FILES["poses"], 8, tally), tally))
+        t = np.concatenate([np.empty(0, np.int64), *(block.t for block in blocks)])
+        rows = np.concatenate([np.empty((0, 7)), *(block.values for block in blocks)])
         norm = np.linalg.norm(rows[:, 3:], axis=1, keepdims=True)
-        bad = np.flatnonzero(np.abs(norm[:, 0] - 1) > UNIT_WITHIN)
-        if bad.size:
-            why = f"a quaternion of length {norm[bad[0], 0]:.4g} is not a rotation"
-            raise BrokenRecording(self.path, f"{_FILES['poses']} pose {bad[0] + 1}", why)
-        return Poses(t, rows[:, :3].copy(), rows[:, 3:] / norm)
+        unit = np.abs(norm[:, 0] - 1) <= UNIT_WITHIN
+        if not unit.all():
+            first = int(unit.argmin())
+            why = f"a quaternion of length {norm[first, 0]:.4g} is not a rotation"
+            tally.add(Reason.INVALID, f"{_FILES['poses']} pose {first + 1}", why, int(np.count_nonzero(~unit)))
+        return Poses(t[unit], rows[unit, :3], rows[unit, 3:] / norm[unit])
 
     def twists(self) -> Twists | None:
         """Twists of the camera from its poses, by `geometry.twists`; None without poses."""
@@ -144,29 +145,39 @@ class EcdRecording(EventsOnly):
 
         Raises:
             MissingExtra: Pillow is not installed.
-            BrokenRecording: a line does not name an image, is before the previous one, or its file does not exist or
-                cannot be read; the error names the line.
         """
         if "frames" not in self.streams:
             return
-        number, not_before_us = 0, None
-        for lines in self._blocks(_FILES["frames"]):
-            for line in lines:
-                number += 1
-                if not line.strip() or line.lstrip().startswith(b"#"):
+        tally = self.faults.begin("frames")
+        try:
+            yield from self._frames(tally)
+        except BrokenRecording as error:
+            unread(tally, error)
+
+    def _frames(self, tally: Tally) -> Iterator[Frame]:
+        not_before_us: int | None = None
+        for first, lines in self._blocks(_FILES["frames"]):
+            for i, line in enumerate(lines):
+                where = f"{_FILES['frames']} line {first + i}"
+                if _is_blank(line):
                     continue
-                frame = self._frame(line, f"{_FILES['frames']} line {number}", not_before_us)
+                try:
+                    frame = self._frame(line, where)
+                except BrokenRecording as error:
+                    tally.add(Reason.DAMAGED, where, error.why)
+                    continue
+                if not_before_us is not None and frame.t_us < not_before_us:
+                    tally.add(Reason.LATE, where, f"t={frame.t_us} us comes after t={not_before_us} us")
+                    continue
                 not_before_us = frame.t_us
                 yield frame
 
-    def _frame(self, line: bytes, where: str, not_before_us: int | None) -> Frame:
+    def _frame(self, line: bytes, where: str) -> Frame:
         try:
             t, path = line.decode().split()
             t_us = round(float(t) * 1e6)
         except (ValueError, OverflowError):
             raise BrokenRecording(self.path, where, f"the line is not `t[s] path`: {line[:60]!r}") from None
-        if not_before_us is not None and t_us < not_before_us:
-            raise BrokenRecording(self.path, where, "time runs backwards")
         parts = path.split("/")
         outside = ".." in parts or path.startswith("/")  # images.txt must not open files outside the recording
         if outside or not self.place.has(path):
@@ -174,41 +185,62 @@ class EcdRecording(EventsOnly):
         with self.place.open(path) as file:
             return Frame(t_us, read_image(self.path, where, file))
 
-    def _table(self, name: str, columns: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
+    def _table(self, name: str, columns: int, tally: Tally) -> Iterator[tuple[Where, _Rows]]:
         """Times [us] (N,) and the other columns of a text file of numbers, in blocks of about BLOCK_BYTES."""
-        number, not_before_us = 0, -(1 << 62)
-        for lines in self._blocks(name):
-            kept = [line for line in lines if line.strip() and not line.lstrip().startswith(b"#")]
-            try:
-                rows = np.loadtxt(kept, comments=None, ndmin=2) if kept else np.empty((0, columns))
-                bad = rows.shape[1] != columns or not np.isfinite(rows).all() or (np.abs(rows[:, 0]) >= MAX_T_S).any()
-            except ValueError:
-                bad = True
-            if bad:
-                at = next(i for i, line in enumerate(lines) if not _is_row(line, columns))
-                text = lines[at][:60].decode("ascii", "backslashreplace")
-                why = f"the line is not {columns} numbers: {text!r}"
-                raise BrokenRecording(self.path, f"{name} line {number + at + 1}", why)
+        for first, lines in self._blocks(name):
+            valid = [_is_row(line, columns) for line in lines]
+            _count_lines(tally, first, lines, valid, f"the line is not {columns} numbers", name + " ")
+            kept = [line if good else b"" for line, good in zip(lines, valid, strict=True)]
+            numbers = [line.split() for line in kept if not _is_blank(line)]
+            rows = np.array(numbers, np.float64) if numbers else np.empty((0, columns))
             t = np.rint(rows[:, 0] * 1e6).astype(np.int64)
-            if (np.diff(t, prepend=not_before_us) < 0).any():
-                raise BrokenRecording(self.path, f"{name} after line {number}", "time runs backwards")
-            number += len(lines)
-            if t.size:
-                not_before_us = int(t[-1])
-                yield t, rows[:, 1:]
+            yield _line_of(first, kept, name + " "), _Rows(t, rows[:, 1:])
 
-    def _blocks(self, name: str) -> Iterator[list[bytes]]:
-        """The lines of a file, in blocks of about BLOCK_BYTES."""
-        rest = b""
+    def _blocks(self, name: str) -> Iterator[tuple[int, list[bytes]]]:
+        """The number of the first line, and the lines of a file, in blocks of about BLOCK_BYTES."""
+        rest, first = b"", 1
         with self.place.open(name) as file:
             while block := file.read(BLOCK_BYTES):
-                lines, newline, rest = (rest + block).rpartition(b"\n")
+                text, newline, rest = (rest + block).rpartition(b"\n")
                 if newline:
-                    yield lines.split(b"\n")
-                elif len(rest) > BLOCK_BYTES:  # not text: parsing it as one line reports the error
-                    break
+                    lines = text.split(b"\n")
+                elif len(rest) > BLOCK_BYTES:  # not text: one line, which is not valid
+                    lines, rest = [rest], b""
+                else:
+                    continue
+                yield first, lines
+                first += len(lines)
         if rest:
-            yield [rest]
+            yield first, [rest]
+
+
+def _is_blank(line: bytes) -> bool:
+    """Whether a line is blank or a comment."""
+    text = line.strip()
+    return not text or text.startswith(b"#")
+
+
+def _is_event(line: bytes) -> bool:
+    """Whether a line is an event."""
+    return _EVENT_LINE.fullmatch(line) is not None and abs(float(line.split()[0])) < MAX_T_S
+
+
+def _line_of(first: int, lines: list[bytes], prefix: str = "") -> Where:
+    """The line of row i of a block, which begins with line `first`."""
+
+    def where(i: int) -> str:
+        kept = [k for k, line in enumerate(lines) if not _is_blank(line)]
+        return f"{prefix}line {first + kept[i]}"
+
+    return where
+
+
+def _count_lines(tally: Tally, first: int, lines: list[bytes], valid: list[bool], why: str, prefix: str = "") -> None:
+    """Count the lines of a block that are not valid."""
+    if not all(valid):
+        at = valid.index(False)
+        text = lines[at][:60].decode("ascii", "backslashreplace")
+        tally.add(Reason.DAMAGED, f"{prefix}line {first + at}", f"{why}: {text!r}", valid.count(False))
 
 
 def _is_row(line: bytes, columns: int) -> bool:
@@ -262,43 +294,20 @@ def parse_calib(path: Path, data: bytes, sensor: Sensor) -> CameraInfo:
         raise InvalidField(str(path), "calib", text, _CALIB) from None
 
 
-def _parse(lines: list[bytes], sensor: Sensor, not_before_us: int | None) -> Events:
-    """The events of these lines. Blank lines and lines that begin with # are skipped.
+def _parse(lines: list[bytes]) -> Events:
+    """The events of these lines as they are recorded. Blank lines and lines that begin with # are skipped.
 
     Raises:
-        ValueError: a line is not `t[s] x y p`. EventOutsideSensor, TimeBackwards: the event is invalid.
+        ValueError: a line is not `t[s] x y p`.
     """
     if lines and b"#" in b"".join(lines):
         lines = [line for line in lines if not line.lstrip().startswith(b"#")]
     if not any(map(bytes.strip, lines)):
         return Events.empty()
     rows = np.loadtxt(lines, _LINE, comments=None, ndmin=1)
-    if not (np.abs(rows["t"]) < MAX_T_S).all() or rows["p"].max() > 1:  # in this form nan fails
+    if not (np.abs(rows["t"]) < MAX_T_S).all() or rows["p"].max() > 1 or rows["p"].min() < 0:  # in this form nan fails
         raise ValueError("t is not finite or p is neither 0 nor 1")
-    events = Events.from_columns(np.rint(rows["t"] * 1e6), rows["x"], rows["y"], rows["p"])
-    check_events(events, sensor, not_before_us)
-    return events
-
-
-def _first_bad(lines: list[bytes], sensor: Sensor, not_before_us: int | None) -> tuple[int, str]:
-    """How many lines come before the first invalid one, and what is wrong with that one.
-
-    Finds it by bisection: once a span of leading lines fails, every longer span fails too.
-    """
-
-    def fault(stop: int) -> str:
-        try:
-            _parse(lines[:stop], sensor, not_before_us)
-        except EventOutsideSensor:
-            return f"the event lies outside the sensor {sensor}"
-        except TimeBackwards:
-            return "time runs backwards"
-        except ValueError:
-            return "the line is not `t[s] x y p`"
-        return ""
-
-    stop = bisect_left(range(1, len(lines)), True, key=lambda stop: fault(stop) != "") + 1
-    return stop - 1, fault(stop)
+    return as_recorded(np.rint(rows["t"] * 1e6).astype(np.int64), rows["x"], rows["y"], rows["p"])
 
 
 def _accepts(path: Path) -> bool:

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.geometry.motion import Twists
-from neurove_core.io.errors import BrokenRecording, UnknownSource
+from neurove_core.io.checked import Piece, as_recorded, cleaned, numbered
+from neurove_core.io.errors import UnknownSource
+from neurove_core.io.faults import Faults, Reason, Tally
 from neurove_core.io.format import Format
 from neurove_core.io.formats.mat5 import MatFault, read_columns
-from neurove_core.io.recording import EventsOnly, in_chunks, refuse_topic, valid_prefix
-from neurove_protocol.errors import EventOutsideSensor, TimeBackwards
-from neurove_protocol.events import Events, Sensor, check_events
+from neurove_core.io.recording import EventsOnly, refuse_topic
+from neurove_protocol.events import Events, Sensor
 
 DAVIS240B = Sensor(240, 180)
 """The sensor of the recordings; they use 190 of its columns."""
@@ -41,6 +42,7 @@ class EvbenchRecording(EventsOnly):
     sensor: Sensor
     streams: tuple[str, ...]
     endless: bool = False
+    faults: Faults = field(default_factory=Faults, compare=False, repr=False)
 
     @classmethod
     def open(cls, path: Path, sensor: Sensor | None = None) -> Self:
@@ -65,19 +67,10 @@ class EvbenchRecording(EventsOnly):
         return self.path.name
 
     def chunks(self) -> Iterator[Events]:
-        """All events from the beginning; see `Recording`. The whole file is read at once.
-
-        Raises:
-            BrokenRecording: an event is outside the sensor or before the previous one.
-        """
-        events = self._events()
-        try:
-            check_events(events, self.sensor)
-        except (EventOutsideSensor, TimeBackwards) as error:
-            good = valid_prefix(events, self.sensor, None)
-            yield from in_chunks(good)
-            raise BrokenRecording(self.path, f"event {good.n}", error.message) from None
-        yield from in_chunks(events)
+        """All events from the beginning; see `Recording`. The whole file is read at once."""
+        tally = self.faults.begin("events")
+        pieces: Iterator[Piece] = iter([(numbered(0), self._events(tally))])
+        return cleaned(pieces, self.sensor, tally)
 
     def twists(self) -> Twists | None:
         """The truth in ground-truth_3Dcam.txt of the same folder, at the first and the last event; None without it.
@@ -88,19 +81,21 @@ class EvbenchRecording(EventsOnly):
         rotation = _rotation(self.path)
         if rotation is None:
             return None
-        t = self._events().t
+        t = self._events(Tally("twists")).t
         twist = np.full((2, 6), np.nan)
         twist[:, 3] = rotation / FRAME_S
         return Twists(t[[0, -1]], twist) if t.size else None
 
-    def _events(self) -> Events:
+    def _events(self, tally: Tally) -> Events:
         columns = _columns(self.path)
         t, x, y, p = (columns[name].astype(np.int64) for name in COLUMNS)
-        bad = (x < 0) | (y < 0) | (y >= self.sensor.height) | ((p != 0) & (p != 1))
-        # Report these as events outside the sensor: otherwise the flip would hide a wrong y, and `p & 1` a wrong p.
-        if bad.any():
-            x = np.where(bad, np.iinfo(np.uint16).max, x)
-        return Events.from_columns(t, x.astype(np.uint16), np.maximum(self.sensor.height - 1 - y, 0), p & 1)
+        valid = (p == 0) | (p == 1)
+        if not valid.all():
+            first = int(valid.argmin())
+            why = f"the polarity p={p[first]} is neither 1 nor 0"
+            tally.add(Reason.INVALID, f"event {first}", why, int(np.count_nonzero(~valid)))
+            t, x, y, p = (column[valid] for column in (t, x, y, p))
+        return as_recorded(t, x, self.sensor.height - 1 - y, p)  # signed: `cleaned` names a negative number
 
 
 def _columns(path: Path) -> dict[str, NDArray[Any]]:

@@ -1,7 +1,7 @@
 """Event Stream files (.es, version 2): a header, then events of five bytes and bytes that only advance the clock."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Self
 
@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.compiled import compiled
+from neurove_core.io.checked import Piece, as_recorded, cleaned, numbered
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
+from neurove_core.io.faults import Faults
 from neurove_core.io.format import Format
 from neurove_core.io.recording import BLOCK_BYTES, CHUNK_EVENTS, EventsOnly, empty_events, refuse_topic
 from neurove_protocol.errors import InvalidField
@@ -36,6 +38,7 @@ class EventStreamRecording(EventsOnly):
     sensor: Sensor
     kind: int
     endless: bool = False
+    faults: Faults = field(default_factory=Faults, compare=False, repr=False)
 
     @classmethod
     def open(cls, path: Path, sensor: Sensor | None = None) -> Self:
@@ -73,50 +76,47 @@ class EventStreamRecording(EventsOnly):
         return self.path.name
 
     def chunks(self) -> Iterator[Events]:
-        """All events from the beginning; see `Recording`. Times [us] start at 0 at the start of the recording.
+        """All events from the beginning; see `Recording`. Times [us] start at 0 at the start of the recording."""
+        return cleaned(self._pieces(), self.sensor, self.faults.begin("events"))
 
-        Raises:
-            BrokenRecording: an event is truncated or outside the sensor. The error names the byte.
-        """
-        at, t_us, pending = _HEADER_BYTES, 0, b""
+    def _pieces(self) -> Iterator[Piece]:
+        at, t_us, number, pending = _HEADER_BYTES, 0, 0, b""
         with self.path.open("rb") as file:
             file.seek(at)
             while block := file.read(BLOCK_BYTES):
                 data = np.frombuffer(pending + block, np.uint8)
                 while True:
                     out = empty_events(CHUNK_EVENTS)
-                    t_us, read, n, inside = es_decode(data, t_us, self.kind, self.sensor.width, self.sensor.height, out)
-                    if n:
-                        yield out.span(0, n)
-                    at, data = at + read, data[read:]
-                    if not inside:
-                        x, y = (int(number) for number in data[1:EVENT_BYTES].copy().view("<u2"))
-                        why = f"an event at x={x} y={y} (y upwards) lies outside the sensor {self.sensor}"
-                        raise BrokenRecording(self.path, f"byte {at}", why)
+                    t_us, read, n = es_decode(data, t_us, self.kind, out)
+                    yield numbered(number), self._flipped(out.span(0, n))
+                    at, number, data = at + read, number + n, data[read:]
                     if n < CHUNK_EVENTS:
                         break
                 pending = data.tobytes()
         if pending:
             raise BrokenRecording(self.path, f"byte {at}", "the file ends within an event")
 
+    def _flipped(self, events: Events) -> Events:
+        """The events with y downwards. A y outside the sensor becomes negative."""
+        return as_recorded(
+            events.t, events.x, self.sensor.height - 1 - events.y.astype(np.int32), events.p
+        )  # signed: `cleaned` names a negative number
+
 
 @compiled
 def es_decode(
-    data: NDArray[np.uint8], t_us: int, kind: int, width: int, height: int, out: Events
-) -> tuple[int, int, int, bool]:  # pragma: no cover (machine code)
-    """Decode bytes until an event is truncated, `out` is full, or an event is outside the sensor.
+    data: NDArray[np.uint8], t_us: int, kind: int, out: Events
+) -> tuple[int, int, int]:  # pragma: no cover (machine code)
+    """Decode bytes until an event is truncated or `out` is full.
 
     Args:
         data: (N,) bytes, starting with the first byte of an event.
         t_us: time before these bytes [us].
         kind: DVS or ATIS.
-        width: width of the sensor [px].
-        height: height of the sensor [px].
-        out: columns of equal length for the events, with y downwards.
+        out: columns of equal length for the events, with y as in the file. They may lie outside the sensor.
 
     Returns:
-        The time after the bytes read [us], the number of bytes read, the number of events in `out`, and False if the
-        next event is outside the sensor.
+        The time after the bytes read [us], the number of bytes read, and the number of events in `out`.
     """
     t_out, x_out, y_out, p_out = out
     shift, longest = (1, 127) if kind == DVS else (2, 63)  # `longest`: largest step of an overflow byte [us]
@@ -132,22 +132,18 @@ def es_decode(
         x = np.int64(data[i + 1]) | np.int64(data[i + 2]) << 8
         y = np.int64(data[i + 3]) | np.int64(data[i + 4]) << 8
         if kind == DVS or not first & 1:
-            if x >= width or y >= height:
-                return t_us, i, n, False
-            t_out[n], x_out[n], y_out[n] = t_us + (first >> shift), x, height - 1 - y
+            t_out[n], x_out[n], y_out[n] = t_us + (first >> shift), x, y
             p_out[n] = first & 1 if kind == DVS else (first >> 1) & 1
             n += 1
         t_us += int(first >> shift)
         i += EVENT_BYTES
-    return t_us, i, n, True
+    return t_us, i, n
 
 
-def es_reference(
-    data: NDArray[np.uint8], t_us: int, kind: int, width: int, height: int
-) -> tuple[int, int, Events, bool]:
-    """Reference implementation of `es_decode` without a limit on events: time, bytes read, events, verdict."""
+def es_reference(data: NDArray[np.uint8], t_us: int, kind: int) -> tuple[int, int, Events]:
+    """Reference implementation of `es_decode` without a limit on events: time, bytes read, events."""
     rows: list[tuple[int, int, int, int]] = []
-    at, inside = 0, True
+    at = 0
     left = data.tobytes()
     while left:
         first = left[0]
@@ -159,13 +155,10 @@ def es_reference(
             break
         x, y = int.from_bytes(left[1:3], "little"), int.from_bytes(left[3:5], "little")
         step, change, p = (first >> 1, True, first & 1) if kind == DVS else (first >> 2, not first & 1, first >> 1 & 1)
-        if change and (x >= width or y >= height):
-            inside = False
-            break
         t_us, at, left = t_us + step, at + EVENT_BYTES, left[EVENT_BYTES:]
         if change:
-            rows.append((t_us, x, height - 1 - y, p))
-    return t_us, at, Events.from_columns(*(zip(*rows, strict=True) if rows else [()] * 4)), inside
+            rows.append((t_us, x, y, p))
+    return t_us, at, Events.from_columns(*(zip(*rows, strict=True) if rows else [()] * 4))
 
 
 def _open(path: Path, sensor: Sensor | None, topic: str | None) -> EventStreamRecording:

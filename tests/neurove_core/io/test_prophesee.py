@@ -132,14 +132,15 @@ def test_the_triggers_of_a_raw_file_are_found_between_its_events(tmp_path):
     assert columns(all_triggers(recording)) == [[67], [1], [1]]
 
 
-def test_triggers_end_at_an_unknown_or_truncated_word(tmp_path):
+def test_triggers_pass_over_a_reserved_word_and_end_at_a_truncated_one(tmp_path):
     words = evt3((TIME_HIGH, 1), (TRIGGER, 1), (0x9, 1), (TRIGGER, 0))
-    for data, where in ((words.tobytes(), 4), (words[:2].tobytes() + b"\0", 4)):
-        recording = open_source(put(tmp_path, "a.raw", HEADER_EVT3 + data))
-        triggers = recording.triggers()
-        assert columns(next(iter(triggers))) == [[4096], [0], [1]]
-        with pytest.raises(BrokenRecording, match=f"byte {len(HEADER_EVT3) + where}"):
-            next(iter(triggers))
+    recording = open_source(put(tmp_path, "a.raw", HEADER_EVT3 + words.tobytes()))
+    assert columns(all_triggers(recording)) == [[4096, 4096], [0, 0], [1, 0]]
+    assert not recording.faults.found
+    recording = open_source(put(tmp_path, "a.raw", HEADER_EVT3 + words[:2].tobytes() + b"\0"))
+    assert columns(all_triggers(recording)) == [[4096], [0], [1]]
+    (fault,) = recording.faults.found
+    assert (fault.stream, fault.reason, fault.where) == ("triggers", "unread", f"byte {len(HEADER_EVT3) + 4}")
 
 
 def test_the_real_recordings_have_no_triggers():
@@ -199,17 +200,17 @@ def test_words_of_another_format_are_refused(header, why, tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("bad", "why"),
+    ("bad", "where", "why"),
     [
-        (0x9123, "0x9123 has an unknown word type"),
-        (ADDR_X << 12 | 64, "x=64 y=7 lies outside the sensor 64x48"),
+        (0x9123, f"byte {len(HEADER_EVT3) + 6}", "the word 0x9123 has a reserved type"),
+        (ADDR_X << 12 | 64, "event 1", "x=64 y=7 lies outside the sensor 64x48"),
     ],
 )
-def test_a_bad_word_ends_the_recording_and_the_error_names_its_byte(bad, why, tmp_path):
+def test_a_bad_word_is_skipped_and_counted_with_its_place(bad, where, why, tmp_path):
     good = evt3((TIME_HIGH, 1), (ADDR_Y, 7), (ADDR_X, 63))
     words = np.concatenate([good, np.array([bad], np.uint16), good])
     events, error = read_broken(open_source(put(tmp_path, "a.raw", HEADER_EVT3 + words.tobytes())))
-    assert events.n == 1
+    assert events.n == 2
     assert error is not None
-    assert error.details["where"] == f"byte {len(HEADER_EVT3) + 6}"
+    assert error.details["where"] == where
     assert why in error.message

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from neurove_core.extras import MissingExtra
-from neurove_core.io import BrokenRecording, UnknownSource
+from neurove_core.io import UnknownSource
 from neurove_core.sources import open_source
+from neurove_protocol import Events
 from tests import ros_bags
 from tests.builders import make_events
 from tests.neurove_core.io.test_rosbag import imu_and_pose, in_packets
@@ -42,10 +43,10 @@ def test_messages_compressed_one_by_one_are_read_unchanged(compressed_bag):
 
 
 @pytest.mark.parametrize("modified", [lambda data: data[:10] + b"\xff" * 40, lambda data: "a text"])
-def test_a_message_that_cannot_be_decompressed_ends_the_recording_with_its_place(compressed_bag, modified):
+def test_a_message_that_cannot_be_decompressed_is_skipped_and_counted_with_its_place(compressed_bag, modified):
     modify(compressed_bag, 3, modified)
     events, error = read_broken(open_source(str(compressed_bag)))
-    assert_same(events, EVENTS.span(0, 800))
+    assert_same(events, Events.join([EVENTS.span(0, 800), EVENTS.span(1200, 2000)]))
     assert error is not None
     assert "message 3" in str(error.details["where"])
 
@@ -62,14 +63,15 @@ def test_the_error_for_compressed_files_gives_the_command_to_decompress_them(tmp
         open_source(str(tmp_path))
 
 
-def test_an_imu_sample_with_decreasing_time_ends_the_samples_after_the_valid_ones(tmp_path):
+def test_a_late_imu_sample_is_discarded_and_counted_with_its_place(tmp_path):
     store = ros_bags.Store(2)
     samples = [next(imu_and_pose(store, i)) for i in (0, 1, 2, 0, 3)]
     messages = [*in_packets(store, EVENTS), *((topic, samples[-1][1], one) for topic, _, one in samples)]
-    blocks = open_source(str(ros_bags.write_bag(tmp_path / "a", store, messages))).imu()
-    np.testing.assert_array_equal(np.diff(next(blocks).t), [1000, 1000])
-    with pytest.raises(BrokenRecording, match="message 9.*time runs backwards"):
-        next(blocks)
+    recording = open_source(str(ros_bags.write_bag(tmp_path / "a", store, messages)))
+    t = np.concatenate([imu.t for imu in recording.imu()])
+    np.testing.assert_array_equal(np.diff(t), [1000, 1000, 1000])
+    (fault,) = recording.faults.found
+    assert (fault.stream, fault.reason, fault.where) == ("imu", "late", "message 9 of a.db3")
 
 
 def test_a_bag_without_poses_and_evt3_gives_no_poses_and_no_triggers(tmp_path):

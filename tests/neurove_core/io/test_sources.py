@@ -14,7 +14,7 @@ from neurove_core import sources
 from neurove_core.sources import open_source, supported
 
 PAGE = (Path(neurove_core.io.__file__).parent / "README.md").read_text()
-(TOY,) = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
+TOY, *_ = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 LINES = "0 1 2 1\n5000 3 4 0\n120000 63 47 1\n"
 
 

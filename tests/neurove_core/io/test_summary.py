@@ -137,14 +137,16 @@ def test_values_of_a_recording_without_events_are_unknown(tmp_path: Path):
     assert (one.events, one.duration_s, one.mean_rate_hz, one.peak_rate_hz) == (1, 0.0, None, 100)
 
 
-def test_a_broken_recording_is_summarised_up_to_the_damage(tmp_path: Path):
+def test_a_damaged_recording_is_summarised_with_its_faults(tmp_path: Path):
     events = make_events(n=1000, seed=4)
     file = tmp_path / "events.txt"
-    file.write_bytes(ecd_text(events) + b"nonsense\n")
+    file.write_bytes(ecd_text(events.span(0, 500)) + b"nonsense\n" + ecd_text(events.span(500, 1000)))
     summary = survey(open_source(str(file), SENSOR)).summary
     assert summary.events == 1000
-    assert summary.broken is not None
-    assert "line 1001" in summary.broken
+    assert summary.broken is None
+    (fault,) = summary.faults
+    assert (fault.where, fault.count) == ("line 501", 1)
+    assert summary.as_json()["faults"][0]["reason"] == "damaged"
 
 
 @pytest.mark.parametrize("stream", ["events", "imu", "twists"])

@@ -7,6 +7,7 @@ import pytest
 from neurove_core.sources import open_source
 from neurove_protocol import Sensor
 from tests.builders import make_events
+from tests.neurove_core.io.test_prophesee import dat
 from tests.recordings import ecd_text, shared
 
 
@@ -40,11 +41,21 @@ def test_convert_keeps_the_triggers_of_a_real_bag(run, tmp_path):
     assert sum(part.t.size for part in recording.triggers()) == 4157
 
 
-def test_a_broken_recording_is_reported_and_leaves_no_file(run, tmp_path):
-    (tmp_path / "events.txt").write_bytes(ecd_text(make_events(200)) + b"0.9 7 br\n")
-    code, _, err = run("convert", tmp_path, tmp_path / "c.mcap")
-    assert (code, "line 201" in err, err.count("\n")) == (1, True, 1)
-    assert [one.name for one in tmp_path.iterdir()] == ["events.txt"]
+def test_a_bad_line_costs_itself_and_is_told(run, tmp_path):
+    (tmp_path / "events.txt").write_bytes(b"0.0 7 br\n" + ecd_text(make_events(200)))
+    code, found, err = run("convert", tmp_path, tmp_path / "c.mcap", "--json", "--sensor", "64x48")
+    assert (code, "line 1" in err, err.count("\n")) == (0, True, 1)
+    about = json.loads(found)
+    assert (about["events"], about["faults"][0]["reason"]) == (200, "damaged")
+    assert len(list(open_source(str(tmp_path / "c.mcap")).chunks())) == 1
+
+
+def test_what_can_be_read_of_a_truncated_recording_is_converted_and_the_exit_code_is_1(run, tmp_path):
+    (tmp_path / "a.dat").write_bytes(dat(make_events(200))[:-3])
+    code, found, err = run("convert", tmp_path / "a.dat", tmp_path / "c.h5", "--json")
+    assert (code, "the file ends within a record" in err, err.count("\n")) == (1, True, 1)
+    assert json.loads(found)["events"] == 199
+    assert (tmp_path / "c.h5").exists()
 
 
 @pytest.mark.parametrize(
@@ -87,12 +98,13 @@ def test_info_of_a_real_recording_with_an_imu(run):
     assert all(text in found for text in ("78,830, 52.3 % ON", "2,363 samples at 1,001.2 Hz", "59", "truth"))
 
 
-def test_info_of_a_broken_recording_ends_with_1(run, tmp_path):
+def test_info_of_a_recording_with_a_fault_ends_with_1(run, tmp_path):
     (tmp_path / "events.txt").write_bytes(ecd_text(make_events(2000)) + b"and then\n")
     code, found, err = run("info", tmp_path, "--sensor", "64x48", "--json")
     assert code == 1
     assert json.loads(found)["events"] == 2000
-    assert "broken at line 2001" in err
+    assert "the first at line 2001" in err
+    assert json.loads(found)["faults"][0]["count"] == 1
 
 
 def test_a_simulation_contains_its_truth(run, tmp_path):

@@ -2,19 +2,22 @@
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurove_core.io.checked import Piece, as_recorded, cleaned, ordered
 from neurove_core.io.clock import unwrap_times
 from neurove_core.io.errors import BrokenRecording, UnknownSource
+from neurove_core.io.faults import Faults
 from neurove_core.io.format import Format
-from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Imu, in_chunks, refuse_topic, valid_prefix
-from neurove_protocol.errors import EventOutsideSensor, InvalidField, TimeBackwards
-from neurove_protocol.events import Events, Sensor, check_events
+from neurove_core.io.order import Where
+from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Imu, refuse_topic
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import Events, Sensor
 
 MAX_HEADER_BYTES = 4 << 20  # jAER writes all its preferences there, about 200,000 bytes
 PAIR = np.dtype([("address", ">u4"), ("t", ">u4")])
@@ -95,6 +98,7 @@ class Aedat2Recording(EventsOnly):
     chip: Chip
     header: Header
     endless: bool = False
+    faults: Faults = field(default_factory=Faults, compare=False, repr=False)
 
     @classmethod
     def open(cls, path: Path, sensor: Sensor | None = None) -> Self:
@@ -102,10 +106,12 @@ class Aedat2Recording(EventsOnly):
 
         Args:
             path: the .aedat file.
-            sensor: the pixel array of the events. The default is that of the chip.
+            sensor: the pixel array of the events. The default is that of the chip. If the header does not name a chip,
+                the size selects the chip that has it.
 
         Raises:
-            UnknownSource: the file is not AEDAT 2.0, or its header does not name a known chip.
+            UnknownSource: the file is not AEDAT 2.0, its header names another chip, or it names none and the sensor is
+                that of no known chip.
         """
         with path.open("rb") as file:
             head = file.read(MAX_HEADER_BYTES)
@@ -114,9 +120,14 @@ class Aedat2Recording(EventsOnly):
         header = parse_header(head)
         name = (header.chip_name or "").upper()
         chip = next((chip for start, chip in CHIPS.items() if name.startswith(start)), None)
+        if chip is None and not name:
+            chip = next((chip for chip in CHIPS.values() if chip.sensor == sensor), None)
         if chip is None:
-            why = f"its chip is {header.chip_name!r}" if name else "its header has no AEChip"
-            raise UnknownSource(path, f"{why}; supported chips: {', '.join(CHIPS)}")
+            known = ", ".join(f"{start} {chip.sensor}" for start, chip in CHIPS.items())
+            if name:
+                raise UnknownSource(path, f"its chip is {header.chip_name!r}; supported chips: {known}")
+            given = f"--sensor {sensor} is none of them" if sensor else "give --sensor WIDTHxHEIGHT"
+            raise UnknownSource(path, f"its header has no AEChip; {given}: the size selects the chip: {known}")
         return cls(path, sensor or chip.sensor, chip, header)
 
     @property
@@ -130,25 +141,13 @@ class Aedat2Recording(EventsOnly):
         return ("events",) if self.chip is _DVS128 else ("events", "imu")
 
     def chunks(self) -> Iterator[Events]:
-        """All events from the beginning; see `Recording`. The 32-bit clock wraps every 71.6 min and is unwrapped.
+        """All events from the beginning; see `Recording`. The 32-bit clock wraps every 71.6 min and is unwrapped."""
+        return cleaned(self._pieces(), self.sensor, self.faults.begin("events"))
 
-        Raises:
-            BrokenRecording: a pair is truncated, outside the sensor, or earlier than the pair before it. The error
-                names the byte.
-        """
-        not_before_us = None
+    def _pieces(self) -> Iterator[Piece]:
         for at, address, t in self._blocks():
             index = np.flatnonzero(address & self.chip.not_event == 0)
-            events = self._events(address[index], t[index])
-            try:
-                check_events(events, self.sensor, not_before_us)
-            except (EventOutsideSensor, TimeBackwards) as error:
-                valid = valid_prefix(events, self.sensor, not_before_us)
-                yield from in_chunks(valid)
-                byte = at + int(index[valid.n]) * PAIR.itemsize
-                raise BrokenRecording(self.path, f"byte {byte}", error.message) from None
-            yield from in_chunks(events)
-            not_before_us = int(events.t[-1]) if events.n else not_before_us
+            yield _place(at, index), self._events(address[index], t[index])
 
     def imu(self) -> Iterator[Imu]:
         """All complete samples; see `Recording`. Axes: the optical frame for a DAVIS240, else those of the unit.
@@ -157,11 +156,12 @@ class Aedat2Recording(EventsOnly):
 
         Raises:
             InvalidField: there are samples, but the header does not give their scale.
-            BrokenRecording: a pair is truncated, or a sample is earlier than the sample before it.
         """
-        if self.chip is _DVS128:
-            return
-        pending, not_before_us = np.empty((2, 0), np.int64), None
+        if self.chip is not _DVS128:
+            yield from ordered(self._imu_pieces(), self.faults.begin("imu"))
+
+    def _imu_pieces(self) -> Iterator[tuple[str, Imu]]:
+        pending = np.empty((2, 0), np.int64)
         for at, address, t in self._blocks():
             of_imu = address & _IMU == _IMU
             words = np.concatenate([pending, np.stack([address[of_imu], t[of_imu]])], axis=1)
@@ -169,14 +169,8 @@ class Aedat2Recording(EventsOnly):
             first = np.flatnonzero(code[: code.size - _IMU_WORDS + 1] == 0) if code.size >= _IMU_WORDS else code[:0]
             first = first[(code[first[:, None] + np.arange(_IMU_WORDS)] == np.arange(_IMU_WORDS)).all(1)]
             pending = words[:, max(code.size - _IMU_WORDS + 1, int(first[-1]) + _IMU_WORDS if first.size else 0) :]
-            if not first.size:
-                continue
-            samples = self._samples(words, first)
-            times = samples.t if not_before_us is None else np.append(not_before_us, samples.t)
-            if (np.diff(times) < 0).any():
-                raise BrokenRecording(self.path, f"byte {at}", "time runs backwards in the samples from this byte")
-            not_before_us = int(samples.t[-1])
-            yield samples
+            if first.size:
+                yield f"the samples from byte {at}", self._samples(words, first)
 
     def _samples(self, words: NDArray[np.int64], first: NDArray[np.intp]) -> Imu:
         """The samples that begin at the columns `first` of `words`, which has rows of address and time (2, N)."""
@@ -195,13 +189,13 @@ class Aedat2Recording(EventsOnly):
         (width, height), chip = (self.chip.sensor.width, self.chip.sensor.height), self.chip
         bits = 7 if chip is _DVS128 else 10
         x = width - 1 - (address >> chip.x_bit & (1 << bits) - 1)
-        # a negative y becomes larger than any sensor
         y = height - 1 - (address >> chip.y_bit & (1 << min(bits, 9)) - 1)
-        return Events.from_columns(t, x.astype(np.uint16), y.astype(np.uint16), (address >> chip.p_bit & 1) == chip.on)
+        return as_recorded(t, x, y, (address >> chip.p_bit & 1) == chip.on)  # signed: `cleaned` names a negative number
 
     def _blocks(self) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.int64]]]:
         """Blocks of up to BLOCK_BYTES: the byte of the first pair, the addresses and the times [us]."""
-        at, before_us = self.header.size, 0
+        at = self.header.size
+        before_us: int | None = None
         with self.path.open("rb") as file:
             file.seek(at)
             while block := file.read(BLOCK_BYTES):
@@ -211,6 +205,11 @@ class Aedat2Recording(EventsOnly):
                 at += pairs.nbytes
                 if len(block) % PAIR.itemsize:
                     raise BrokenRecording(self.path, f"byte {at}", "the file ends within a pair of address and time")
+
+
+def _place(at: int, index: NDArray[np.intp]) -> Where:
+    """The byte of event i of a block that begins at byte `at`; its pair has the number index[i]."""
+    return lambda i: f"byte {at + int(index[i]) * PAIR.itemsize}"
 
 
 def _open(path: Path, sensor: Sensor | None, topic: str | None) -> Aedat2Recording:

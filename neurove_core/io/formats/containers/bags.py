@@ -8,11 +8,13 @@ import re
 import sqlite3
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Final, NamedTuple, Protocol, TypeVar
+from typing import Any, Final, NamedTuple, Protocol, TypeVar
 
-from neurove_core.extras import MissingExtra
 from neurove_core.io.errors import BrokenRecording, UnknownSource
+from neurove_core.io.faults import Reason, Tally
+from neurove_core.io.unpack import unpacked
 
 T = TypeVar("T")
 
@@ -20,6 +22,8 @@ SQLITE_MAGIC: Final = b"SQLite format 3\0"
 ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 MAX_RECORD_BYTES: Final = 64 << 20
 """Maximum size of one message or chunk [bytes], compressed and decompressed."""
+
+_MAX_STEP: Final = 1 << 20  # messages that are passed over after a damaged page
 
 
 class BagMessage(NamedTuple):
@@ -46,15 +50,20 @@ class BagFile(Protocol):
     def cdr(self) -> bool:
         """True for CDR messages (ROS 2), False for ROS 1 messages."""
 
-    def messages(self, topics: Collection[str], since_ns: int | None = None) -> Iterator[BagMessage]:
+    def messages(
+        self, topics: Collection[str], since_ns: int | None = None, tally: Tally | None = None
+    ) -> Iterator[BagMessage]:
         """Yield the messages of these topics in recorded order.
+
+        A damaged message or chunk is skipped.
 
         Args:
             topics: names of the topics.
             since_ns: log time [ns]. A container with an index may skip messages before it.
+            tally: counts what is skipped.
 
         Raises:
-            BrokenRecording: the file is damaged. It is raised after all complete messages.
+            BrokenRecording: the file cannot be read beyond a place. It is raised after all messages before it.
         """
 
 
@@ -89,12 +98,14 @@ class SqliteBag:
             raise UnknownSource(path, f"not a ROS 2 bag: {error}") from None
         return cls(path, {str(name): type_name(str(kind)) for name, kind in rows})
 
-    def messages(self, topics: Collection[str], since_ns: int | None = None) -> Iterator[BagMessage]:
+    def messages(
+        self, topics: Collection[str], since_ns: int | None = None, tally: Tally | None = None
+    ) -> Iterator[BagMessage]:
         """See `BagFile`.
 
         Rows are read by number. The index of times is at the end of the file and is missing in a truncated file.
         """
-        first, last = 0, 0
+        first = 0
         with _ReadConnection(self.path) as connection:
             if since_ns is not None:
                 query = "SELECT min(id) FROM messages WHERE timestamp >= ?"
@@ -106,14 +117,42 @@ class SqliteBag:
                 "SELECT m.id, t.name, m.timestamp, m.data FROM messages m JOIN topics t ON t.id = m.topic_id "
                 f"WHERE m.id >= ? AND t.name IN ({','.join('?' * len(topics))}) ORDER BY m.id"
             )
-            rows = _checked(self.path, 0, lambda: connection.execute(query, (first, *topics)))
-            while (row := _checked(self.path, last, rows.fetchone)) is not None:
+            for row in self._rows(connection, query, first, topics, tally):
                 number, topic, log_ns, data = row
-                last = int(number)
                 where = f"message {number}"
                 if not isinstance(data, bytes) or not isinstance(log_ns, int):
-                    raise BrokenRecording(self.path, where, "this row is not a message")
-                yield BagMessage(topic, log_ns, where, decompressed(self.path, where, data))
+                    damaged(tally, where, "this row is not a message")
+                    continue
+                plain, why = decompressed(data)
+                if why:
+                    damaged(tally, where, why)
+                else:
+                    yield BagMessage(topic, log_ns, where, plain)
+
+    def _rows(
+        self, connection: sqlite3.Connection, query: str, first: int, topics: Collection[str], tally: Tally | None
+    ) -> Iterator[Any]:
+        """Rows of the query. After a damaged page it continues with a later row, at growing distance."""
+        last, step = first - 1, 1
+        error: BrokenRecording | None = None
+        while step < _MAX_STEP:
+            found = False
+            try:
+                rows = _checked(self.path, max(last, 0), partial(connection.execute, query, (last + step, *topics)))
+                while (row := _checked(self.path, max(last, 0), rows.fetchone)) is not None:
+                    if error is not None:
+                        damaged(tally, error.where, error.why)
+                    if not isinstance(row[0], int):
+                        raise BrokenRecording(self.path, f"the message after message {last}", "it has no number")
+                    last, step, error, found = max(last, row[0]), 1, None, True
+                    yield row
+            except BrokenRecording as broken:
+                error = error or broken
+                step = 1 if found else 2 * step
+                continue
+            break
+        if error is not None:
+            raise error
 
 
 class _ReadConnection:
@@ -140,29 +179,29 @@ def _checked(path: Path, last: int, call: Callable[[], T]) -> T:
         raise BrokenRecording(path, f"the message after message {last}", str(error)) from None
 
 
-def decompressed(path: Path, where: str, data: bytes) -> bytes:
+def damaged(tally: Tally | None, where: str, why: str) -> None:
+    """Count a message or a chunk that is skipped."""
+    if tally is not None:
+        tally.add(Reason.DAMAGED, where, why)
+
+
+def decompressed(data: bytes) -> tuple[bytes, str]:
     """Decompress a message that rosbag2 compressed on its own; return any other message unchanged.
 
     CDR begins with a zero and ROS 1 begins with a small number. Neither matches the first bytes of zstd.
 
+    Returns:
+        The message, and what is wrong with it: it cannot be decompressed, or it is larger than `MAX_RECORD_BYTES`.
+
     Raises:
-        BrokenRecording: the message cannot be decompressed, or it is larger than `MAX_RECORD_BYTES`.
         MissingExtra: zstandard is not installed.
     """
     if not data.startswith(ZSTD_MAGIC):
-        return data
-    try:
-        import zstandard
-    except ModuleNotFoundError:
-        raise MissingExtra("zstandard", "recordings") from None
-    try:
-        reader = zstandard.ZstdDecompressor().stream_reader(data)
-        plain = reader.read(MAX_RECORD_BYTES + 1)
-    except zstandard.ZstdError as error:
-        raise BrokenRecording(path, where, str(error)) from None
+        return data, ""
+    plain, why = unpacked("zstd", data, MAX_RECORD_BYTES + 1)
     if len(plain) > MAX_RECORD_BYTES:
-        raise BrokenRecording(path, where, f"the message has more than {MAX_RECORD_BYTES} bytes")
-    return plain
+        why = f"the message has more than {MAX_RECORD_BYTES} bytes"
+    return plain, why
 
 
 @dataclass(frozen=True, slots=True)
@@ -182,11 +221,22 @@ class BagFolder:
         """See `BagFile`."""
         return self.files[0].cdr
 
-    def messages(self, topics: Collection[str], since_ns: int | None = None) -> Iterator[BagMessage]:
-        """See `BagFile`."""
+    def messages(
+        self, topics: Collection[str], since_ns: int | None = None, tally: Tally | None = None
+    ) -> Iterator[BagMessage]:
+        """See `BagFile`. A file that cannot be read to its end is damage; the next file follows."""
         for file in self.files:
-            for message in file.messages(topics, since_ns):
-                yield message._replace(where=f"{message.where} of {file.path.name}")
+            inner = None if tally is None else Tally(tally.stream)
+            try:
+                for message in file.messages(topics, since_ns, inner):
+                    yield message._replace(where=f"{message.where} of {file.path.name}")
+            except BrokenRecording as error:
+                if file is self.files[-1]:
+                    raise BrokenRecording(self.path, f"{error.where} of {file.path.name}", error.why) from None
+                damaged(tally, f"{error.where} of {file.path.name}", error.why)
+            if inner is not None and tally is not None:
+                for fault in inner.faults:
+                    tally.add(fault.reason, f"{fault.where} of {file.path.name}", fault.why, fault.count)
 
 
 def in_recorded_order(folder: Path) -> list[Path]:
@@ -198,13 +248,8 @@ def in_recorded_order(folder: Path) -> list[Path]:
     Raises:
         UnknownSource: the folder has no such file.
     """
-    files = [path for path in folder.iterdir() if path.suffix in (".db3", ".mcap")]
+    files = [path for path in folder.iterdir() if re.search(r"\.(db3|mcap)(\.zstd)?$", path.name)]
     if not files:
-        compressed = any(path.suffix == ".zstd" for path in folder.iterdir())
-        why = (
-            "its files are compressed: decompress them with `zstd -d`"
-            if compressed
-            else "the folder has no .db3 or .mcap file"
-        )
-        raise UnknownSource(folder, why)
-    return sorted(files, key=lambda path: (int((re.findall(r"_(\d+)$", path.stem) or [-1])[0]), path.name))
+        raise UnknownSource(folder, "the folder has no .db3 or .mcap file")
+    number = re.compile(r"_(\d+)\.(?:db3|mcap)")
+    return sorted(files, key=lambda path: (int((number.findall(path.name) or [-1])[-1]), path.name))

@@ -7,13 +7,12 @@ does not report the byte at which it failed. The package parses only the few rec
 import zlib
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, Self
+from typing import NamedTuple, Self
 
-from neurove_core.extras import MissingExtra
 from neurove_core.io.errors import BrokenRecording, UnknownSource
-from neurove_core.io.formats.containers.bags import MAX_RECORD_BYTES, BagMessage, decompressed, type_name
+from neurove_core.io.faults import Tally
+from neurove_core.io.formats.containers.bags import MAX_RECORD_BYTES, BagMessage, damaged, decompressed, type_name
 from neurove_core.io.formats.containers.mcap_records import (
     CHANNEL,
     CHUNK,
@@ -36,6 +35,7 @@ from neurove_core.io.formats.containers.mcap_records import (
     record_errors,
     summary,
 )
+from neurove_core.io.unpack import unpacked
 
 
 class Record(NamedTuple):
@@ -97,25 +97,31 @@ class McapFile:
         """True for CDR messages (ROS 2), False for ROS 1 messages."""
         return not any(channel.encoding == "ros1" for channel in self.channels.values())
 
-    def messages(self, topics: Collection[str], since_ns: int | None = None) -> Iterator[BagMessage]:
+    def messages(
+        self, topics: Collection[str], since_ns: int | None = None, tally: Tally | None = None
+    ) -> Iterator[BagMessage]:
         """See `BagFile`."""
         skip = 0
         if since_ns is not None:
             while skip < len(self.chunks) and self.chunks[skip].end_ns < since_ns:
                 skip += 1
-        for record in self.records(topics, skip):
-            data = decompressed(self.path, record.where, record.data)
-            yield BagMessage(record.channel.topic, record.log_ns, record.where, data)
+        for record in self.records(topics, skip, tally):
+            data, why = decompressed(record.data)
+            if why:
+                damaged(tally, record.where, why)
+            else:
+                yield BagMessage(record.channel.topic, record.log_ns, record.where, data)
 
-    def records(self, topics: Collection[str], first_chunk: int = 0) -> Iterator[Record]:
-        """Yield the messages of these topics in recorded order.
+    def records(self, topics: Collection[str], first_chunk: int = 0, tally: Tally | None = None) -> Iterator[Record]:
+        """Yield the messages of these topics in recorded order. Damaged records and chunks are skipped.
 
         Args:
             topics: names of the topics.
             first_chunk: number in `chunks` of the first chunk to read.
+            tally: counts what is skipped.
 
         Raises:
-            BrokenRecording: the file is damaged at the named byte. It is raised after all complete messages.
+            BrokenRecording: the file cannot be read beyond the named byte. It is raised after all messages before it.
         """
         wanted = frozenset(topics)
         start = len(MAGIC)
@@ -124,15 +130,17 @@ class McapFile:
             start = self.path.stat().st_size if last else self.chunks[first_chunk].start
             if last:
                 return
-        return (yield from self._walk(Definitions(dict(self.channels)), wanted, {}, start))
+        yield from self._walk(Definitions(dict(self.channels)), wanted, {}, start, tally)
 
     def first_in_chunk(self, topic: str, chunk: int) -> Record | None:
-        """Return the first message of a topic in one chunk of the index, or None if the chunk has none."""
+        """Return the first message of a topic in one chunk of the index; None if it has none or is damaged."""
         with self.path.open("rb") as file:
             at = self.chunks[chunk].start
-            file.seek(at + RECORD.size)
-            body, complete = _body(self.path, file, at, length_at(file, at))
-            return next(_in_chunk(self.path, at, body, Definitions(dict(self.channels)), {topic}, complete), None)
+            length = length_at(file, at)
+            if length > MAX_RECORD_BYTES:
+                return None
+            walk = _Walk(self.path, Definitions(dict(self.channels)), {topic}, {}, None)
+            return next(walk.in_chunk(at, file.read(length), complete=True), None)
 
     def chunks_of(self, topic: str) -> list[int]:
         """Return the numbers of the chunks that hold messages of a topic or whose index lists no channels."""
@@ -140,8 +148,14 @@ class McapFile:
         return [i for i, chunk in enumerate(self.chunks) if not chunk.channels or ids & chunk.channels]
 
     def _walk(
-        self, found: Definitions, wanted: Collection[str], metadata: dict[str, dict[str, str]], start: int = len(MAGIC)
+        self,
+        found: Definitions,
+        wanted: Collection[str],
+        metadata: dict[str, dict[str, str]],
+        start: int = len(MAGIC),
+        tally: Tally | None = None,
     ) -> Iterator[Record]:
+        walk = _Walk(self.path, found, wanted, metadata, tally)
         with self.path.open("rb") as file:
             size = file.seek(0, 2)
             at = file.seek(start)
@@ -152,125 +166,99 @@ class McapFile:
                 opcode, length = RECORD.unpack(head)
                 if opcode in (DATA_END, FOOTER):
                     return
-                if opcode in (CHUNK, MESSAGE, SCHEMA, CHANNEL, METADATA):
-                    body, complete = _body(self.path, file, at, length)
-                    if opcode == CHUNK:
-                        yield from _in_chunk(self.path, at, body, found, wanted, complete)
-                    elif complete and (
-                        record := _message_of(self.path, f"byte {at}", opcode, body, found, wanted, metadata)
-                    ):
-                        yield record
-                    if not complete:
-                        raise BrokenRecording(self.path, f"byte {at}", "the file ends within this record")
+                fault = _fault_of(length, size - file.tell())
+                if not fault or (length <= MAX_RECORD_BYTES and not self._chunk_after(at)):
+                    yield from walk.record(at, opcode, file.read(min(length, MAX_RECORD_BYTES)), length)
                 after = at + RECORD.size + length
-                if after > size:
-                    raise BrokenRecording(self.path, f"byte {at}", "the file ends within this record")
+                if fault:
+                    after = self._chunk_after(at)
+                    if not after:
+                        raise BrokenRecording(self.path, f"byte {at}", fault)
+                    damaged(tally, f"byte {at}", fault)
                 at = file.seek(after)
 
+    def _chunk_after(self, at: int) -> int:
+        """The first byte of the next chunk that the index names; 0 without one."""
+        return next((chunk.start for chunk in self.chunks if chunk.start > at), 0)
 
-def _body(path: Path, file: BinaryIO, at: int, length: int) -> tuple[bytes, bool]:
-    """Return the bytes of a record that the file holds, and whether the record is complete."""
+
+def _fault_of(length: int, left: int) -> str:
+    """What is wrong with the length of a record, if the file has `left` bytes after its head."""
+    if length > left:
+        return "the file ends within this record"
     if length > MAX_RECORD_BYTES:
-        raise BrokenRecording(path, f"byte {at}", f"a record has {length} bytes; the limit is {MAX_RECORD_BYTES}")
-    body = file.read(length)
-    return body, len(body) == length
+        return f"a record has {length} bytes; the limit is {MAX_RECORD_BYTES}"
+    return ""
 
 
-def _in_chunk(
-    path: Path, at: int, body: bytes, found: Definitions, wanted: Collection[str], complete: bool
-) -> Iterator[Record]:
-    """Yield the messages of one chunk; of a truncated chunk, the complete messages."""
-    where = f"byte {at}"
-    if len(body) < CHUNK_HEAD.size:
-        raise BrokenRecording(path, where, "the file ends within the header of this chunk")
-    _, _, size, crc, name = CHUNK_HEAD.unpack_from(body)
-    start = CHUNK_HEAD.size + name + 8
-    compression = body[CHUNK_HEAD.size : start - 8].decode("ascii", "replace")
-    if size > MAX_RECORD_BYTES:
-        raise BrokenRecording(path, where, f"a chunk has {size} bytes; the limit is {MAX_RECORD_BYTES}")
-    data, why = _decompressed_chunk(compression, body[start:], size)
-    if not why and len(data) != size and complete:
-        why = f"this chunk holds {len(data)} bytes instead of {size}"
-    if not why and complete and crc and zlib.crc32(data) != crc:
-        why = "this chunk's checksum is wrong"  # any of its messages may be corrupt
-        data = b""
-    inside = 0
-    while inside + RECORD.size <= len(data):
-        opcode, length = RECORD.unpack_from(data, inside)
-        stop = inside + RECORD.size + length
-        if stop > len(data):
-            why = why or "a record extends past the end of this chunk"
-            break
-        place = f"byte {inside} of the chunk at {where}"
-        record = _message_of(path, place, opcode, data[inside + RECORD.size : stop], found, wanted, {})
-        if record:
+@dataclass(frozen=True, slots=True)
+class _Walk:
+    """One pass over the records of a file."""
+
+    path: Path
+    found: Definitions
+    wanted: Collection[str]
+    metadata: dict[str, dict[str, str]]
+    tally: Tally | None
+
+    def record(self, at: int, opcode: int, body: bytes, length: int) -> Iterator[Record]:
+        """Yield the messages of one record; of a truncated chunk, the complete messages."""
+        complete = len(body) == length
+        if opcode == CHUNK:
+            yield from self.in_chunk(at, body, complete=complete)
+        elif complete and (record := self._message(f"byte {at}", opcode, body)):
             yield record
-        inside = stop
-    if not complete:
-        why = "the file ends within this chunk"
-    if why:
-        raise BrokenRecording(path, where, why)
 
+    def in_chunk(self, at: int, body: bytes, *, complete: bool) -> Iterator[Record]:
+        """Yield the messages of one chunk that can be read."""
+        where = f"byte {at}"
+        if len(body) < CHUNK_HEAD.size:
+            damaged(self.tally if complete else None, where, "this chunk ends within its header")
+            return
+        _, _, size, crc, name = CHUNK_HEAD.unpack_from(body)
+        start = CHUNK_HEAD.size + name + 8
+        compression = body[CHUNK_HEAD.size : start - 8].decode("ascii", "replace")
+        if size > MAX_RECORD_BYTES:
+            damaged(self.tally, where, f"a chunk has {size} bytes; the limit is {MAX_RECORD_BYTES}")
+            return
+        data, why = unpacked(compression, body[start:], size) if compression else (body[start:], "")
+        if not why and complete and len(data) != size:
+            why = f"this chunk holds {len(data)} bytes instead of {size}"
+        if not why and complete and crc and zlib.crc32(data) != crc:
+            why = "this chunk's checksum is wrong"  # any of its messages may be corrupt
+            data = b""
+        inside = 0
+        while inside + RECORD.size <= len(data):
+            opcode, length = RECORD.unpack_from(data, inside)
+            stop = inside + RECORD.size + length
+            if stop > len(data):
+                why = why or "a record extends past the end of this chunk"
+                break
+            place = f"byte {inside} of the chunk at {where}"
+            record = self._message(place, opcode, data[inside + RECORD.size : stop])
+            if record:
+                yield record
+            inside = stop
+        if why and complete:
+            damaged(self.tally, where, why)
 
-def _decompressed_chunk(compression: str, data: bytes, size: int) -> tuple[bytes, str]:
-    """Decompress a chunk up to the first fault; return the data and the fault, which is empty if there is none."""
-    if compression == "":
-        return data, ""
-    try:
-        if compression == "zstd":
-            import zstandard
-
-            with zstandard.ZstdDecompressor().stream_reader(data) as reader:
-                return _read(reader, size)
-        if compression == "lz4":
-            import lz4.frame
-
-            with lz4.frame.LZ4FrameFile(BytesIO(data)) as reader:
-                return _read(reader, size)
-    except ModuleNotFoundError as error:
-        raise MissingExtra(str(error.name).partition(".")[0], "recordings") from None
-    return b"", f"unknown compression {compression!r}; supported: zstd, lz4"
-
-
-def _read(reader: Any, size: int) -> tuple[bytes, str]:
-    """Read at most `size` bytes in parts, so that the data before a fault is kept."""
-    parts, left = [], size
-    try:
-        while left and (part := reader.read(min(left, 1 << 16))):
-            parts.append(part)
-            left -= len(part)
-    except (RuntimeError, EOFError, OSError, ValueError) as error:
-        return b"".join(parts), f"cannot decompress this chunk: {error}"
-    except Exception as error:  # ZstdError has no other base class
-        if type(error).__name__ != "ZstdError":
-            raise
-        return b"".join(parts), f"cannot decompress this chunk: {error}"
-    return b"".join(parts), ""
-
-
-def _message_of(
-    path: Path,
-    where: str,
-    opcode: int,
-    body: bytes,
-    found: Definitions,
-    wanted: Collection[str],
-    metadata: dict[str, dict[str, str]],
-) -> Record | None:
-    """Return the message of this record if its topic is wanted; add a schema, channel or metadata record to `found`."""
-    if opcode == MESSAGE:
-        if len(body) < MESSAGE_HEAD.size:
-            raise BrokenRecording(path, where, "a message has no header")
-        number, _, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(body)
-        channel = found.channels.get(number)
-        if channel is None:
-            raise BrokenRecording(path, where, f"a message refers to channel {number}, which no record defines")
-        if channel.topic not in wanted:
-            return None
-        return Record(channel, log_ns, publish_ns, where, body[MESSAGE_HEAD.size :])
-    if opcode in (SCHEMA, CHANNEL, METADATA):
-        try:
-            add_definition(opcode, body, found, metadata)
-        except record_errors() as error:
-            raise BrokenRecording(path, where, f"cannot read this record: {error}") from None
-    return None
+    def _message(self, where: str, opcode: int, body: bytes) -> Record | None:
+        """Return the message of this record if its topic is wanted; note a schema, channel or metadata record."""
+        if opcode == MESSAGE:
+            if len(body) < MESSAGE_HEAD.size:
+                damaged(self.tally, where, "a message has no header")
+                return None
+            number, _, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(body)
+            channel = self.found.channels.get(number)
+            if channel is None:
+                damaged(self.tally, where, f"a message refers to channel {number}, which no record defines")
+                return None
+            if channel.topic not in self.wanted:
+                return None
+            return Record(channel, log_ns, publish_ns, where, body[MESSAGE_HEAD.size :])
+        if opcode in (SCHEMA, CHANNEL, METADATA):
+            try:
+                add_definition(opcode, body, self.found, self.metadata)
+            except record_errors() as error:
+                damaged(self.tally, where, f"cannot read this record: {error}")
+        return None

@@ -15,7 +15,9 @@ from typing import Any, BinaryIO, Final, NamedTuple, Self
 
 from neurove_core.extras import MissingExtra
 from neurove_core.io.errors import BrokenRecording, UnknownSource
-from neurove_core.io.formats.containers.bags import MAX_RECORD_BYTES, BagMessage
+from neurove_core.io.faults import Tally
+from neurove_core.io.formats.containers.bags import MAX_RECORD_BYTES, BagMessage, damaged
+from neurove_core.io.unpack import ERRORS, bounded
 
 MAGIC: Final = b"#ROSBAG V2.0\n"
 MAX_HEADER_BYTES: Final = 1 << 20
@@ -72,7 +74,9 @@ class Ros1Bag:
         """See `BagFile`."""
         return {connection.topic: connection.type for connection in self.connections.values()}
 
-    def messages(self, topics: Collection[str], since_ns: int | None = None) -> Iterator[BagMessage]:
+    def messages(
+        self, topics: Collection[str], since_ns: int | None = None, tally: Tally | None = None
+    ) -> Iterator[BagMessage]:
         """See `BagFile`."""
         start = len(MAGIC)
         if since_ns is not None and self.chunk_ends:
@@ -80,31 +84,41 @@ class Ros1Bag:
             if not later:
                 return
             start = later[0]
-        yield from self._walk(frozenset(topics), start)
+        yield from self._walk(frozenset(topics), start, tally)
 
-    def _walk(self, wanted: frozenset[str], start: int) -> Iterator[BagMessage]:
+    def _walk(self, wanted: frozenset[str], start: int, tally: Tally | None = None) -> Iterator[BagMessage]:
         with self.path.open("rb") as file:
             at = file.seek(start)
             size = file.seek(0, 2)
             file.seek(at)
             while at < size:
+                after = 0  # unknown
                 try:
                     record = _read_record(file)
                     after = file.tell() + record.size
                     if record.op == _CHUNK:
-                        yield from self._in_chunk(file, record, at, wanted)
+                        yield from self._in_chunk(file, record, at, wanted, tally)
                     elif record.op == _CONNECTION:
                         self._add_connection(record.header, _read_exactly(file, record.size))
                     elif record.op == _CHUNK_INFO:  # only the index follows
                         return
+                    why = "the file ends within this record" if after > size else ""
                 except _BadRecord as error:
                     why = str(error) or "the file ends within a record"
-                    raise BrokenRecording(self.path, f"byte {at}", why) from None
-                if after > size:
-                    raise BrokenRecording(self.path, f"byte {at}", "the file ends within this record")
+                if why:
+                    after = after if 0 < after < size else self._chunk_after(at)
+                    if not after:
+                        raise BrokenRecording(self.path, f"byte {at}", why)
+                    damaged(tally, f"byte {at}", why)
                 at = file.seek(after)
 
-    def _in_chunk(self, file: BinaryIO, chunk: _Record, at: int, wanted: frozenset[str]) -> Iterator[BagMessage]:
+    def _chunk_after(self, at: int) -> int:
+        """The first byte of the next chunk that the index names; 0 without one."""
+        return next((start for start, _ in self.chunk_ends if start > at), 0)
+
+    def _in_chunk(
+        self, file: BinaryIO, chunk: _Record, at: int, wanted: frozenset[str], tally: Tally | None
+    ) -> Iterator[BagMessage]:
         """Yield the messages of one chunk. They are read one by one, because a chunk may have any size."""
         stream, stop, inside = _decompressed_chunk(file, chunk), _integer(chunk.header, "size"), 0
         while inside < stop:
@@ -114,11 +128,11 @@ class Ros1Bag:
                 self._add_connection(record.header, data)
             elif record.op == _MESSAGE:
                 connection = self.connections.get(_integer(record.header, "conn"))
+                where = f"byte {inside} of the chunk at byte {at}"
                 if connection is None:
-                    raise _BadRecord("a message refers to a connection that no record defines")
-                if connection.topic in wanted:
+                    damaged(tally, where, "a message refers to a connection that no record defines")
+                elif connection.topic in wanted:
                     seconds, nanoseconds = struct.unpack("<II", record.header.get("time", b"").ljust(8, b"\0")[:8])
-                    where = f"byte {inside} of the chunk at byte {at}"
                     yield BagMessage(connection.topic, seconds * 1_000_000_000 + nanoseconds, where, data)
             inside += record.head + record.size
 
@@ -151,13 +165,13 @@ def _decompressed_chunk(file: BinaryIO, chunk: _Record) -> Any:
         case b"none":
             return limited
         case b"bz2":
-            return bz2.BZ2File(limited)
+            return bounded(bz2.BZ2File(limited), chunk.size)
         case b"lz4":
             try:
                 import lz4.frame
             except ModuleNotFoundError:
                 raise MissingExtra("lz4", "recordings") from None
-            return lz4.frame.LZ4FrameFile(limited)
+            return bounded(lz4.frame.LZ4FrameFile(limited), chunk.size)
         case _:
             raise _BadRecord(f"unknown compression {compression!r}; supported: none, bz2, lz4")
 
@@ -168,7 +182,7 @@ def _read_exactly(stream: Any, size: int) -> bytes:
         raise _BadRecord(f"a record has {size} bytes; the limit is {MAX_RECORD_BYTES}")
     try:
         data = bytes(stream.read(size)) if size else b""
-    except (OSError, EOFError, RuntimeError, ValueError) as error:  # errors of the decompressors
+    except ERRORS as error:
         raise _BadRecord(f"cannot decompress the chunk: {error}") from None
     if len(data) < size:
         raise _BadRecord

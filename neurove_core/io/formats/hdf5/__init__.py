@@ -1,1 +1,1 @@
-"""Recordings in HDF5: MVSEC, DSEC, M3ED."""
+"""Recordings in HDF5: MVSEC, DSEC, M3ED, Prophesee and others."""

@@ -1,4 +1,4 @@
-"""Detection of the data set of an HDF5 file with events: MVSEC, DSEC or M3ED."""
+"""Detection of the layout of an HDF5 file with events: MVSEC, DSEC, M3ED, and those of `layouts`."""
 
 from pathlib import Path
 
@@ -6,6 +6,7 @@ from neurove_core.io.errors import UnknownSource
 from neurove_core.io.format import Format
 from neurove_core.io.formats.hdf5.dsec import DsecRecording
 from neurove_core.io.formats.hdf5.file import has, opened
+from neurove_core.io.formats.hdf5.layouts import PlainRecording, layout_of
 from neurove_core.io.formats.hdf5.m3ed import TOPICS as M3ED_TOPICS
 from neurove_core.io.formats.hdf5.m3ed import M3edRecording
 from neurove_core.io.formats.hdf5.mvsec import TOPICS as MVSEC_TOPICS
@@ -17,6 +18,10 @@ _LOOKED_FOR = (
     "davis/left/events or davis/right/events (MVSEC)",
     "events/p, x, y, t (DSEC)",
     "prophesee/left or prophesee/right with t, x, y, p (M3ED)",
+    "CD/events (Prophesee)",
+    "events of shape (N, 4) (v2e)",
+    "x, y, t, p (EDS)",
+    "events/xs, ys, ts, ps",
 )
 _TRUTH = ("davis/left/odometry", "Cn_T_C0", "poss")
 
@@ -31,6 +36,8 @@ def open_hdf5(path: Path, sensor: Sensor | None = None, topic: str | None = None
 
     Raises:
         UnknownSource: the file has none of the layouts, or lacks this topic.
+        MissingGeometry: neither the file nor the caller gives the sensor. MissingFilter: its events need a filter that
+            HDF5 does not have.
         BrokenRecording: the file is truncated or corrupt. MissingExtra: h5py or hdf5plugin is not installed.
         InvalidField: its calibration is invalid.
     """
@@ -38,6 +45,7 @@ def open_hdf5(path: Path, sensor: Sensor | None = None, topic: str | None = None
         mvsec = any(has(file, f"{name}/events") for name in MVSEC_TOPICS)
         m3ed = any(has(file, *(f"{name}/{column}" for column in "txyp")) for name in M3ED_TOPICS)
         dsec = has(file, *(f"events/{column}" for column in "txyp"))
+        layout = layout_of(file)
         truth = [name for name in _TRUTH if has(file, name)]
     if mvsec:
         return MvsecRecording.open(path, sensor, topic)
@@ -46,8 +54,16 @@ def open_hdf5(path: Path, sensor: Sensor | None = None, topic: str | None = None
     if dsec:
         refuse_topic(path, topic)
         return DsecRecording.open(path, sensor)
+    if layout is not None:
+        refuse_topic(path, topic)
+        return PlainRecording.open(path, layout, sensor)
     why = f"it has no events; looked for {'; '.join(_LOOKED_FOR)}"
     raise UnknownSource(path, why + (f"; it has poses: {truth[0]}" if truth else ""))
 
 
-FORMAT = Format("FILE.h5, FILE.hdf5 (MVSEC, DSEC, M3ED)", open_hdf5, (".h5", ".hdf5"), signature=rb"\x89HDF\r\n\x1a\n")
+FORMAT = Format(
+    "FILE.h5, FILE.hdf5 (MVSEC, DSEC, M3ED, Prophesee, v2e, EDS, events/xs)",
+    open_hdf5,
+    (".h5", ".hdf5"),
+    signature=rb"\x89HDF\r\n\x1a\n",
+)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.extras import MissingExtra
-from neurove_core.io.errors import BrokenRecording, UnknownSource
+from neurove_core.io.errors import BrokenRecording, MissingFilter, UnknownSource
 
 MAX_CHUNK_BYTES: Final = 64 << 20
 """Largest stored chunk of a data set. HDF5 decompresses a chunk at once, so this limit bounds the memory."""
@@ -75,24 +75,67 @@ def dataset(path: Path, file: Any, name: str, *tail: int) -> Any:
 
     Raises:
         BrokenRecording: it does not exist, has another shape or type, or is stored in chunks above MAX_CHUNK_BYTES.
+        MissingFilter: HDF5 lacks a filter that its rows need.
     """
-    try:
-        found = file[name]
-        shape, kind, width = tuple(found.shape), found.dtype.kind, found.dtype.itemsize
-        missing = found.size and not found.is_virtual and not found.id.get_storage_size()
-        chunk_bytes = int(np.prod(found.chunks or (0,), dtype=np.float64)) * width
-    except (*FAULTS, AttributeError) as error:
-        raise BrokenRecording(path, name, f"it cannot be read: {error}") from None
-    numbers = kind in "biu" or (kind == "f" and width in (4, 8))  # numpy's linear algebra supports no other floats
-    if len(shape) != 1 + len(tail) or shape[1:] != tail or not numbers:
+    found, shape = _stored(path, file, name)
+    if len(shape) != 1 + len(tail) or shape[1:] != tail or not _is_number(found.dtype):
         want = ", ".join(["N", *map(str, tail)])
         raise BrokenRecording(path, name, f"expected numbers of shape ({want}), not {found.dtype} of {shape}")
+    return found
+
+
+def records(path: Path, file: Any, name: str, fields: tuple[str, ...]) -> Any:
+    """The h5py.Dataset of records (N,) that have these fields of numbers. Its rows are not read yet.
+
+    Raises:
+        BrokenRecording, MissingFilter: as for `dataset`.
+    """
+    found, shape = _stored(path, file, name)
+    known = found.dtype.fields or {}
+    if len(shape) != 1 or not all(one in known and _is_number(known[one][0]) for one in fields):
+        want = ", ".join(fields)
+        raise BrokenRecording(path, name, f"expected records of {want} and shape (N), not {found.dtype} of {shape}")
+    return found
+
+
+def _is_number(dtype: Any) -> bool:
+    """Whether these are numbers that numpy's linear algebra supports."""
+    return dtype.kind in "biu" or (dtype.kind == "f" and dtype.itemsize in (4, 8))
+
+
+def _stored(path: Path, file: Any, name: str) -> tuple[Any, tuple[int, ...]]:
+    """The h5py.Dataset and its shape, if its rows can be read within the bounds."""
+    try:
+        found = file[name]
+        shape = tuple(found.shape)
+        missing = found.size and not found.is_virtual and not found.id.get_storage_size()
+        chunk_bytes = int(np.prod(found.chunks or (0,), dtype=np.float64)) * found.dtype.itemsize
+    except (*FAULTS, AttributeError) as error:
+        raise BrokenRecording(path, name, f"it cannot be read: {error}") from None
     if chunk_bytes > MAX_CHUNK_BYTES:
         why = f"it is stored in chunks of {chunk_bytes} bytes; at most {MAX_CHUNK_BYTES} are allowed"
         raise BrokenRecording(path, name, why)
     if missing:  # HDF5 would return zeros for all rows that the header claims
-        raise BrokenRecording(path, name, f"its {shape[0]} rows were never written")
-    return found
+        raise BrokenRecording(path, name, f"its {shape[0] if shape else 1} rows were never written")
+    _check_filters(path, name, found)
+    return found, shape
+
+
+def _check_filters(path: Path, name: str, found: Any) -> None:
+    """Raise MissingFilter if the first row needs a filter that HDF5 does not have."""
+    from h5py import h5z
+
+    try:
+        pipeline = found.id.get_create_plist()
+        numbers = [pipeline.get_filter(i)[0] for i in range(pipeline.get_nfilters())]
+        lacking = [number for number in numbers if not h5z.filter_avail(number)]
+    except FAULTS as error:
+        raise BrokenRecording(path, name, f"its filters cannot be read: {error}") from None
+    if lacking and found.size:
+        try:
+            found[:1]  # a chunk may be stored without an optional filter
+        except FAULTS:
+            raise MissingFilter(path, name, lacking[0]) from None
 
 
 def value(path: Path, file: Any, name: str) -> Any:

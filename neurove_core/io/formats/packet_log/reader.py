@@ -1,5 +1,6 @@
 """Reader of NeuroVE recordings: it gives events, or the packets as published."""
 
+import contextlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Any, Final, NamedTuple, Self, TypeVar
 import numpy as np
 
 from neurove_core.geometry.motion import Poses, Twists
-from neurove_core.io.checked import cleaned
+from neurove_core.io.checked import cleaned, ordered, unread
 from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.faults import Faults, Reason, Tally
 from neurove_core.io.format import Format
@@ -74,10 +75,7 @@ class McapRecording(EventsOnly):
         if wanted is None and len(streams) > 1:
             name = f"{path.name} ({streams[0]}, the first of {len(streams)} streams)"
         stream = wanted or streams[0]
-        first = next(file.records((f"{stream}/events",)), None)
-        if first is None:
-            raise UnknownSource(path, f"stream {stream} has no packet")
-        return cls(path, name, sensor or _decoded(path, first).sensor, stream, file)
+        return cls(path, name, sensor or _sensor_of(path, file, stream), stream, file)
 
     @property
     def streams(self) -> tuple[str, ...]:
@@ -108,7 +106,7 @@ class McapRecording(EventsOnly):
 
     def _pieces(self, first_chunk: int, tally: Tally) -> Iterator[tuple[str, Events]]:
         first: Sensor | None = None
-        for record in self.file.records((self._topic("events"),), first_chunk):
+        for record in self.file.records((self._topic("events"),), first_chunk, tally):
             try:
                 packet = _decoded(self.path, record)
             except BrokenRecording as error:
@@ -131,7 +129,7 @@ class McapRecording(EventsOnly):
             BrokenRecording: the file is truncated or corrupt. It is raised after all complete packets.
         """
         streams = _streams(self.file) if stream is None else [stream]
-        for record in self.file.records([f"{name}/events" for name in streams]):
+        for record in self.file.records([f"{name}/events" for name in streams], tally=self.faults.begin("packets")):
             name = record.channel.topic.removesuffix("/events")
             yield RecordedPacket(name, record.data, record.log_ns)
 
@@ -144,8 +142,11 @@ class McapRecording(EventsOnly):
         """Return the last CameraInfo of each stream that has one, as published bytes."""
         topics = [f"{name}/camera" for name in _streams(self.file)]
         present = [topic for topic in topics if topic in self.file.topics]
-        found = self.file.records(present) if present else ()
-        return {record.channel.topic.removesuffix("/camera"): record.data for record in found}
+        found: dict[str, bytes] = {}
+        with contextlib.suppress(BrokenRecording):  # reading the events counts it
+            for record in self.file.records(present) if present else ():
+                found[record.channel.topic.removesuffix("/camera")] = record.data
+        return found
 
     def camera(self, stream: str) -> CameraInfo | None:
         """Return the lens that the driver of the stream published, or None.
@@ -158,15 +159,22 @@ class McapRecording(EventsOnly):
 
     def imu(self) -> Iterator[Imu]:
         """Yield the IMU samples of the converted recording."""
-        return self._tables("imu")
+        tally = self.faults.begin("imu")
+        return ordered(self._tables("imu", tally), tally)
 
     def triggers(self) -> Iterator[Triggers]:
         """Yield the trigger edges of the converted recording."""
-        return self._tables("triggers")
+        tally = self.faults.begin("triggers")
+        return ordered(self._tables("triggers", tally), tally)
 
     def frames(self) -> Iterator[Frame]:
         """Yield the images of the converted recording."""
-        return self._messages("frames", layout.unpack_frame)
+        tally = self.faults.begin("frames")
+        try:
+            for _, frame in self._messages("frames", layout.unpack_frame, tally):
+                yield frame
+        except BrokenRecording as error:
+            unread(tally, error)
 
     def poses(self) -> Poses | None:
         """Return the poses of the converted recording, or None."""
@@ -179,27 +187,45 @@ class McapRecording(EventsOnly):
     def _topic(self, kind: str) -> str:
         return f"{self.stream}/{kind}"
 
-    def _tables(self, kind: str) -> Iterator[Any]:
-        return self._messages(kind, lambda data: layout.unpack_columns(kind, data))
+    def _tables(self, kind: str, tally: Tally) -> Iterator[tuple[str, Any]]:
+        return self._messages(kind, lambda data: layout.unpack_columns(kind, data), tally)
 
     def _joined(self, kind: str, table: Callable[..., T]) -> T | None:
-        parts = list(self._tables(kind))
+        tally = self.faults.begin(kind)
+        parts = list(ordered(self._tables(kind, tally), tally))
         return table(*(np.concatenate(columns) for columns in zip(*parts, strict=True))) if parts else None
 
-    def _messages(self, kind: str, unpack: Callable[[bytes], T]) -> Iterator[T]:
+    def _messages(self, kind: str, unpack: Callable[[bytes], T], tally: Tally) -> Iterator[tuple[str, T]]:
         topic = self._topic(kind)
         if topic not in self.file.topics:
             return
         chunks = self.file.chunks_of(topic)
-        for record in self.file.records((topic,), chunks[0] if chunks else 0):
+        for record in self.file.records((topic,), chunks[0] if chunks else 0, tally):
             try:
-                yield unpack(record.data)
+                unpacked = unpack(record.data)
             except BadColumns as why:
-                raise BrokenRecording(self.path, record.where, str(why)) from None
+                tally.add(Reason.DAMAGED, record.where, str(why))
+            else:
+                yield record.where, unpacked
 
 
 def _streams(file: McapFile) -> list[str]:
     return sorted(topic.removesuffix("/events") for topic in file.topics if topic.endswith("/events"))
+
+
+def _sensor_of(path: Path, file: McapFile, stream: str) -> Sensor:
+    """The sensor of the first packet that can be decoded.
+
+    Raises:
+        UnknownSource: the stream has no packet. BrokenRecording: it has none that can be decoded.
+    """
+    bad: BrokenRecording | None = None
+    for record in file.records((f"{stream}/events",)):
+        try:
+            return _decoded(path, record).sensor
+        except BrokenRecording as error:
+            bad = bad or error
+    raise bad or UnknownSource(path, f"stream {stream} has no packet")
 
 
 def _decoded(path: Path, record: Record) -> EventPacket:

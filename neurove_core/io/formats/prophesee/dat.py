@@ -20,6 +20,9 @@ from neurove_protocol.events import Events, Sensor
 
 RECORD = np.dtype([("t", "<u4"), ("bits", "<u4")])
 _EVENTS, _TRIGGERS = (0x00, 0x0C), (0x0E,)
+VERSION = "2"
+"""Version of the layout of the records. In version 1 the coordinates have other bits."""
+
 SEEK_RECORDS = 4096
 """Distance between the records that the search for a time reads."""
 
@@ -44,13 +47,15 @@ class DatRecording(EventsOnly):
             sensor: its pixel array, which takes precedence over the header.
 
         Raises:
-            UnknownSource: its records are neither events nor triggers of 8 bytes.
+            UnknownSource: its records are neither events nor triggers of 8 bytes, or the header gives another version.
             MissingGeometry: neither the header nor `sensor` gives the sensor size.
             BrokenRecording: the file ends within its header.
         """
         with path.open("rb") as file:
             head = file.read(HEADER_BYTES)
         header = parse_header(path, head)
+        if header.version not in (None, VERSION):
+            raise UnknownSource(path, f"its header says version {header.version}; the supported version is {VERSION}")
         kind_and_size = head[header.size : header.size + 2]
         if len(kind_and_size) < 2:
             raise BrokenRecording(path, f"byte {len(head)}", "the file ends within its header")
@@ -74,7 +79,7 @@ class DatRecording(EventsOnly):
 
     def chunks(self) -> Iterator[Events]:
         """All events from the beginning; see `Recording`. The 32-bit clock wraps every 71.6 min and is unwrapped."""
-        return self._events(0, 0)
+        return self._events(0, None)
 
     def since(self, t_us: int) -> Iterator[Events]:
         """As `chunks`, from this time [us], found by bisection.
@@ -86,7 +91,7 @@ class DatRecording(EventsOnly):
         if n <= 0:
             return self.chunks()
         records = np.memmap(self.path, RECORD, "r", self.start, (n,))
-        times, _ = unwrap_times(np.array(records["t"][::SEEK_RECORDS]), 0)
+        times, _ = unwrap_times(np.array(records["t"][::SEEK_RECORDS]), None)
         sample = max(int(times.searchsorted(t_us)) - 1, 0)
         return later(self._events(sample * SEEK_RECORDS, int(times[sample])), t_us)
 
@@ -96,20 +101,20 @@ class DatRecording(EventsOnly):
             yield from ordered(self._edges(), self.faults.begin("triggers"))
 
     def _edges(self) -> Iterator[tuple[Where, Triggers]]:
-        for at, t, bits in self._blocks(0, 0):
+        for at, t, bits in self._blocks(0, None):
             yield _place(at), Triggers(t, (bits >> 8 & 0x1F).astype(np.uint8), (bits & 1).astype(np.uint8))
 
-    def _events(self, first: int, before_us: int) -> Iterator[Events]:
+    def _events(self, first: int, before_us: int | None) -> Iterator[Events]:
         """The events from record number `first`. `before_us` is the time of this record or of an earlier one [us]."""
         if self.kind not in _EVENTS:
             return iter(())
         return cleaned(self._pieces(first, before_us), self.sensor, self.faults.begin("events"))
 
-    def _pieces(self, first: int, before_us: int) -> Iterator[Piece]:
+    def _pieces(self, first: int, before_us: int | None) -> Iterator[Piece]:
         for at, t, bits in self._blocks(first, before_us):
             yield _place(at), Events.from_columns(t, bits & 0x3FFF, bits >> 14 & 0x3FFF, bits >> 28 & 1)
 
-    def _blocks(self, first: int, before_us: int) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.uint32]]]:
+    def _blocks(self, first: int, before_us: int | None) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.uint32]]]:
         """Blocks of up to BLOCK_BYTES: the byte of the first record, the times [us] and the second words."""
         at = self.start + first * RECORD.itemsize
         with self.path.open("rb") as file:

@@ -8,19 +8,15 @@ from numpy.typing import NDArray
 from neurove_core.compiled import compiled
 from neurove_protocol.events import Events
 
-OK: Final = 0  # all words were read, or `out` is full: call again with the remaining words
-ILLEGAL: Final = 1  # the next word has an unknown type
-OUTSIDE: Final = 2  # the next word has an event outside the sensor; it is in `out` after the valid ones
-
 STEP_BACK: Final = 10
-"""Maximum decrease of TIME_HIGH that is not a wrap of its counter. Prophesee's own decoder has the same limit."""
+"""Maximum decrease of TIME_HIGH that is a disturbance of one word. Prophesee's own decoder has the same limit."""
+
+EVT3_BACK_US: Final = (STEP_BACK + 1) << 12
+EVT2_BACK_US: Final = (STEP_BACK + 1) << 6
+"""An event that is earlier by less than this gets the time of the event before it."""
 
 VECTOR_EVENTS: Final = 12
 """Maximum number of events in one word. `out` must have space for at least as many."""
-
-EVT2_WORDS: Final = (0x0, 0x1, 0x8, 0xA, 0xE, 0xF)
-EVT3_WORDS: Final = (0x0, 0x2, 0x3, 0x4, 0x5, 0x6, 0x7, 0x8, 0xA, 0xE, 0xF)
-"""Known word types, given by the first four bits."""
 
 _ADDR_Y, _ADDR_X, _BASE_X, _VECT_12, _VECT_8, TIME_LOW, TIME_HIGH = 0, 2, 3, 4, 5, 6, 8
 _EVT3_SKIPPED = 1 << 0x7 | 1 << 0xA | 1 << 0xE | 1 << 0xF  # CONTINUED_4, EXT_TRIGGER, OTHERS, CONTINUED_12
@@ -57,37 +53,49 @@ def signed(word: np.unsignedinteger[Any]) -> int:  # pragma: no cover (machine c
 
 @compiled
 def unwrapped(high: int, value: int, period: int) -> int:  # pragma: no cover (machine code)
-    """Unwrap a counter whose new value is `value`. A decrease by more than STEP_BACK is a wrap."""
-    return high + (value - high + STEP_BACK) % period - STEP_BACK
+    """Unwrap a counter whose new value is `value`: see `step_of`."""
+    step = value - high % period
+    if step >= period - STEP_BACK:
+        step -= period
+    elif step < -STEP_BACK and value < period // 4 and value - step >= period // 4 * 3:
+        step += period
+    return high + step
+
+
+@compiled
+def not_before(last_us: int, t_us: int, back_us: int) -> int:  # pragma: no cover (machine code)
+    """The time of an event after one at `last_us`: `last_us` if the step back is small, otherwise the clock changed."""
+    return last_us if last_us - back_us < t_us < last_us else t_us
 
 
 @compiled
 def evt3_decode(
-    words: NDArray[np.uint16], state: Evt3State, width: int, height: int, out: Events
-) -> tuple[Evt3State, int, int, int]:  # pragma: no cover (machine code)
-    """Decode EVT3 words until they end, `out` is full, or a word cannot be used.
+    words: NDArray[np.uint16], state: Evt3State, out: Events, reserved: NDArray[np.int64]
+) -> tuple[Evt3State, int, int]:  # pragma: no cover (machine code)
+    """Decode EVT3 words until they end or `out` is full.
 
     The camera's clock has 24 bits [us] and wraps every 16.777 s; the times are unwrapped. TIME_HIGH sometimes decreases
-    by up to STEP_BACK without a wrap. Output times never decrease: an event at such a moment gets the time of the event
-    before it. Triggers, monitoring words, and events before the first TIME_HIGH are skipped.
+    by up to STEP_BACK: an event at such a moment gets the time of the event before it. Triggers, monitoring words,
+    events before the first TIME_HIGH, and words of a reserved type are skipped. Some cameras fill packets with the
+    latter.
 
     Source: docs.prophesee.ai, EVT 3.0 format.
 
     Args:
         words: (N,) words from the camera.
         state: state after the words before these.
-        width: width of the sensor [px].
-        height: height of the sensor [px].
-        out: columns of equal length, at least VECTOR_EVENTS, for the events.
+        out: columns of equal length, at least VECTOR_EVENTS, for the events. They may lie outside the sensor.
+        reserved: (2,) the number of reserved words, which is increased, and the index in `words` of the first one,
+            which is set if the number is 0.
 
     Returns:
-        The state after the words read, the number of words read, the number of events in `out`, and OK, ILLEGAL or
-        OUTSIDE. The state is valid only after OK.
+        The state after the words read, the number of words read, and the number of events in `out`. If not all words
+        were read, `out` is full: call again with the remaining words.
     """
     timed, high, low, last_us, y, base_x, p = state
     t_out, x_out, y_out, p_out = out
     if t_out.size < VECTOR_EVENTS:  # a negative limit would become a huge unsigned number
-        return state, 0, 0, OK
+        return state, 0, 0
     n, limit = (
         np.uint64(0),
         np.uint64(t_out.size - VECTOR_EVENTS),
@@ -99,12 +107,9 @@ def evt3_decode(
         if kind == _ADDR_X:
             if timed and y >= 0:
                 if n > limit:
-                    return Evt3State(timed, high, low, last_us, y, base_x, p), i, signed(n), OK
-                last_us = max(last_us, base + low)
-                x = value & 0x7FF
-                t_out[n], x_out[n], y_out[n], p_out[n] = last_us, x, y, value >> 11
-                if (x >= width) | (y >= height):
-                    return Evt3State(timed, high, low, last_us, y, base_x, p), i, signed(n), OUTSIDE
+                    return Evt3State(timed, high, low, last_us, y, base_x, p), i, signed(n)
+                last_us = not_before(last_us, base + low, EVT3_BACK_US)
+                t_out[n], x_out[n], y_out[n], p_out[n] = last_us, value & 0x7FF, y, value >> 11
                 n += _ONE
         elif kind == _ADDR_Y:
             y = value & 0x7FF
@@ -123,13 +128,11 @@ def evt3_decode(
             mask = value if kind == _VECT_12 else value & 0xFF
             if mask and timed and y >= 0 and base_x >= 0:
                 if n > limit:
-                    return Evt3State(timed, high, low, last_us, y, base_x, p), i, signed(n), OK
-                last_us = max(last_us, base + low)
+                    return Evt3State(timed, high, low, last_us, y, base_x, p), i, signed(n)
+                last_us = not_before(last_us, base + low, EVT3_BACK_US)
                 while mask:
                     x = base_x + _BIT[(mask & -mask) % 13]
                     t_out[n], x_out[n], y_out[n], p_out[n] = last_us, x, y, p
-                    if (x >= width) | (y >= height):
-                        return Evt3State(timed, high, low, last_us, y, base_x, p), i, signed(n), OUTSIDE
                     n += _ONE
                     mask &= mask - 1
             if base_x >= 0:
@@ -137,30 +140,21 @@ def evt3_decode(
         elif kind == _BASE_X:
             base_x, p = value & 0x7FF, value >> 11
         else:
-            return Evt3State(timed, high, low, last_us, y, base_x, p), i, signed(n), ILLEGAL
-    return Evt3State(timed, high, low, last_us, y, base_x, p), words.size, signed(n), OK
+            if not reserved[0]:
+                reserved[1] = i
+            reserved[0] += 1
+    return Evt3State(timed, high, low, last_us, y, base_x, p), words.size, signed(n)
 
 
 @compiled
 def evt2_decode(
-    words: NDArray[np.uint32], state: Evt2State, width: int, height: int, out: Events
-) -> tuple[Evt2State, int, int, int]:  # pragma: no cover (machine code)
-    """Decode EVT2 words until they end, `out` is full, or a word cannot be used.
+    words: NDArray[np.uint32], state: Evt2State, out: Events, reserved: NDArray[np.int64]
+) -> tuple[Evt2State, int, int]:  # pragma: no cover (machine code)
+    """Decode EVT2 words until they end or `out` is full; see `evt3_decode`.
 
-    Time has 28 bits in TIME_HIGH and 6 bits in each event. It wraps every 4.77 h and is unwrapped. As in `evt3_decode`,
-    output times never decrease, and events before the first TIME_HIGH are skipped.
+    Time has 28 bits in TIME_HIGH and 6 bits in each event. It wraps every 4.77 h and is unwrapped.
 
     Source: docs.prophesee.ai, EVT 2.0 format.
-
-    Args:
-        words: (N,) words from the camera.
-        state: state after the words before these.
-        width: width of the sensor [px].
-        height: height of the sensor [px].
-        out: columns of equal length for the events.
-
-    Returns:
-        As `evt3_decode`.
     """
     timed, high, last_us = state
     n = 0
@@ -170,12 +164,9 @@ def evt2_decode(
         if kind <= 1:
             if timed:
                 if n == out.t.size:
-                    return Evt2State(timed, high, last_us), i, n, OK
-                x, y = (word >> 11) & 0x7FF, word & 0x7FF
-                last_us = max(last_us, (high << 6) + ((word >> 22) & 0x3F))
-                out.t[n], out.x[n], out.y[n], out.p[n] = last_us, x, y, kind
-                if x >= width or y >= height:
-                    return Evt2State(timed, high, last_us), i, n, OUTSIDE
+                    return Evt2State(timed, high, last_us), i, n
+                last_us = not_before(last_us, (high << 6) + ((word >> 22) & 0x3F), EVT2_BACK_US)
+                out.t[n], out.x[n], out.y[n], out.p[n] = last_us, (word >> 11) & 0x7FF, word & 0x7FF, kind
                 n += 1
         elif kind == TIME_HIGH:
             value = word & 0xFFF_FFFF
@@ -183,20 +174,17 @@ def evt2_decode(
             if not timed:
                 timed, last_us = 1, high << 6
         elif kind not in _EVT2_SKIPPED:
-            return Evt2State(timed, high, last_us), i, n, ILLEGAL
-    return Evt2State(timed, high, last_us), words.size, n, OK
+            if not reserved[0]:
+                reserved[1] = i
+            reserved[0] += 1
+    return Evt2State(timed, high, last_us), words.size, n
 
 
-def evt3_reference(
-    words: NDArray[np.uint16], state: Evt3State, width: int, height: int
-) -> tuple[Evt3State, int, Events, int]:
-    """Reference implementation of `evt3_decode` without a limit on events: state, words read, events, verdict."""
+def evt3_reference(words: NDArray[np.uint16], state: Evt3State) -> tuple[Evt3State, Events, list[int]]:
+    """Reference implementation of `evt3_decode` without a limit on events: state, events, indices of reserved words."""
     s = state._asdict()
     events: list[tuple[int, int, int, int]] = []
-
-    def done(read: int, verdict: int) -> tuple[Evt3State, int, Events, int]:
-        return Evt3State(**s), read, Events.from_columns(*(zip(*events, strict=True) if events else [()] * 4)), verdict
-
+    reserved: list[int] = []
     for i, word in enumerate(words.tolist()):
         value = word & 0xFFF
         hits: list[tuple[int, int]] = []  # x and polarity of this word's events
@@ -217,53 +205,50 @@ def evt3_reference(
             case 0x8 if not s["timed"]:
                 s.update(timed=1, high=value, low=0, last_us=value << 12)
             case 0x8:
-                step = step_of(value - s["high"] % (1 << 12), 1 << 12)
+                step = step_of(s["high"] % (1 << 12), value, 1 << 12)
                 s.update(high=s["high"] + step, low=0 if step else s["low"])
             case 0x7 | 0xA | 0xE | 0xF:
                 pass
             case _:
-                return done(i, ILLEGAL)
+                reserved.append(i)
         if hits and s["timed"] and s["y"] >= 0:
-            s["last_us"] = max(s["last_us"], (s["high"] << 12) + s["low"])
-            for x, p in hits:
-                if x >= width or s["y"] >= height:
-                    return done(i, OUTSIDE)
-                events.append((s["last_us"], x, s["y"], p))
-    return done(words.size, OK)
+            t_us = (s["high"] << 12) + s["low"]
+            s["last_us"] = s["last_us"] if 0 < s["last_us"] - t_us < EVT3_BACK_US else t_us
+            events += [(s["last_us"], x, s["y"], p) for x, p in hits]
+    return Evt3State(**s), Events.from_columns(*(zip(*events, strict=True) if events else [()] * 4)), reserved
 
 
-def evt2_reference(
-    words: NDArray[np.uint32], state: Evt2State, width: int, height: int
-) -> tuple[Evt2State, int, Events, int]:
-    """Reference implementation of `evt2_decode`, vectorised over all words: state, words read, events, verdict."""
-    kinds = words >> 28
-    known = np.isin(kinds, EVT2_WORDS)
-    read, verdict = (words.size, OK) if known.all() else (int(np.argmin(known)), ILLEGAL)
-
-    ticks = np.flatnonzero(kinds[:read] == 0x8)
-    highs = [state.high]
-    for value in (words[ticks] & 0xFFF_FFFF).tolist():
-        first = len(highs) == 1 and not state.timed
-        highs.append(value if first else highs[-1] + step_of(value - highs[-1] % (1 << 28), 1 << 28))
-    floor_us = state.last_us if state.timed or not ticks.size else highs[1] << 6
-
-    at = np.flatnonzero(kinds[:read] <= 1)
-    if not state.timed:
-        at = at[at > ticks[0]] if ticks.size else at[:0]
-    cd = words[at].astype(np.int64)
-    t = (np.array(highs)[np.searchsorted(ticks, at)] << 6) + (cd >> 22 & 0x3F)
-    events = Events.from_columns(
-        np.maximum.accumulate(np.maximum(t, floor_us)), cd >> 11 & 0x7FF, cd & 0x7FF, kinds[at]
-    )
-    outside = np.flatnonzero((events.x >= width) | (events.y >= height))
-    if outside.size:
-        read, verdict, events = int(at[outside[0]]), OUTSIDE, events.span(0, int(outside[0]))
-    last_us = int(events.t[-1]) if events.n else floor_us
-    return Evt2State(int(state.timed or ticks.size > 0), highs[-1], last_us), read, events, verdict
+def evt2_reference(words: NDArray[np.uint32], state: Evt2State) -> tuple[Evt2State, Events, list[int]]:
+    """Reference implementation of `evt2_decode`: state, events, indices of reserved words."""
+    timed, high, last_us = state
+    events: list[tuple[int, int, int, int]] = []
+    reserved: list[int] = []
+    for i, word in enumerate(words.tolist()):
+        match word >> 28:
+            case 0x0 | 0x1 as p if timed:
+                t_us = (high << 6) + (word >> 22 & 0x3F)
+                last_us = last_us if 0 < last_us - t_us < EVT2_BACK_US else t_us
+                events.append((last_us, word >> 11 & 0x7FF, word & 0x7FF, p))
+            case 0x8 if not timed:
+                timed, high = 1, word & 0xFFF_FFFF
+                last_us = high << 6
+            case 0x8:
+                high += step_of(high % (1 << 28), word & 0xFFF_FFFF, 1 << 28)
+            case 0x0 | 0x1 | 0xA | 0xE | 0xF:
+                pass
+            case _:
+                reserved.append(i)
+    columns = zip(*events, strict=True) if events else [()] * 4
+    return Evt2State(timed, high, last_us), Events.from_columns(*columns), reserved
 
 
-def step_of(difference: int, period: int) -> int:
-    """Step of a counter with this difference of values. A decrease by more than STEP_BACK is a wrap."""
-    if difference < -STEP_BACK:
-        return difference + period
-    return difference - period if difference >= period - STEP_BACK else difference
+def step_of(before: int, value: int, period: int) -> int:
+    """Step of a counter from the value `before`.
+
+    A decrease by up to STEP_BACK is a disturbance, also across a wrap. A larger one is a wrap if it comes from the top
+    quarter of the range and ends in the bottom quarter. Any other decrease is a change of the clock, which is kept.
+    """
+    if value - before >= period - STEP_BACK:
+        return value - before - period
+    wraps = value - before < -STEP_BACK and before >= period // 4 * 3 and value < period // 4
+    return value - before + (period if wraps else 0)

@@ -1,14 +1,16 @@
 """Prophesee .raw files: a text header, then EVT2 or EVT3 words from the camera."""
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from neurove_core.io.checked import Piece, cleaned, numbered, ordered
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
+from neurove_core.io.faults import Faults, Reason, Tally
 from neurove_core.io.format import Format
 from neurove_core.io.formats.prophesee import evt, triggers
 from neurove_core.io.recording import BLOCK_BYTES, CHUNK_EVENTS, EventsOnly, Triggers, empty_events, refuse_topic
@@ -17,7 +19,7 @@ from neurove_protocol.events import Events, Sensor
 
 HEADER_BYTES = 64 << 10  # maximum size; a header has about 500 bytes
 
-Decode = Callable[[NDArray[Any], Any, int, int, Events], tuple[Any, int, int, int]]
+Decode = Callable[[NDArray[Any], Any, Events, NDArray[np.int64]], tuple[Any, int, int]]
 FindTriggers = Callable[[NDArray[Any], triggers.TriggerState], tuple[triggers.TriggerState, triggers.Columns]]
 
 
@@ -25,19 +27,14 @@ class Words(NamedTuple):
     """A word format: its word type and its decoders."""
 
     dtype: np.dtype[Any]
-    known: NDArray[np.bool_]  # (16,) known word types, indexed by the first four bits
     decode: Decode
     start: NamedTuple
     triggers: FindTriggers
 
 
-def _known(*kinds: int) -> NDArray[np.bool_]:
-    return np.isin(np.arange(16), kinds)
-
-
 FORMATS = {
-    "EVT2": Words(np.dtype("<u4"), _known(*evt.EVT2_WORDS), evt.evt2_decode, evt.Evt2State(), triggers.evt2_triggers),
-    "EVT3": Words(np.dtype("<u2"), _known(*evt.EVT3_WORDS), evt.evt3_decode, evt.Evt3State(), triggers.evt3_triggers),
+    "EVT2": Words(np.dtype("<u4"), evt.evt2_decode, evt.Evt2State(), triggers.evt2_triggers),
+    "EVT3": Words(np.dtype("<u2"), evt.evt3_decode, evt.Evt3State(), triggers.evt3_triggers),
 }
 _FORMAT_OF_EVT = {"2.0": "EVT2", "2.1": "EVT21", "3.0": "EVT3"}
 
@@ -48,6 +45,7 @@ class Header(NamedTuple):
     format: str | None
     sensor: Sensor | None  # None if the header has no valid sensor size
     size: int  # [bytes]
+    version: str | None = None  # of the records of a .dat file
 
 
 def parse_header(path: Path, head: bytes) -> Header:
@@ -57,7 +55,7 @@ def parse_header(path: Path, head: bytes) -> Header:
     If a value occurs twice, the later one applies.
 
     >>> parse_header(Path("a.raw"), b"% evt 3.0\n% format EVT3;height=720;width=1280\n% end\n\x00\x80")
-    Header(format='EVT3', sensor=Sensor(width=1280, height=720), size=52)
+    Header(format='EVT3', sensor=Sensor(width=1280, height=720), size=52, version=None)
 
     Raises:
         BrokenRecording: a header line has no end.
@@ -84,7 +82,7 @@ def parse_header(path: Path, head: bytes) -> Header:
         sensor = Sensor(int(fields.get("width", "")), int(fields.get("height", "")))
     except (ValueError, InvalidField):
         sensor = None
-    return Header(fields.get("format"), sensor, at)
+    return Header(fields.get("format"), sensor, at, fields.get("version"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +94,7 @@ class PropheseeRecording(EventsOnly):
     words: Words
     header_bytes: int
     endless: bool = False
+    faults: Faults = field(default_factory=Faults, compare=False, repr=False)
 
     @classmethod
     def open(cls, path: Path, sensor: Sensor | None = None) -> Self:
@@ -131,62 +130,46 @@ class PropheseeRecording(EventsOnly):
         return self.path.name
 
     def chunks(self) -> Iterator[Events]:
-        """All events from the beginning; see `Recording`. Other words are skipped.
+        """All events from the beginning; see `Recording`. Words of reserved types are skipped and counted."""
+        tally = self.faults.begin("events")
+        return cleaned(self._pieces(tally), self.sensor, tally)
 
-        Raises:
-            BrokenRecording: a word is truncated, has an unknown type, or has an event outside the sensor. The error
-                names the byte.
-        """
-        dtype, _, decode, state, _ = self.words
-        at = self.header_bytes
-        with self.path.open("rb") as file:
-            file.seek(at)
-            while block := file.read(BLOCK_BYTES):
-                words = np.frombuffer(block, dtype, len(block) // dtype.itemsize)
-                while words.size:
-                    out = empty_events(CHUNK_EVENTS)
-                    state, read, n, verdict = decode(words, state, self.sensor.width, self.sensor.height, out)
-                    if n:
-                        yield out.span(0, n)
-                    at += read * dtype.itemsize
-                    if verdict != evt.OK:
-                        raise BrokenRecording(
-                            self.path, f"byte {at}", self._fault_text(verdict, int(words[read]), out, n)
-                        )
-                    words = words[read:]
-                if len(block) % dtype.itemsize:
-                    raise BrokenRecording(self.path, f"byte {at}", "the file ends within a word")
+    def _pieces(self, tally: Tally) -> Iterator[Piece]:
+        state, number = self.words.start, 0
+        for at, words in self._blocks():
+            while words.size:
+                out, reserved = empty_events(CHUNK_EVENTS), np.zeros(2, np.int64)
+                state, read, n = self.words.decode(words, state, out, reserved)
+                yield numbered(number), out.span(0, n)
+                number += n
+                count, first = reserved.tolist()
+                if count:
+                    word = f"0x{int(words[first]):0{2 * words.itemsize}x}"
+                    place = f"byte {at + first * words.itemsize}"
+                    tally.add(Reason.RESERVED, place, f"the word {word} has a reserved type", count)
+                at, words = at + read * words.itemsize, words[read:]
 
     def triggers(self) -> Iterator[Triggers]:
-        """All edges on the trigger inputs; see `Recording`. Their times are in the clock of the events.
+        """All edges on the trigger inputs; see `Recording`. Their times are in the clock of the events."""
+        return ordered(self._edges(), self.faults.begin("triggers"))
 
-        Raises:
-            BrokenRecording: a word is truncated or has an unknown type. The error names the byte.
-        """
-        dtype, known, _, _, find = self.words
-        at, state = self.header_bytes, triggers.TriggerState()
+    def _edges(self) -> Iterator[tuple[str, Triggers]]:
+        state = triggers.TriggerState()
+        for at, words in self._blocks():
+            state, columns = self.words.triggers(words, state)
+            yield f"the words from byte {at}", Triggers(*columns)
+
+    def _blocks(self) -> Iterator[tuple[int, NDArray[Any]]]:
+        """Blocks of up to BLOCK_BYTES: the byte of the first word, and the words."""
+        dtype, at = self.words.dtype, self.header_bytes
         with self.path.open("rb") as file:
             file.seek(at)
             while block := file.read(BLOCK_BYTES):
                 words = np.frombuffer(block, dtype, len(block) // dtype.itemsize)
-                is_known = known[words >> (8 * dtype.itemsize - 4)]
-                n = words.size if is_known.all() else int(is_known.argmin())
-                state, columns = find(words[:n], state)
-                if columns[0].size:
-                    yield Triggers(*columns)
-                at += n * dtype.itemsize
-                if n < words.size:
-                    raise BrokenRecording(self.path, f"byte {at}", self._unknown_text(int(words[n])))
+                yield at, words
+                at += words.nbytes
                 if len(block) % dtype.itemsize:
                     raise BrokenRecording(self.path, f"byte {at}", "the file ends within a word")
-
-    def _unknown_text(self, word: int) -> str:
-        return f"0x{word:0{2 * self.words.dtype.itemsize}x} has an unknown word type"
-
-    def _fault_text(self, verdict: int, word: int, out: Events, n: int) -> str:
-        if verdict == evt.OUTSIDE:
-            return f"an event at x={out.x[n]} y={out.y[n]} lies outside the sensor {self.sensor}"
-        return self._unknown_text(word)
 
 
 def _open(path: Path, sensor: Sensor | None, topic: str | None) -> PropheseeRecording:

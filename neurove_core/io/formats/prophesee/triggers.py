@@ -6,7 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.compiled import compiled
-from neurove_core.io.formats.prophesee.evt import TIME_HIGH, TIME_LOW, signed, step_of, unwrapped
+from neurove_core.io.formats.prophesee.evt import (
+    EVT2_BACK_US,
+    EVT3_BACK_US,
+    TIME_HIGH,
+    TIME_LOW,
+    not_before,
+    signed,
+    step_of,
+    unwrapped,
+)
 
 Columns = tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.uint8]]
 """Time [us], channel and level (1 rising, 0 falling) of trigger edges, each (N,): the fields of `io.Triggers`."""
@@ -24,12 +33,12 @@ class TriggerState(NamedTuple):
 
 
 def evt3_triggers(words: NDArray[np.uint16], state: TriggerState) -> tuple[TriggerState, Columns]:
-    """Edges on the trigger inputs in EVT3 words. Times are unwrapped and never decrease, as in `evt3_decode`.
+    """Edges on the trigger inputs in EVT3 words. Times are unwrapped, as in `evt3_decode`.
 
     Source: docs.prophesee.ai, EVT 3.0 format, EXT_TRIGGER: channel in bits 8 to 11, level in bit 0.
 
     Args:
-        words: (N,) words from the camera, all of known types (the decoder of events reports unknown types).
+        words: (N,) words from the camera. Others than those of time and of triggers are skipped.
         state: state after the words before these.
 
     Returns:
@@ -70,7 +79,7 @@ def _evt3_triggers(
             elif value != high & 0xFFF:
                 high, low = unwrapped(high, value, 1 << 12), 0
         elif kind == _TRIGGER and timed:
-            last_us = max(last_us, (high << 12) + low)
+            last_us = not_before(last_us, (high << 12) + low, EVT3_BACK_US)
             out[0][n], out[1][n], out[2][n] = last_us, value >> 8, value & 1
             n += 1
     return TriggerState(timed, high, low, last_us), n
@@ -91,7 +100,7 @@ def _evt2_triggers(
             if not timed:
                 timed, last_us = 1, high << 6
         elif kind == _TRIGGER and timed:
-            last_us = max(last_us, (high << 6) + ((word >> 22) & 0x3F))
+            last_us = not_before(last_us, (high << 6) + ((word >> 22) & 0x3F), EVT2_BACK_US)
             out[0][n], out[1][n], out[2][n] = last_us, (word >> 8) & 0x1F, word & 1
             n += 1
     return TriggerState(timed, high, low, last_us), n
@@ -107,7 +116,7 @@ def evt3_triggers_reference(words: NDArray[np.uint16], state: TriggerState) -> t
         elif kind == TIME_HIGH:
             _apply_time_high(s, value, 1 << 12, 1 << 12)
         elif kind == _TRIGGER and s["timed"]:
-            s["last_us"] = max(s["last_us"], (s["high"] << 12) + s["low"])
+            _apply_time(s, (s["high"] << 12) + s["low"], EVT3_BACK_US)
             rows.append((s["last_us"], value >> 8, value & 1))
     return TriggerState(**s), _columns(rows)
 
@@ -119,7 +128,7 @@ def evt2_triggers_reference(words: NDArray[np.uint32], state: TriggerState) -> t
         if word >> 28 == TIME_HIGH:
             _apply_time_high(s, word & 0xFFF_FFFF, 1 << 28, 1 << 6)
         elif word >> 28 == _TRIGGER and s["timed"]:
-            s["last_us"] = max(s["last_us"], (s["high"] << 6) + (word >> 22 & 0x3F))
+            _apply_time(s, (s["high"] << 6) + (word >> 22 & 0x3F), EVT2_BACK_US)
             rows.append((s["last_us"], word >> 8 & 0x1F, word & 1))
     return TriggerState(**s), _columns(rows)
 
@@ -129,8 +138,13 @@ def _apply_time_high(s: dict[str, int], value: int, period: int, tick_us: int) -
     if not s["timed"]:
         s.update(timed=1, high=value, low=0, last_us=value * tick_us)
         return
-    step = step_of(value - s["high"] % period, period)
+    step = step_of(s["high"] % period, value, period)
     s.update(high=s["high"] + step, low=0 if step else s["low"])
+
+
+def _apply_time(s: dict[str, int], t_us: int, back_us: int) -> None:
+    """Update the state with the time of a trigger."""
+    s["last_us"] = s["last_us"] if 0 < s["last_us"] - t_us < back_us else t_us
 
 
 def _columns(rows: list[tuple[int, int, int]]) -> Columns:

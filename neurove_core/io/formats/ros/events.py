@@ -12,11 +12,13 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from neurove_core.io.clock import unwraps
+from neurove_core.io.faults import Reason, Tally
 from neurove_core.io.formats.prophesee import evt, triggers
 from neurove_core.io.formats.ros.libcaer import WORD_EVENTS, LibcaerState, libcaer_decode
 from neurove_core.io.formats.ros.messages import DVS, BadMessage, EventMessage
 from neurove_core.io.recording import CHUNK_EVENTS, Triggers, empty_events
-from neurove_protocol.events import Events, Sensor
+from neurove_protocol.events import Events
 
 ENCODINGS: Final = ("evt3", "libcaer", "libcaer_cmp", "mono")
 UNIX_TIME: Final = ("libcaer", "libcaer_cmp", DVS)
@@ -38,27 +40,35 @@ class Anchor(NamedTuple):
 class Decoder:
     """Decodes the messages of one topic into events. Pass the messages in recorded order.
 
+    The events may lie outside the sensor, and their times may decrease.
+
     Args:
-        sensor: the pixel array.
         anchor: a moment before the first message to decode. Not needed if decoding starts at the first message of the
             recording.
+        tally: counts reserved words.
     """
 
-    def __init__(self, sensor: Sensor, anchor: Anchor | None = None) -> None:
-        self._sensor = sensor
+    def __init__(self, anchor: Anchor | None = None, tally: Tally | None = None) -> None:
         self._anchor = anchor
+        self._tally = tally
         self._seq: int | None = None
+        self._where = ""
         self._evt3 = evt.Evt3State()
         self._triggers = triggers.TriggerState()
         self._libcaer = LibcaerState()
         self._known_wraps_us: int | None = 0 if anchor is None else None  # None: unknown after a gap
 
-    def events(self, message: EventMessage) -> Iterator[Events]:
+    def events(self, message: EventMessage, where: str = "") -> Iterator[Events]:
         """Yield the events of the next message.
 
+        Args:
+            message: the message.
+            where: its place in the recording.
+
         Raises:
-            BadMessage: the message is invalid. It is raised after the valid events before the fault.
+            BadMessage: the message is invalid.
         """
+        self._where = where
         self._reset_after_gap(message)
         yield from self._decoded(message)
 
@@ -86,7 +96,7 @@ class Decoder:
         if message.encoding != "evt3":
             return
         self._reset_after_gap(message)
-        for _ in self._decoded(message):  # advances the clock, and raises for an invalid word
+        for _ in self._decoded(message):  # advances the clock
             pass
         self._triggers, (t, channel, level) = triggers.evt3_triggers(_words(message), self._triggers)
         if t.size:
@@ -103,15 +113,18 @@ class Decoder:
         words, done = _words(message), 0
         while words.size:
             out = empty_events(min(CHUNK_EVENTS, max(words.size * evt.VECTOR_EVENTS, evt.VECTOR_EVENTS)))
-            width, height = self._sensor.width, self._sensor.height
-            self._evt3, read, n, verdict = evt.evt3_decode(words, self._evt3, width, height, out)
+            reserved = np.zeros(2, np.int64)
+            self._evt3, read, n = evt.evt3_decode(words, self._evt3, out, reserved)
             if n:
                 yield self._unwrapped(out.span(0, n), message)
-            if verdict == evt.OUTSIDE:
-                raise BadMessage(f"event at x={out.x[n]} y={out.y[n]} is outside the sensor {self._sensor}")
-            if verdict != evt.OK:
-                raise BadMessage(f"word {done + read} (0x{int(words[read]):04x}) has an unknown type")
+            self._count(reserved, words, done)
             words, done = words[read:], done + read
+
+    def _count(self, reserved: NDArray[np.int64], words: NDArray[np.uint16], done: int) -> None:
+        count, first = reserved.tolist()
+        if count and self._tally is not None:
+            why = f"word {done + first} (0x{int(words[first]):04x}) has an unknown type"
+            self._tally.add(Reason.RESERVED, self._where, why, count)
 
     def _unwrapped(self, events: Events, message: EventMessage) -> Events:
         """Return the events on the same unwrapped clock as the events before."""
@@ -127,18 +140,15 @@ class Decoder:
         return self._known_wraps_us or 0
 
     def _decode_libcaer_cmp(self, message: EventMessage) -> Iterator[Events]:
-        base_us, width, height = message.time_base_ns // _MICROSECOND, self._sensor.width, self._sensor.height
+        base_us = message.time_base_ns // _MICROSECOND
         self._libcaer = self._libcaer._replace(high=0, low=0)
         words = _words(message)
         for first in range(0, words.size, _WORDS):
             part = words[first : first + _WORDS]
-            out = empty_events(part.size * WORD_EVENTS)
-            self._libcaer, read, n, verdict = libcaer_decode(part, self._libcaer, base_us, width, height, out)
+            out, reserved = empty_events(part.size * WORD_EVENTS), np.zeros(2, np.int64)
+            self._libcaer, n = libcaer_decode(part, self._libcaer, base_us, out, reserved)
             yield out.span(0, n)
-            if verdict == evt.OUTSIDE:
-                raise BadMessage(f"event at x={out.x[n]} y={out.y[n]} is outside the sensor {self._sensor}")
-            if verdict != evt.OK:
-                raise BadMessage(f"word {first + read} (0x{int(part[read]):04x}) has an unknown type")
+            self._count(reserved, part, first)
 
 
 def _words(message: EventMessage) -> NDArray[np.uint16]:
@@ -163,7 +173,7 @@ def _libcaer(message: EventMessage) -> Events:
     if (rows["t"] < 0).any():
         raise BadMessage("an event has a negative time")
     low = rows["t"].astype(np.int64)
-    wraps = np.concatenate(([0], np.cumsum(low[1:] < low[:-1] - _LIBCAER_PERIOD_US // 2))) if low.size else low
+    wraps = unwraps(low, _LIBCAER_PERIOD_US)
     t = message.time_base_ns // _MICROSECOND + low + wraps * _LIBCAER_PERIOD_US
     data, valid = rows["data"], rows["data"] & 1 > 0
     events = Events.from_columns(t, data >> 17, data >> 2 & 0x7FFF, data >> 1 & 1)

@@ -21,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.compiled import compiled
-from neurove_core.io.formats.prophesee.evt import ILLEGAL, OK, OUTSIDE
 from neurove_protocol.events import Events
 
 WORD_EVENTS: Final = 8
@@ -48,21 +47,19 @@ def signed(word: np.unsignedinteger[Any]) -> int:  # pragma: no cover (machine c
 
 @compiled
 def libcaer_decode(
-    words: NDArray[np.uint16], state: LibcaerState, base_us: int, width: int, height: int, out: Events
-) -> tuple[LibcaerState, int, int, int]:  # pragma: no cover (machine code)
-    """Decode words of one packet, up to the first invalid word.
+    words: NDArray[np.uint16], state: LibcaerState, base_us: int, out: Events, reserved: NDArray[np.int64]
+) -> tuple[LibcaerState, int]:  # pragma: no cover (machine code)
+    """Decode words of one packet. Words of a reserved type are skipped.
 
     Args:
         words: (N,) uint16; all words of the packet or some of them.
         state: state after the words before these.
         base_us: the packet's time base [us].
-        width: sensor width [px].
-        height: sensor height [px].
-        out: output columns with at least WORD_EVENTS * N rows; times are not checked.
+        out: output columns with at least WORD_EVENTS * N rows; neither times nor coordinates are checked.
+        reserved: (2,) number of reserved words and index of the first one, as in `evt3_decode`.
 
     Returns:
-        State after the words, number of words read, number of valid events n in `out`, and OK, ILLEGAL or OUTSIDE. For
-        OUTSIDE, row n of `out` holds the event that is outside the sensor.
+        State after the words, and number of events in `out`.
     """
     x, base_y, p, high, low = state
     n = 0
@@ -83,31 +80,28 @@ def libcaer_decode(
         elif kind == _BASE_Y:
             base_y, p = value & 0x7FF, value >> 11
         else:
-            return LibcaerState(x, base_y, p, high, low), i, n, ILLEGAL
+            if not reserved[0]:
+                reserved[1] = i
+            reserved[0] += 1
         if mask and x >= 0 and y >= 0:
             while mask:
                 if mask & 1:
                     out.t[n], out.x[n], out.y[n], out.p[n] = base_us + high + low, x, y, polarity
-                    if x >= width or y >= height:
-                        return LibcaerState(x, base_y, p, high, low), i, n, OUTSIDE
                     n += 1
                 y += 1
                 mask >>= 1
         if base_y >= 0 and kind == _VECT_8:
             base_y += 8
-    return LibcaerState(x, base_y, p, high, low), words.size, n, OK
+    return LibcaerState(x, base_y, p, high, low), n
 
 
 def libcaer_reference(
-    words: NDArray[np.uint16], state: LibcaerState, base_us: int, width: int, height: int
-) -> tuple[LibcaerState, int, Events, int]:
-    """Reference implementation of `libcaer_decode`: state, words read, events, verdict."""
+    words: NDArray[np.uint16], state: LibcaerState, base_us: int
+) -> tuple[LibcaerState, Events, list[int]]:
+    """Reference implementation of `libcaer_decode`: state, events, indices of reserved words."""
     s = state._asdict()
     events: list[tuple[int, int, int, int]] = []
-
-    def done(read: int, verdict: int) -> tuple[LibcaerState, int, Events, int]:
-        return LibcaerState(**s), read, Events.from_columns(*zip(*events, strict=True) if events else [()] * 4), verdict
-
+    reserved: list[int] = []
     for i, word in enumerate(words.tolist()):
         value, hits = word & 0xFFF, []
         match word >> 12:
@@ -126,9 +120,8 @@ def libcaer_reference(
                     hits = [(s["base_y"] + k, s["p"]) for k in range(8) if value >> k & 1]
                     s["base_y"] += 8
             case _:
-                return done(i, ILLEGAL)
-        for y, p in hits if s["x"] >= 0 else []:
-            if s["x"] >= width or y >= height:
-                return done(i, OUTSIDE)
-            events.append((base_us + s["high"] + s["low"], s["x"], y, p))
-    return done(words.size, OK)
+                reserved.append(i)
+        if s["x"] >= 0:
+            events += [(base_us + s["high"] + s["low"], s["x"], y, p) for y, p in hits]
+    columns = zip(*events, strict=True) if events else [()] * 4
+    return LibcaerState(**s), Events.from_columns(*columns), reserved

@@ -1,5 +1,6 @@
 """One camera of a ROS bag: a .bag file (ROS 1), or a .db3 file, an .mcap file or a folder of them (ROS 2)."""
 
+import contextlib
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -11,9 +12,9 @@ import numpy as np
 
 from neurove_core.geometry import motion
 from neurove_core.geometry.motion import Poses, Twists
-from neurove_core.io.checked import cleaned
+from neurove_core.io.checked import cleaned, ordered, unread
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
-from neurove_core.io.faults import Faults
+from neurove_core.io.faults import Faults, Reason, Tally
 from neurove_core.io.format import Format
 from neurove_core.io.formats.containers.bags import (
     SQLITE_MAGIC,
@@ -30,7 +31,9 @@ from neurove_core.io.formats.containers.ros1 import Ros1Bag
 from neurove_core.io.formats.ros import messages
 from neurove_core.io.formats.ros.events import UNIX_TIME, Anchor, Decoder
 from neurove_core.io.formats.ros.messages import BadMessage, EventMessage
+from neurove_core.io.order import Where
 from neurove_core.io.recording import EventsOnly, Imu, Triggers, later
+from neurove_core.io.spool import plain_file
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
@@ -54,11 +57,13 @@ _CONTAINERS: Final = ((ROS1_MAGIC, ".bag", Ros1Bag), (SQLITE_MAGIC, ".db3", Sqli
 def open_bag(path: Path) -> BagFile:
     """Open a bag of any supported container. Its content decides; only without a signature does the suffix.
 
+    Compressed files of a folder, such as `run_0.mcap.zstd`, are decompressed into temporary files.
+
     Raises:
         UnknownSource: the path is not a bag.
     """
     if path.is_dir():
-        return BagFolder(path, tuple(open_bag(file) for file in in_recorded_order(path)))
+        return BagFolder(path, tuple(open_bag(plain_file(file).path) for file in in_recorded_order(path)))
     with path.open("rb") as file:
         head = file.read(len(SQLITE_MAGIC))
     for magic, _, container in _CONTAINERS:
@@ -131,13 +136,8 @@ class RosbagRecording(EventsOnly):
         return ("events", *(name for name, found in present.items() if found))
 
     def chunks(self) -> Iterator[Events]:
-        """Yield all events from the beginning; see `Recording`.
-
-        Raises:
-            BrokenRecording: the file is truncated or corrupt, a message is invalid, or an event is outside the sensor
-                or earlier than the event before it. The error names the message or the byte.
-        """
-        return cleaned(self._pieces(None, None), self.sensor, self.faults.begin("events"))
+        """Yield all events from the beginning; see `Recording`. A message that cannot be decoded is skipped."""
+        return self._cleaned(None, None)
 
     def since(self, t_us: int) -> Iterator[Events]:
         """Yield the events from this time [us] on, as `chunks` does. Uses the index of the bag if there is one."""
@@ -151,7 +151,7 @@ class RosbagRecording(EventsOnly):
         return self._since_indexed(t_us, anchor, since_ns)
 
     def _since_indexed(self, t_us: int, anchor: Anchor, since_ns: int) -> Iterator[Events]:
-        chunks = cleaned(self._pieces(since_ns, anchor), self.sensor, self.faults.begin("events"))
+        chunks = self._cleaned(since_ns, anchor)
         chunk = next(chunks, None)
         if chunk is None or chunk.t[0] > t_us:  # the clocks drifted by more than the margin
             yield from later(self.chunks(), t_us)
@@ -159,27 +159,29 @@ class RosbagRecording(EventsOnly):
         yield from later(iter([chunk]), t_us)
         yield from later(chunks, t_us)
 
-    def _pieces(self, since_ns: int | None, anchor: Anchor | None) -> Iterator[tuple[str, Events]]:
-        decoder = Decoder(self.sensor, anchor)
-        for message in self.bag.messages((self.topic,), since_ns):
+    def _cleaned(self, since_ns: int | None, anchor: Anchor | None) -> Iterator[Events]:
+        tally = self.faults.begin("events")
+        return cleaned(self._pieces(since_ns, anchor, tally), self.sensor, tally)
+
+    def _pieces(self, since_ns: int | None, anchor: Anchor | None, tally: Tally) -> Iterator[tuple[str, Events]]:
+        decoder = Decoder(anchor, tally)
+        for message in self.bag.messages((self.topic,), since_ns, tally):
             try:
                 parsed, events = _parsed(message, self.bag)
-                for part in (events,) if events else decoder.events(parsed):
+                for part in (events,) if events else decoder.events(parsed, message.where):
                     yield message.where, part
             except BadMessage as why:
-                raise BrokenRecording(self.path, message.where, str(why)) from None
+                tally.add(Reason.DAMAGED, message.where, str(why))
 
     def _first_anchor(self) -> tuple[Anchor, int] | None:
         """Return the time of the first event on both clocks and the log time of its message [ns], or None."""
-        decoder = Decoder(self.sensor)
+        decoder = Decoder()
         for message in self.bag.messages((self.topic,)):
-            try:
+            with contextlib.suppress(BadMessage):
                 parsed, events = _parsed(message, self.bag)
                 for part in (events,) if events else decoder.events(parsed):
                     if part.n:
                         return Anchor(parsed.stamp_ns, int(part.t[0])), message.log_ns
-            except BadMessage:
-                return None
         return None
 
     @property
@@ -198,8 +200,7 @@ class RosbagRecording(EventsOnly):
         topic = self._nearest_topic(CAMERA_TYPE)
         if topic is None:
             return None
-        for message in self.bag.messages((topic,)):
-            info = self._read(message, messages.camera_info)
+        for _, info in self._samples(topic, messages.camera_info, Tally("camera")):
             if info is None or info.sensor != self.sensor:
                 return None
             return CameraInfo(**(info.model_dump() | {"stream": stream}))
@@ -209,48 +210,48 @@ class RosbagRecording(EventsOnly):
         """The samples of the sensor_msgs/Imu topic nearest by name.
 
         They are in the frame of the IMU, because bags rarely give its mounting.
-
-        Raises:
-            BrokenRecording: as `chunks`, or the time of a sample decreases.
         """
         topic = self._nearest_topic(IMU_TYPE)
-        found = (
-            (message.where, self._read(message, messages.imu))
-            for message in self.bag.messages((topic,) if topic else ())
-        )
-        return _imu_batches(self.path, found, self.ros_offset_us)
+        if topic is not None:
+            tally = self.faults.begin("imu")
+            yield from ordered(_imu_batches(self._samples(topic, messages.imu, tally), self.ros_offset_us), tally)
+
+    def _samples(self, topic: str, read: Callable[..., T], tally: Tally) -> Iterator[tuple[str, T]]:
+        """The place and the value of each message of a topic that can be decoded."""
+        for message in self.bag.messages((topic,), tally=tally):
+            try:
+                yield message.where, read(message.data, cdr=self.bag.cdr)
+            except BadMessage as why:
+                tally.add(Reason.DAMAGED, message.where, str(why))
 
     def triggers(self) -> Iterator[Triggers]:
-        """Yield the edges of the trigger input. `evt3` messages hold them among the events.
+        """Yield the edges of the trigger input. `evt3` messages hold them among the events."""
+        if self.first.encoding == "evt3":
+            tally = self.faults.begin("triggers")
+            yield from ordered(self._edges(tally), tally)
 
-        Raises:
-            BrokenRecording: as `chunks`.
-        """
-        decoder = Decoder(self.sensor)
-        if self.first.encoding != "evt3":
-            return
-        for message in self.bag.messages((self.topic,)):
+    def _edges(self, tally: Tally) -> Iterator[tuple[str, Triggers]]:
+        decoder = Decoder()
+        for message in self.bag.messages((self.topic,), tally=tally):
             try:
-                yield from decoder.triggers(_parsed(message, self.bag)[0])
+                for edges in decoder.triggers(_parsed(message, self.bag)[0]):
+                    yield message.where, edges
             except BadMessage as why:
-                raise BrokenRecording(self.path, message.where, str(why)) from None
+                tally.add(Reason.DAMAGED, message.where, str(why))
 
     def poses(self) -> Poses | None:
         """Return the poses of the geometry_msgs/PoseStamped or nav_msgs/Odometry topic nearest by name.
 
         They are poses of the body that this topic tracks. Of several poses within one microsecond only the first is
-        kept, because trackers send some poses twice.
-
-        Raises:
-            BrokenRecording: as `chunks`, the time of a pose decreases, a position is not finite, or an orientation is
-                not a unit quaternion.
+        kept, because trackers send some poses twice. A pose that is late, whose position is not finite or whose
+        orientation is not a unit quaternion is skipped.
         """
         topic = self._nearest_topic(*POSE_TYPES)
         if topic is None:
             return None
         read = messages.odometry if self.bag.topics[topic] == "nav_msgs/Odometry" else messages.pose
-        found = ((message.where, self._read(message, read)) for message in self.bag.messages((topic,)))
-        return _poses(self.path, found, self.ros_offset_us)
+        tally = self.faults.begin("poses")
+        return _poses(self._samples(topic, read, tally), self.ros_offset_us, tally)
 
     def twists(self) -> Twists | None:
         """Return the twists of the tracked body, from its poses; None for fewer than two poses. See `motion.twists`."""
@@ -261,12 +262,6 @@ class RosbagRecording(EventsOnly):
         """Return the topic of one of these types that shares the most leading name parts with the event topic."""
         names = sorted(name for name, kind in self.bag.topics.items() if kind in types)
         return max(names, key=lambda name: _shared_parts(name, self.topic), default=None)
-
-    def _read(self, message: BagMessage, read: Callable[..., T]) -> T:
-        try:
-            return read(message.data, cdr=self.bag.cdr)
-        except BadMessage as why:
-            raise BrokenRecording(self.path, message.where, str(why)) from None
 
 
 def _no_events(bag: BagFile, topics: list[str], topic: str | None) -> str:
@@ -285,13 +280,16 @@ def _parsed(message: BagMessage, bag: BagFile) -> tuple[EventMessage, Events | N
 
 
 def _first(path: Path, bag: BagFile, topic: str) -> EventMessage:
+    """Return the first message that can be decoded, without its events."""
+    bad: BrokenRecording | None = None
     for message in bag.messages((topic,)):
         try:
             parsed, _ = _parsed(message, bag)
         except BadMessage as why:
-            raise BrokenRecording(path, message.where, str(why)) from None
-        return parsed._replace(data=memoryview(b""))
-    raise UnknownSource(path, f"topic {topic} has no message")
+            bad = bad or BrokenRecording(path, message.where, str(why))
+        else:
+            return parsed._replace(data=memoryview(b""))
+    raise bad or UnknownSource(path, f"topic {topic} has no message")
 
 
 def _shared_parts(one: str, other: str) -> int:
@@ -300,19 +298,22 @@ def _shared_parts(one: str, other: str) -> int:
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
-def _poses(path: Path, found: Iterator[tuple[str, messages.PoseSample]], offset_us: int) -> Poses | None:
+def _poses(found: Iterator[tuple[str, messages.PoseSample]], offset_us: int, tally: Tally) -> Poses | None:
     """Join (position in the file, pose) pairs into one table; None if there are none."""
     samples: list[messages.PoseSample] = []
-    for where, sample in found:
-        if samples and sample.stamp_ns // 1000 <= samples[-1].stamp_ns // 1000:
-            if sample.stamp_ns < samples[-1].stamp_ns:
-                raise BrokenRecording(path, where, "time runs backwards")
-            continue
-        length = float(np.linalg.norm(sample.orientation))
-        if not (abs(length - 1) < 1e-2 and np.isfinite(sample.position_m).all()):  # this form rejects NaN
-            why = f"position {sample.position_m} and orientation {sample.orientation} are not a pose"
-            raise BrokenRecording(path, where, why)
-        samples.append(sample)
+    try:
+        for where, sample in found:
+            length = float(np.linalg.norm(sample.orientation))
+            if not (abs(length - 1) < 1e-2 and np.isfinite(sample.position_m).all()):  # this form rejects NaN
+                why = f"position {sample.position_m} and orientation {sample.orientation} are not a pose"
+                tally.add(Reason.INVALID, where, why)
+            elif samples and sample.stamp_ns < samples[-1].stamp_ns:
+                why = f"t={sample.stamp_ns} ns comes after t={samples[-1].stamp_ns} ns: time runs backwards"
+                tally.add(Reason.LATE, where, why)
+            elif not samples or sample.stamp_ns // 1000 > samples[-1].stamp_ns // 1000:
+                samples.append(sample)
+    except BrokenRecording as error:
+        unread(tally, error)
     if not samples:
         return None
     t = np.array([sample.stamp_ns for sample in samples]) // 1000 - offset_us
@@ -321,24 +322,26 @@ def _poses(path: Path, found: Iterator[tuple[str, messages.PoseSample]], offset_
     return Poses(t, np.array([sample.position_m for sample in samples]), orientation)
 
 
-def _imu_batches(path: Path, found: Iterator[tuple[str, messages.ImuSample]], offset_us: int) -> Iterator[Imu]:
+def _imu_batches(found: Iterator[tuple[str, messages.ImuSample]], offset_us: int) -> Iterator[tuple[Where, Imu]]:
     """The samples of some messages, each with its place in the file, up to the first error."""
-    batch: list[messages.ImuSample] = []
+    batch: list[tuple[str, messages.ImuSample]] = []
     broken: BrokenRecording | None = None
     try:
-        for where, sample in found:
-            if batch and sample.stamp_ns < batch[-1].stamp_ns:
-                raise BrokenRecording(path, where, "time runs backwards")
-            batch.append(sample)
-            if len(batch) > _BATCH:
-                yield _imu(batch[:-1], offset_us)
-                batch = batch[-1:]
+        for one in found:
+            batch.append(one)
+            if len(batch) >= _BATCH:
+                yield _places(batch), _imu([sample for _, sample in batch], offset_us)
+                batch = []
     except BrokenRecording as error:
         broken = error
     if batch:
-        yield _imu(batch, offset_us)
+        yield _places(batch), _imu([sample for _, sample in batch], offset_us)
     if broken is not None:
         raise broken
+
+
+def _places(batch: list[tuple[str, messages.ImuSample]]) -> Where:
+    return lambda i: batch[i][0]
 
 
 def _imu(samples: list[messages.ImuSample], offset_us: int) -> Imu:
