@@ -13,7 +13,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Final, NamedTuple, cast
 
-from neurove_core.io.errors import UnknownSource
+from neurove_core.io.errors import BrokenRecording, RecordingError, UnknownSource
 from neurove_core.io.faults import Reason
 from neurove_core.io.format import Format, UrlFormat
 from neurove_core.io.recording import Recording
@@ -102,7 +102,12 @@ def _open_path(path: Path, sensor: Sensor | None, topic: str | None) -> Recordin
     if path.is_symlink() and path.is_file() and not path.suffix:  # /dev/stdin of a redirected file
         path = path.resolve()
     plain = _plain(path)
-    recording = _format_of(plain.path).open(plain.path, sensor, topic)
+    try:
+        recording = _format_of(plain.path).open(plain.path, sensor, topic)
+    except RecordingError:
+        if plain.why:
+            raise BrokenRecording(path, "its compressed content", plain.why) from None
+        raise
     if plain.why:
         recording.faults.begin("file").add(Reason.UNREAD, path.name, plain.why)
     return recording

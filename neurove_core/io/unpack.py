@@ -100,7 +100,7 @@ def parts(compression: str, stream: IO[bytes], packed: int, size: int) -> Iterat
 
     Args:
         compression: as for `unpacked`, or `gzip`.
-        stream: gives the compressed bytes.
+        stream: gives the compressed bytes; it can seek.
         packed: number of compressed bytes.
         size: largest number of bytes to give.
 
@@ -110,10 +110,13 @@ def parts(compression: str, stream: IO[bytes], packed: int, size: int) -> Iterat
     """
     left = size
     try:
+        declared = _declared_size(stream) if compression == "zstd" else 0
         plain = bounded(_decompressor(compression, stream), packed)
         while left and (part := plain.read(min(left, 1 << 16))):
             yield part
             left -= len(part)
+        if left and size - left < declared:  # the library does not report a truncated frame
+            raise Unpackable(f"the data end after {size - left} of {declared} bytes")
     except ModuleNotFoundError as error:
         raise MissingExtra(str(error.name).partition(".")[0], "recordings") from None
     except ERRORS as error:
@@ -122,6 +125,20 @@ def parts(compression: str, stream: IO[bytes], packed: int, size: int) -> Iterat
         if type(error).__name__ != "ZstdError":
             raise
         raise Unpackable(str(error)) from None
+
+
+def _declared_size(stream: IO[bytes]) -> int:
+    """The size of the content that the header of the first zstd frame declares [bytes]; 0 if it declares none."""
+    import zstandard
+
+    at = stream.tell()
+    try:
+        size = zstandard.get_frame_parameters(stream.read(32)).content_size
+    except zstandard.ZstdError:
+        return 0  # the decompressor reports it
+    finally:
+        stream.seek(at)
+    return 0 if size == zstandard.CONTENTSIZE_UNKNOWN else int(size)
 
 
 def _decompressor(compression: str, stream: IO[bytes]) -> Any:
