@@ -1,7 +1,8 @@
 """Requests and replies of a node: health, models, push, activate, rollback; the status of a stream; the error reply."""
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal, cast
 
+import msgpack
 from pydantic import ConfigDict, Field
 
 from neurove_protocol.codec import Count, Message, Name, Part
@@ -61,6 +62,11 @@ class ActivateRequest(Request):
     expect: DigestPrefix | None = None  # of the active model: conflict if another one is active
     shadow_s: Annotated[float, Field(ge=0, le=3600)] = 0.0  # time in shadow before activation [s]
     canary: Annotated[tuple[Name, ...], Field(strict=False)] = ()  # streams that change; empty means all
+    force: Annotated[str, Field(min_length=1, max_length=200)] | None = None  # why no difference may refuse the model
+
+    def encode(self) -> bytes:
+        """This request as a msgpack map; without `force` where it is nil, because older nodes refuse unknown fields."""
+        return cast(bytes, msgpack.packb(self.model_dump(exclude={"force"} if self.force is None else None)))
 
 
 class RollbackRequest(Request):
@@ -223,8 +229,9 @@ class ActivateReply(Message):
 
     node: Name
     active: ModelInfo
-    previous: ModelInfo
+    previous: ModelInfo  # that it replaced; the active model itself if nothing changed
     epoch: Count
+    changed: bool = True  # false: the model was active before, and nothing changed
 
 
 class ErrorReply(Message):

@@ -8,7 +8,7 @@ the same parts as `details` for machines, and the exit code of a command that fa
     +- InputError                    a message, a field or an event is refused
     |  +- Malformed, UnsupportedVersion, InvalidField, UnknownFormat, BlobLength, EventOutsideSensor, TimeBackwards
     +- ModelError                    a model is refused, or a model change failed
-    |  +- UnknownModel, BadModel, Untrusted, Downgrade
+    |  +- UnknownModel, BadModel, Untrusted, Untrained, Downgrade
     |  +- NoMemory, TooSlow, Diverged, RolledBack, NothingBefore
     +- TransferError                 a pushed bundle is not stored
     |  +- NoStore, TooLarge, NoQuota, NoSpace, TransferInterrupted
@@ -33,6 +33,9 @@ EXIT_WRONG_USAGE: Final = 2
 
 EXIT_CONFLICT: Final = 3
 """Exit code of a command that another client's model change preceded."""
+
+EXIT_PARTIAL: Final = 4
+"""Exit code of a command for several nodes of which some, but not all, refused."""
 
 MAX_TEXT_BYTES = 1024
 """Cap of an error's sentence and of each of its details, so that an error reply fits the caps of a message."""
@@ -210,6 +213,16 @@ class Untrusted(ModelError):
     def __init__(self, name: str, reason: str, why: str) -> None:
         super().__init__(f"model {name}: signature refused ({reason}): {why}", value=name, reason=reason)
         self.why = why
+
+
+class Untrained(ModelError):
+    """A model is untrained, and the node trusts keys: it takes only trained models."""
+
+    code = "untrained"
+
+    def __init__(self, name: str) -> None:
+        why = "it is untrained; a node with trusted_keys takes only trained models"
+        super().__init__(f"model {name}: {why}", value=name)
 
 
 class NoStore(TransferError):

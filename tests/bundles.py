@@ -1,17 +1,24 @@
 """A small bundle, and helpers that split, edit and join its bytes."""
 
+import copy
 import json
 import struct
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import safetensors.torch
 import torch
 
+from neurove_core import self_test
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
+from neurove_core.estimator import Estimator
 from neurove_core.models import bundle
 from neurove_core.models.bundle import Bundle
+from neurove_core.models.uncertainty import Uncertainty
+from neurove_core.networks.neurove import NeuroVE
 from neurove_protocol.errors import BadModel
 
 CONFIG = ModelConfig(
@@ -23,6 +30,19 @@ CONFIG = ModelConfig(
 
 def make_bundle(seed: int = 0, **config: Any) -> Bundle:
     return bundle.untrained(seed, CONFIG.model_copy(update=config))
+
+
+def proven(model: Bundle) -> Bundle:
+    """The model as a trained one with a golden test and a calibration, so that others may be judged by it."""
+    network, config = copy.deepcopy(model.network), model.config
+    assert isinstance(network, NeuroVE)
+    network.add_spread()
+    calibrated = replace(
+        model, network=network, trained=True, uncertainty=Uncertainty(torch.eye(6), uncertain_above=1e9, provenance="x")
+    )
+    shape = (2, 2 * config.window.bins, config.canonical.height, config.canonical.width)
+    counts = np.random.default_rng(0).poisson(0.3, shape).astype(np.uint8)
+    return replace(calibrated, golden=self_test.record(Estimator(calibrated), counts)).with_digest()
 
 
 ORIGINAL = make_bundle()

@@ -1,9 +1,7 @@
 """The files of a recording that consists of several files, in a folder or in a .zip file, and its images."""
 
 import io
-import lzma
 import zipfile
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,8 +12,9 @@ from numpy.typing import NDArray
 
 from neurove_core.extras import MissingExtra
 from neurove_core.io.errors import BrokenRecording, UnknownSource
+from neurove_core.io.unpack import ERRORS, bounded
 
-BROKEN_ZIP = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, EOFError, NotImplementedError, RuntimeError, ValueError)
+BROKEN_ZIP = (zipfile.BadZipFile, *ERRORS)
 """Errors of the standard library for an archive that is incomplete or has an unknown compression."""
 
 MAX_IMAGE_BYTES = 64 << 20  # of one image file
@@ -46,10 +45,21 @@ class Place(NamedTuple):
                 with (self.path / name).open("rb") as file:
                     yield file
                 return
-            with zipfile.ZipFile(self.path) as archive, archive.open(self.inside + name) as packed:
+            with member(self.path, self.inside + name) as packed:
                 yield packed
-        except BROKEN_ZIP as error:
-            raise BrokenRecording(self.path, name, f"it cannot be unpacked: {error}") from None
+        except (*BROKEN_ZIP, KeyError) as error:
+            raise BrokenRecording(self.path, name, f"it cannot be read: {error}") from None
+
+
+@contextmanager
+def member(path: Path, name: str) -> Iterator[IO[bytes]]:
+    """Open a file in a .zip file. Its decompressed size is bounded; see `unpack`.
+
+    Raises:
+        KeyError: there is no such file. BROKEN_ZIP: it cannot be unpacked. They can be raised while it is read.
+    """
+    with zipfile.ZipFile(path) as archive, archive.open(name) as packed:
+        yield bounded(packed, archive.getinfo(name).compress_size)
 
 
 def folder_in_zip(path: Path, wanted: str) -> str:

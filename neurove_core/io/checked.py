@@ -1,7 +1,7 @@
 """Make valid chunks of the events that a reader decodes, and count what is not valid."""
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -10,6 +10,8 @@ from neurove_core.io.faults import Reason, Tally
 from neurove_core.io.order import Order, T, Where
 from neurove_core.io.recording import CHUNK_EVENTS, in_chunks
 from neurove_protocol.events import Events, Sensor
+
+V = TypeVar("V")
 
 _MIN_EVENTS = CHUNK_EVENTS // 4
 
@@ -71,6 +73,14 @@ def ordered(pieces: Iterator[tuple[str | Where, T]], tally: Tally) -> Iterator[T
     except BrokenRecording as error:
         unread(tally, error)
     yield from order.finish()
+
+
+def until_broken(items: Iterator[V], tally: Tally) -> Iterator[V]:
+    """The same items, for example images. An error that ends them is counted as `UNREAD` and not raised."""
+    try:
+        yield from items
+    except BrokenRecording as error:
+        unread(tally, error)
 
 
 def unread(tally: Tally, error: BrokenRecording) -> None:

@@ -37,7 +37,7 @@ T = TypeVar("T", bound=Rows)
 Where = Callable[[int], str]
 """Gives the place in the recording of sample number i of a piece."""
 
-_START, _AHEAD, _BACK = "start", "ahead", "back"
+_AHEAD, _BACK = "ahead", "back"
 
 
 def span(rows: T, first: int, stop: int) -> T:
@@ -64,17 +64,18 @@ class Order(Generic[T]):
 
     def __init__(self, tally: Tally, *, restart: bool = True) -> None:
         self._tally, self._restart = tally, restart
-        self._last: int | None = None  # time of the last sample that passed
+        self._last: int | None = None  # time of the newest sample that is believed
+        self._believed = 0  # number of these samples
+        self._start: list[tuple[T, Where]] = []  # the first of them, up to CONFIRM: they have not passed yet
         self._shift = 0  # added to the times
         self._kind = ""  # why samples wait; empty: none wait
         self._held: list[tuple[T, Where]] = []
         self._held_n, self._held_last = 0, 0
-        self._passed = 0
 
     def is_plain(self, rows: T) -> bool:
         """Whether these rows can pass as they are."""
         t = rows.t
-        if self._kind or self._shift or self._last is None or not t.size:
+        if self._kind or self._shift or self._last is None or self._start or not t.size:
             return False
         if t[0] < self._last or t[0] - self._last > MAX_GAP_US:
             return False
@@ -84,7 +85,7 @@ class Order(Generic[T]):
     def passed(self, rows: T) -> None:
         """Note that plain rows passed."""
         self._last = int(rows.t[-1])
-        self._passed += rows.t.size
+        self._believed += rows.t.size
 
     def push(self, rows: T, where: Where) -> Iterator[T]:
         """The rows that can pass now, in order.
@@ -104,16 +105,15 @@ class Order(Generic[T]):
         breaks = np.flatnonzero((steps < 0) | (steps > MAX_GAP_US)) + 1
         for first, stop in pairwise([0, *breaks.tolist(), t.size]):
             run = span(rows, first, stop)
-            if self._shift:
-                run = _shifted(run, self._shift)
-            yield from self._take(run, _after(where, first))
+            yield from self._take(_shifted(run, self._shift) if self._shift else run, _after(where, first))
 
     def finish(self) -> Iterator[T]:
         """The rows that still wait at the end of the recording and can pass."""
-        if self._kind == _BACK and self._held_n < min(LAST_CONFIRM, self._passed):
-            self._discard(Reason.LATE, self._late_text())
+        if self._kind == _BACK and self._held_n < min(LAST_CONFIRM, self._believed):
+            self._discard(Reason.LATE)
         elif self._kind:
             yield from self._confirm()
+        yield from self._flush()
 
     def _take(self, run: T, where: Where) -> Iterator[T]:
         """One run of ordered times without a long gap in it."""
@@ -121,103 +121,104 @@ class Order(Generic[T]):
         if self._kind:
             yield from self._take_waiting(run, where)
         elif self._last is None:
-            yield from self._hold(_START, run, where)
+            yield from self._believe(run, where)
         elif first - self._last > MAX_GAP_US:
             yield from self._hold(_AHEAD, run, where)
         elif first < self._last - RESTART_US:
             yield from self._hold(_BACK, run, where)
         else:
-            yield from self._pass_from(self._last, run, where)
+            late = self._late_rows(run, where, self._last)
+            if late < run.t.size:
+                yield from self._believe(span(run, late, run.t.size), _after(where, late))
 
     def _take_waiting(self, run: T, where: Where) -> Iterator[T]:
         """As `_take`, while earlier rows wait."""
         first = int(run.t[0])
         if self._kind == _BACK and self._last is not None and first >= self._last:  # back at the level before
-            self._discard(Reason.LATE, self._late_text())
-            yield from self._take(run, where)
-        elif first > self._held_last + MAX_GAP_US and self._kind == _START:
-            yield from self._confirm()
+            self._discard(Reason.LATE)
             yield from self._take(run, where)
         elif first >= self._held_last - RESTART_US:
-            late = int(run.t.searchsorted(self._held_last))
-            self._tally.add(Reason.LATE, where(0), _late(first, self._held_last), late)
+            late = self._late_rows(run, where, self._held_last)
             if late < run.t.size:
                 yield from self._hold(self._kind, span(run, late, run.t.size), _after(where, late))
-        elif self._kind == _START:
-            why = f"t={self._held_first} us comes before t={first} us, where the recording begins"
-            self._discard(Reason.STALE_START, why)
-            yield from self._hold(_START, run, where)
         else:
-            reason = Reason.TIME_JUMP if self._kind == _AHEAD else Reason.LATE
-            why = f"t={self._held_first} us stands between t={self._last} us and t={first} us"
-            self._discard(reason, why if self._kind == _AHEAD else self._late_text())
+            self._discard(Reason.TIME_JUMP if self._kind == _AHEAD else Reason.LATE)
             yield from self._take(run, where)
 
     def _hold(self, kind: str, run: T, where: Where) -> Iterator[T]:
         """Let a run wait; the rows that pass after it, if it is the last one needed."""
-        rest = None
-        if kind == _BACK and self._last is not None:
-            low = int(run.t.searchsorted(self._last))
-            if not low:
-                yield from self._take_waiting(run, where)
-                return
-            run, rest = span(run, 0, low), span(run, low, run.t.size)
-        self._kind = kind
-        self._held.append((run, where))
-        size = int(run.t.size)
-        self._held_n += size
-        self._held_last = int(run.t[-1])
+        low = int(run.t.searchsorted(self._last)) if kind == _BACK and self._last is not None else run.t.size
+        rest = span(run, low, run.t.size)
+        if low:
+            self._kind = kind
+            self._held.append((span(run, 0, low), where))
+            self._held_n += low
+            self._held_last = int(run.t[low - 1])
         if self._held_n >= CONFIRM:
             shift = self._shift
             yield from self._confirm()
-            if rest is not None and rest.t.size:
-                yield from self._take(_shifted(rest, self._shift - shift), _after(where, size))
-        elif rest is not None and rest.t.size:
-            yield from self._take_waiting(rest, _after(where, size))
+            rest = _shifted(rest, self._shift - shift)
+        if rest.t.size:
+            yield from self._take(rest, _after(where, low))
 
     def _confirm(self) -> Iterator[T]:
-        """Let the rows that wait pass."""
-        kind, held = self._kind, self._held
+        """Believe the rows that wait."""
+        kind, held, n = self._kind, self._held, self._held_n
         self._clear()
         shift = 0
         if kind == _BACK and self._last is not None:
-            (run, where), first = held[0], int(held[0][0].t[0])
-            if not self._restart:
-                n = sum(run.t.size for run, _ in held)
-                self._tally.add(Reason.LATE, where(0), _late(first, self._last), n)
+            (run, where), last = held[0], self._last
+            first = int(run.t[0])
+            if self._start:
+                before, place = self._start[0]
+                why = f"t={int(before.t[0])} us comes before t={first} us, where the recording begins"
+                self._tally.add(Reason.STALE_START, place(0), why, self._believed)
+                self._start, self._last, self._believed = [], None, 0
+            elif not self._restart:
+                self._tally.add(Reason.LATE, where(0), _late(first, last), n)
                 return
-            shift = self._last + RESTART_US - first
-            self._shift += shift
-            why = f"t={first - self._shift + shift} us comes after t={self._last - self._shift + shift} us and stays"
-            self._tally.add(Reason.NEW_CLOCK, where(0), why)
+            else:
+                why = f"t={first - self._shift} us comes after t={last - self._shift} us and stays"
+                self._tally.add(Reason.NEW_CLOCK, where(0), why)
+                shift = last + RESTART_US - first
+                self._shift += shift
         for run, where in held:
-            yield from self._pass_from(None, _shifted(run, shift) if shift else run, where)
+            yield from self._believe(_shifted(run, shift) if shift else run, where)
 
-    def _pass_from(self, not_before: int | None, run: T, where: Where) -> Iterator[T]:
-        """Let the rows pass that are not late, and report a gap before them."""
-        t = run.t
-        late = 0 if not_before is None else int(t.searchsorted(not_before))
-        if late:
-            self._tally.add(Reason.LATE, where(0), _late(int(t[0]), not_before), late)
-            if late == t.size:
-                return
-            run = span(run, late, t.size)
+    def _believe(self, run: T, where: Where) -> Iterator[T]:
+        """Let rows pass that are in order, and report a gap before them. The first rows wait until there are enough."""
         first = int(run.t[0])
         if self._last is not None and first - self._last > MAX_GAP_US:
             why = f"nothing for {(first - self._last) / 1e6:,.1f} s, from t={self._last} us to t={first} us"
-            self._tally.add(Reason.GAP, where(late), why)
+            self._tally.add(Reason.GAP, where(0), why)
+        start = self._believed < CONFIRM
         self.passed(run)
-        yield run
+        if start:
+            self._start.append((run, where))
+            if self._believed >= CONFIRM:
+                yield from self._flush()
+        else:
+            yield run
 
-    @property
-    def _held_first(self) -> int:
-        return int(self._held[0][0].t[0])
+    def _flush(self) -> Iterator[T]:
+        start, self._start = self._start, []
+        for run, _ in start:
+            yield run
 
-    def _late_text(self) -> str:
-        return _late(self._held_first, self._last)
+    def _late_rows(self, run: T, where: Where, last_us: int) -> int:
+        """Count the rows that are earlier than `last_us`, and return how many they are."""
+        late = int(run.t.searchsorted(last_us))
+        self._tally.add(Reason.LATE, where(0), _late(int(run.t[0]), last_us), late)
+        return late
 
-    def _discard(self, reason: Reason, why: str) -> None:
-        self._tally.add(reason, self._held[0][1](0), why, self._held_n)
+    def _discard(self, reason: Reason) -> None:
+        """Count the rows that wait."""
+        run, where = self._held[0]
+        first = int(run.t[0])
+        why = _late(first, self._last)
+        if reason is Reason.TIME_JUMP:
+            why = f"t={first} us comes after t={self._last} us, and the times do not stay there"
+        self._tally.add(reason, where(0), why, self._held_n)
         self._clear()
 
     def _clear(self) -> None:

@@ -1,16 +1,31 @@
-"""The commands that change running nodes, one after the other: push, activate, rollback."""
+"""The commands that change running nodes, one after the other: push, activate, rollback.
+
+With --all a refusal does not end the command: the next node is asked, and a summary by node follows. Exit code 0: every
+node is as wanted; 4: some nodes refused; the code of the error, or 1 if they differ: all refused.
+"""
 
 import argparse
+import json
+import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
-from neurove_protocol.control import CHUNK_SCHEMA, ActivateReply, ErrorReply, PeerError, ProgressReply, PushReply
-from neurove_protocol.errors import NeuroVEError
+from neurove_protocol.control import CHUNK_SCHEMA, ActivateReply, ModelInfo, ProgressReply, PushReply
+from neurove_protocol.errors import EXIT_FAILURE, EXIT_PARTIAL, NeuroVEError
 from neurove_service.cli.arguments import add_client_flags, client_config, command, seconds
 from neurove_service.config import ClientConfig
 
-Change = Callable[[Any, ClientConfig, str], None]
+
+class Outcome(NamedTuple):
+    """What a command did on one node, and a sentence about it."""
+
+    result: Literal["changed", "unchanged", "refused"]
+    text: str
+    exit_code: int = 0
+
+
+Change = Callable[[Any, ClientConfig, str], Outcome]
 """Changes one node over a transport and prints its progress."""
 
 
@@ -21,10 +36,11 @@ def push(args: argparse.Namespace) -> int:
 
     with PushSource(args.bundle) as source:
 
-        def change(transport: Any, config: ClientConfig, node: str) -> None:
-            _print(args, ask.push(transport, config, source.request, node, _progress(args)))
-            if args.activate:
-                _print(args, ask.activate(transport, config, source.digest, node, on_progress=_progress(args)))
+        def change(transport: Any, config: ClientConfig, node: str) -> Outcome:
+            done = _shown(args, ask.push(transport, config, source.request, node, _progress(args)))
+            if not args.activate:
+                return done
+            return _shown(args, ask.activate(transport, config, source.digest, node, on_progress=_progress(args)))
 
         return _each(
             args,
@@ -37,9 +53,9 @@ def activate(args: argparse.Namespace) -> int:
     """Change the model of a running node."""
     from neurove_service.clients import ask
 
-    def change(transport: Any, config: ClientConfig, node: str) -> None:
-        wanted = {"expect": args.expect, "shadow_s": args.shadow, "canary": args.canary}
-        _print(args, ask.activate(transport, config, args.model, node, **wanted, on_progress=_progress(args)))
+    def change(transport: Any, config: ClientConfig, node: str) -> Outcome:
+        wanted = {"expect": args.expect, "shadow_s": args.shadow, "canary": args.canary, "force": args.force}
+        return _shown(args, ask.activate(transport, config, args.model, node, **wanted, on_progress=_progress(args)))
 
     return _each(args, change)
 
@@ -48,29 +64,58 @@ def rollback(args: argparse.Namespace) -> int:
     """Activate the previous model of a running node again."""
     from neurove_service.clients import ask
 
-    def change(transport: Any, config: ClientConfig, node: str) -> None:
-        _print(args, ask.rollback(transport, config, node, expect=args.expect, on_progress=_progress(args)))
+    def change(transport: Any, config: ClientConfig, node: str) -> Outcome:
+        return _shown(args, ask.rollback(transport, config, node, expect=args.expect, on_progress=_progress(args)))
 
     return _each(args, change)
 
 
 def _each(args: argparse.Namespace, change: Change, prepare: Callable[[Any, Any], None] = lambda _, __: None) -> int:
-    """Change one node after the other, and stop at the first that refuses."""
+    """Change one node after the other, also after a refusal; of several nodes a summary follows."""
     from neurove_service.clients import ask
 
     config = client_config(args)
     with ask.connect(config) as transport:
         nodes = ask.nodes(transport, config, args.node, args.all)
         prepare(transport, config.keys)
-        for number, node in enumerate(nodes, 1):
+        if len(nodes) == 1:
+            change(transport, config, nodes[0])
+            return 0
+        outcomes = {}
+        for node in nodes:
             try:
-                change(transport, config, node)
+                outcomes[node] = change(transport, config, node)
             except NeuroVEError as error:
-                if number == len(nodes):
-                    raise
-                left = f"{error.message}; not changed: {', '.join(nodes[number:])}"
-                raise PeerError(ErrorReply(code=error.code, message=left, details=error.details)) from None
-    return 0
+                print(f"neurove: {error.message}", file=sys.stderr, flush=True)
+                text = error.message.removeprefix(f"{node}: ")
+                outcomes[node] = Outcome("refused", text, error.exit_code)
+    print(_summary(outcomes, as_json=args.json), flush=True)
+    return _exit_code(list(outcomes.values()))
+
+
+def _exit_code(outcomes: list[Outcome]) -> int:
+    refused = [one.exit_code for one in outcomes if one.result == "refused"]
+    if len(refused) < len(outcomes):
+        return EXIT_PARTIAL if refused else 0
+    return refused[0] if len(set(refused)) == 1 else EXIT_FAILURE
+
+
+def _summary(outcomes: dict[str, Outcome], *, as_json: bool) -> str:
+    if as_json:
+        return json.dumps(
+            {"summary": {node: {"result": one.result, "text": one.text} for node, one in outcomes.items()}}
+        )
+    of = {
+        result: sum(one.result == result for one in outcomes.values()) for result in ("changed", "unchanged", "refused")
+    }
+    counts = ", ".join(f"{count} {result}" for result, count in of.items() if count)
+    width = max(len(node) for node in outcomes)
+    return "\n".join(
+        (
+            f"summary of {len(outcomes)} nodes: {counts}",
+            *(f"  {node:{width}}  {one.result}: {one.text}" for node, one in outcomes.items()),
+        )
+    )
 
 
 def _progress(args: argparse.Namespace) -> Callable[[ProgressReply], None]:
@@ -83,27 +128,37 @@ def _progress(args: argparse.Namespace) -> Callable[[ProgressReply], None]:
     return show
 
 
-def _print(args: argparse.Namespace, reply: PushReply | ActivateReply) -> None:
-    if args.json:
-        print(reply.model_dump_json(), flush=True)
-    elif isinstance(reply, PushReply):
-        model = reply.model
-        print(
-            f"{reply.node}: {model.name} ({model.digest[:12]}) is stored, {reply.fetched:,} bytes transferred",
-            flush=True,
-        )
-    else:
-        new, old = reply.active, reply.previous
-        print(
-            f"{reply.node}: {new.name} ({new.digest[:12]}) is active and replaces {old.name} ({old.digest[:12]})",
-            flush=True,
-        )
+def _shown(args: argparse.Namespace, reply: PushReply | ActivateReply) -> Outcome:
+    """Print the reply of a node."""
+    outcome = _outcome(reply)
+    print(reply.model_dump_json() if args.json else f"{reply.node}: {outcome.text}", flush=True)
+    return outcome
+
+
+def _outcome(reply: PushReply | ActivateReply) -> Outcome:
+    if isinstance(reply, PushReply):
+        if not reply.fetched:
+            return Outcome("unchanged", f"already has {_name(reply.model)}, no bytes transferred")
+        return Outcome("changed", f"{_name(reply.model)} is stored, {reply.fetched:,} bytes transferred")
+    if not reply.changed:
+        return Outcome("unchanged", f"already has {_name(reply.active)} as its active model")
+    return Outcome("changed", f"{_name(reply.active)} is active and replaces {_name(reply.previous)}")
+
+
+def _name(model: ModelInfo) -> str:
+    return f"{model.name} ({model.digest[:12]})"
 
 
 def _digest_prefix(text: str) -> str:
     if not 8 <= len(text) <= 64 or text.strip("0123456789abcdef"):
         raise argparse.ArgumentTypeError(f"{text!r}: give the first 8 or more digits of a digest from `neurove models`")
     return text
+
+
+def _reason(text: str) -> str:
+    if not 1 <= len(text.strip()) <= 200:
+        raise argparse.ArgumentTypeError(f"{text!r}: give a reason of 1 to 200 characters")
+    return text.strip()
 
 
 def _streams(text: str) -> tuple[str, ...]:
@@ -126,6 +181,8 @@ def add_activate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--shadow", type=seconds, default=0.0, metavar="S", help=about)
     about = "change these streams only; default: all streams"
     parser.add_argument("--canary", type=_streams, default=(), metavar="STREAM,...", help=about)
+    about = "do not refuse the model for a difference from the active one; the reason is logged on the node"
+    parser.add_argument("--force", type=_reason, metavar="REASON", help=about)
 
 
 def add_rollback(parser: argparse.ArgumentParser) -> None:

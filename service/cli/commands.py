@@ -36,6 +36,12 @@ COMMANDS = (
         "convert", "Convert a recording to a packet log (.mcap) or to DSEC's layout (.h5).", "recordings", "recordings"
     ),
     Command("simulate", "Record a simulated event camera with its exact motion.", "recordings", "recordings"),
+    Command(
+        "estimate",
+        "Write the estimates of a recording to a file, as the service would give them.",
+        "estimating",
+        "serve",
+    ),
     Command("train", "Train a model on simulated sequences and recordings.", "training", "train"),
     Command("calibrate", "Fit the uncertainty of a trained model on new simulated sequences.", "training", "train"),
     Command("evaluate", "Compare a model's estimates with the truth, as RMSE and RE.", "training", "serve"),

@@ -18,9 +18,12 @@ from neurove_service.cli.arguments import (
     add_recording_flags,
     client_config,
     command,
+    duration,
+    refuse_existing,
     seconds,
     tell_faults,
 )
+from neurove_service.cli.bars import event_count
 from neurove_service.lifecycle import stop_on_signals
 
 Progress = Callable[[int], None]
@@ -79,11 +82,10 @@ def _status_line(path: Path) -> Iterator[Callable[[Any], None] | None]:
     if not sys.stderr.isatty():
         yield None
         return
-    from rich.console import Console
-
+    from neurove_service.cli.console import console
     from neurove_service.clients.recorder import as_json
 
-    with Console(stderr=True).status(f"recording {path}: waiting for packets") as status:
+    with console(stderr=True).status(f"recording {path}: waiting for packets") as status:
 
         def show(recorded: Any) -> None:
             lines = [f"{name}: {_line(one)}" for name, one in as_json(recorded).items()]
@@ -92,23 +94,24 @@ def _status_line(path: Path) -> Iterator[Callable[[Any], None] | None]:
         yield show
 
 
-def _write_mcap(recording: Any, path: Path, progress: Progress) -> None:
+def _write_mcap(recording: Any, path: Path, progress: Progress) -> tuple[str, ...]:
     from neurove_core.io.formats.packet_log.writer import write_mcap
 
     write_mcap(recording, path, progress=lambda events, _: progress(events))
+    return ()
 
 
-def _write_dsec(recording: Any, path: Path, progress: Progress) -> None:
+def _write_dsec(recording: Any, path: Path, progress: Progress) -> tuple[str, ...]:
     from neurove_core.io.formats.hdf5.dsec_write import write_dsec
 
     try:
-        write_dsec(recording, path, progress)
+        return write_dsec(recording, path, progress).left_out
     except OSError as error:
         raise InvalidField("recording", "FILE", str(path), error.strerror or str(error)) from None
 
 
-WRITERS: Final[dict[str, Callable[[Any, Path, Progress], None]]] = {".mcap": _write_mcap, ".h5": _write_dsec}
-"""The writer for each suffix: (recording, path, progress)."""
+WRITERS: Final[dict[str, Callable[[Any, Path, Progress], tuple[str, ...]]]] = {".mcap": _write_mcap, ".h5": _write_dsec}
+"""The writer for each suffix: (recording, path, progress) to the streams that the format cannot hold."""
 
 _ENDLESS_S: Final = 5.0  # that `info` reads of a source without end
 
@@ -121,24 +124,27 @@ def convert(args: argparse.Namespace) -> int:
     if path.suffix not in WRITERS:
         raise InvalidField("convert", "OUT", str(path), f"its name must end in {' or '.join(WRITERS)}")
     recording = open_source(args.source, args.sensor, args.topic)
-    if path.exists() and Path(args.source).exists() and path.samefile(args.source):
-        raise InvalidField("convert", "OUT", str(path), "it is the input recording")
+    refuse_existing("convert", "OUT", path, args.source, force=args.force)
     return _write(recording, path, as_json=args.json)
 
 
 def _write(recording: Any, path: Path, *, as_json: bool) -> int:
     counted = {"events": 0}
-    with _bar(recording.name) as show:
+    with event_count(recording.name) as show:
 
         def progress(events: int) -> None:
             counted["events"] = events
             show(events)
 
-        WRITERS[path.suffix](recording, path, progress)
+        left_out = WRITERS[path.suffix](recording, path, progress)
+    if left_out:
+        print(
+            f"neurove: {path} lacks {', '.join(left_out)}: {path.suffix} cannot hold them, .mcap can", file=sys.stderr
+        )
     tell_faults(recording)
     size = path.stat().st_size
     summary = {"file": str(path), "bytes": size, "events": counted["events"], "streams": recording.streams}
-    summary["faults"] = [fault.as_json() for fault in recording.faults.found]
+    summary |= {"left_out": left_out, "faults": [fault.as_json() for fault in recording.faults.found]}
     if as_json:
         print(json.dumps(summary))
     else:
@@ -148,10 +154,9 @@ def _write(recording: Any, path: Path, *, as_json: bool) -> int:
 
 def info(args: argparse.Namespace) -> int:
     """Show what a recording holds: sensor, counts, rates, IMU and truth."""
-    from rich.console import Console
-
     from neurove_core.io import summary
     from neurove_core.sources import open_source
+    from neurove_service.cli.console import console
     from neurove_service.cli.views import survey_table
 
     recording = open_source(args.source, args.sensor, args.topic)
@@ -165,7 +170,7 @@ def info(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps(found.as_json()))
     else:
-        Console().print(survey_table(found))
+        console().print(survey_table(found))
     if args.plot:
         print(f"wrote {args.plot}", file=sys.stderr)
     if found.broken and not recording.faults.unread:
@@ -178,11 +183,13 @@ def simulate(args: argparse.Namespace) -> int:
     """Record a simulated event camera with its exact motion."""
     from neurove_core.sources import open_source
 
-    if args.scene == "carla":
-        return _simulate_carla(args)
     path: Path = args.out
+    if args.scene == "carla":
+        refuse_existing("simulate", "--out", path, None, force=args.force)
+        return _simulate_carla(args)
     if path.suffix not in WRITERS:
         raise InvalidField("simulate", "--out", str(path), f"its name must end in {' or '.join(WRITERS)}")
+    refuse_existing("simulate", "--out", path, None, force=args.force)
     query = {name: getattr(args, name) for name in ("trajectory", "camera", "height", "pitch", "seed", "seconds")}
     given = {name: value for name, value in query.items() if value is not None}
     recording = open_source(f"sim://{args.scene}?{urllib.parse.urlencode(given)}")
@@ -202,29 +209,12 @@ def _simulate_carla(args: argparse.Namespace) -> int:
     return 0
 
 
-@contextlib.contextmanager
-def _bar(name: str) -> Iterator[Progress]:
-    """Show the events converted so far on a terminal; the length of a recording is unknown before its end."""
-    from rich.console import Console
-    from rich.progress import Progress as Bar
-    from rich.progress import SpinnerColumn, TextColumn, TimeElapsedColumn
-
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with Bar(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
-        task = bar.add_task(name, total=None)
-
-        def show(events: int) -> None:
-            bar.update(task, description=f"{name}: {events:,} events")
-
-        yield show
-
-
 def add_record(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `neurove record`."""
     command(parser, record)
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="packet log to write, ending in .mcap")
     parser.add_argument("--stream", default="all", metavar="NAME,...", help="names of streams; default all")
-    parser.add_argument("--seconds", type=seconds, metavar="S", help="length of the recording; default: until Ctrl-C")
+    parser.add_argument("--seconds", type=duration, metavar="S", help="length of the recording; default: until Ctrl-C")
     parser.add_argument("--with-parent", action="store_true", help="end when the parent process ends")
     add_client_flags(parser)
 
@@ -237,6 +227,7 @@ def add_convert(parser: argparse.ArgumentParser) -> None:
         "out", type=Path, metavar="OUT", help="file to write, ending in .mcap (packet log) or .h5 (DSEC)"
     )
     add_recording_flags(parser)
+    parser.add_argument("--force", action="store_true", help="replace OUT if it exists")
 
 
 def add_info(parser: argparse.ArgumentParser) -> None:
@@ -245,7 +236,7 @@ def add_info(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("source", metavar="SOURCE", help="recording of any format, pattern:// or sim://")
     add_recording_flags(parser)
     most = f"default: all, of an endless source {_ENDLESS_S:.0f} s"
-    parser.add_argument("--seconds", type=seconds, metavar="S", help=f"seconds of the source to read; {most}")
+    parser.add_argument("--seconds", type=duration, metavar="S", help=f"seconds of the source to read; {most}")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw events, rate and truth (.png or .svg)")
 
 
@@ -256,6 +247,7 @@ def add_simulate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", metavar="SCENE", help=scenes)
     about = "file to write: .mcap (packet log) or .h5 (DSEC); .npz for carla"
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help=about)
+    parser.add_argument("--force", action="store_true", help="replace FILE if it exists")
     parser.add_argument("--seconds", type=seconds, default=10.0, metavar="S", help="seconds to simulate; default 10 s")
     about = "seed of scene, trajectory and pixels; default 0"
     parser.add_argument("--seed", type=int, default=0, metavar="N", help=about)

@@ -127,6 +127,7 @@ def activate(
     expect: str | None = None,
     shadow_s: float = 0.0,
     canary: tuple[str, ...] = (),
+    force: str | None = None,
     on_progress: OnProgressReply = _ignore,
 ) -> ActivateReply:
     """Change the model of a node.
@@ -139,12 +140,13 @@ def activate(
         expect: first digits of the active model's digest; the node refuses if another model is active.
         shadow_s: time that the model runs in shadow before it becomes active [s].
         canary: streams to change; empty for all.
+        force: why no difference from the active model may refuse it; None: differences count.
         on_progress: receives each step.
 
     Raises:
         PeerError: the node refused; its model is unchanged. NoService: it does not answer, or left during the change.
     """
-    request = ActivateRequest(model=model, expect=expect, shadow_s=shadow_s, canary=canary)
+    request = ActivateRequest(model=model, expect=expect, shadow_s=shadow_s, canary=canary, force=force)
     key, timeout_s = config.keys.activate(node), CHANGE_S + shadow_s
     return _change(transport, key, node, request, ActivateReply, timeout_s, on_progress)
 

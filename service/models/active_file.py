@@ -26,6 +26,7 @@ class Active(BaseModel):
     previous: Digest | None  # of the model before it, for a rollback
     configured: str  # the configured model at that time; a different one now takes precedence over this file
     highest_release: int = Field(ge=0)  # highest release that has served
+    trial: Digest | None = None  # of a model whose probation waits for windows; it serves again on probation
 
 
 class ActiveFile:

@@ -17,8 +17,9 @@ from neurove_service import logs
 from neurove_service.models import admission, swap
 from neurove_service.models.library import MIN_DIGEST, Library
 from neurove_service.models.plan import Plan, SharedPlan
-from neurove_service.models.probation import Probation
+from neurove_service.models.probation import OnTrial, Probation, no_trial
 from neurove_service.models.progress import OnProgress, Progress, Step
+from neurove_service.models.record import Judgement, check_trained, judgement
 from neurove_service.streams.comparison import TrialLimits
 from neurove_service.streams.model_source import StreamView
 from neurove_service.streams.roles import Serving
@@ -44,6 +45,8 @@ class Context(NamedTuple):
     rules: Rules
     on_changed: Callable[[Bundle], None]
     free_bytes: Callable[[], int | None]
+    trained_only: bool = False  # untrained models are refused
+    on_trial: OnTrial = no_trial
 
 
 class Change:
@@ -55,17 +58,24 @@ class Change:
     """
 
     def __init__(self, context: Context, on_progress: OnProgress) -> None:
-        self._plan, self._library, self._rules, self._on_changed, self._free_bytes = context
+        self._context = context
+        self._plan, self._library, self._rules = context.plan, context.library, context.rules
         self._on_progress = on_progress
+        self._judged = Judgement()
 
     def activate(
-        self, model: str, expect: str | None, shadow_s: float, canary: frozenset[str]
+        self, model: str, expect: str | None, shadow_s: float, canary: frozenset[str], force: str | None
     ) -> tuple[Bundle, Serving]:
         """Make a model the active one, see `ModelSlot.activate`."""
         with self._reporting(model):
-            _check_expected(self._plan.current, expect)
             found = self._library.find(model)
+            if self._is_active(found):
+                return found, self._keep_active(found)
+            _check_expected(self._plan.current, expect)
+            check_trained(found, required=self._context.trained_only)
             candidate = _running_canary(self._plan.current, found, canary)
+            active = self._plan.current.active.estimator.bundle
+            self._judged = judgement(found, active, passed=active.digest in self._plan.passed, force=force)
             try:
                 if candidate is not None:
                     self._prime(candidate, canary)
@@ -75,9 +85,10 @@ class Change:
             except BaseException:
                 self._end_trial()
                 raise
-            limits = self._rules.probation.and_of(candidate.estimator.bundle)
-            probation_s = self._rules.probation_s
-            Probation(self._plan, candidate, probation_s, limits, self._on_changed, self._on_progress).start()
+            limits = self._limits(self._rules.probation, candidate)
+            context, probation_s = self._context, self._rules.probation_s
+            calls = context.on_changed, self._on_progress, context.on_trial
+            Probation(self._plan, candidate, probation_s, limits, *calls).start()
             return before.estimator.bundle, candidate
 
     def rollback(self, expect: str | None) -> tuple[Bundle, Serving]:
@@ -97,6 +108,7 @@ class Change:
             raise NothingBefore
         removed = plan.active.estimator.bundle
         with self._reporting(previous.name):
+            check_trained(previous, required=self._context.trained_only)
             estimator = self._load(previous)
             self._plan.epoch += 1
             serving = Serving(estimator, self._plan.epoch)
@@ -108,8 +120,20 @@ class Change:
             self._plan.set(Plan(serving), f"{removed.name} was rolled back")
             self._plan.previous = None
             self._report("rolled_back", f"to {previous.name}; it was primed, because it did not run in standby")
-        self._on_changed(estimator.bundle)
+        self._context.on_changed(estimator.bundle)
         return removed, serving
+
+    def _is_active(self, found: Bundle) -> bool:
+        plan = self._plan.current
+        return plan.phase in ("steady", "probation") and plan.active.estimator.bundle.digest == found.digest
+
+    def _keep_active(self, found: Bundle) -> Serving:
+        """Change nothing, so that the previous model stays the way back."""
+        self._report("done", f"{found.name} is already the active model; nothing changed")
+        return self._plan.current.active
+
+    def _limits(self, limits: TrialLimits, candidate: Serving) -> TrialLimits:
+        return limits.and_of(candidate.estimator.bundle)._replace(compared=self._judged.compared)
 
     def _report(self, step: Step, text: str) -> None:
         log.info("model change", step=step, text=text)
@@ -138,7 +162,7 @@ class Change:
 
     def _load(self, found: Bundle) -> Estimator:
         """Load a model, warm it up, and check its memory, its golden test and its speed."""
-        admission.check_memory(found.name, admission.weight_bytes(found), self._free_bytes())
+        admission.check_memory(found.name, admission.weight_bytes(found), self._context.free_bytes())
         estimator = Estimator(found)
         self._report("loaded", f"{found.info.parameters:,} parameters")
         estimator.warm_up()
@@ -196,7 +220,7 @@ class Change:
         active = self._plan.current.active
         self._report("shadow", f"for {seconds:g} s in parallel with {active.estimator.bundle.name}")
         self._plan.set(Plan(self._plan.current.active, candidate, canary, "shadow"))
-        limits = self._rules.shadow.and_of(candidate.estimator.bundle)
+        limits = self._limits(self._rules.shadow, candidate)
         wait = self._plan.closing.wait
         found = swap.compare_in_shadow(candidate, lambda: self._plan.streams(canary), seconds, limits, wait)
         self._report("shadow", "; ".join(f"{name}: {figures}" for name, figures in found.items()))
@@ -210,13 +234,15 @@ class Change:
                 self._plan.set(Plan(old, candidate, canary, "canary"), f"{new.name} is a canary")
             else:
                 self._plan.previous = old.estimator.bundle
-                self._plan.set(Plan(candidate, old, phase="probation"), f"{new.name} is active")
+                how = f", {self._judged.text}" if self._judged.text else ""
+                self._plan.set(Plan(candidate, old, phase="probation"), f"{new.name} is active{how}")
         log.info("model changed", model=new.name, digest=new.digest[:12], canary=sorted(canary))
         missing = sorted(canary - {stream.name for stream in self._plan.streams(canary)})
         where = f"on {', '.join(sorted(canary))}" if canary else "on all streams"
         self._report("active", f"{where}{f'; these streams do not exist yet: {missing}' if missing else ''}")
         probation = f"for {self._rules.probation_s:g} s"
-        self._report("probation", "until it is promoted or rolled back" if canary else probation)
+        ends = "until it is promoted or rolled back" if canary else probation
+        self._report("probation", f"{ends}; {self._judged.text}" if self._judged.text else ends)
         return old
 
 

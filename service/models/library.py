@@ -99,6 +99,10 @@ class Library:
             return found
         raise UnknownModel(model, tuple(one.name for one in self.available().models))
 
+    def is_built_in(self, digest: str) -> bool:
+        """Whether a model belongs to this installation."""
+        return any(one.digest == digest for one in models.built_in())
+
     def _in_memory(self) -> list[Bundle]:
         return [*models.built_in(), *([self._given] if self._given else [])]
 

@@ -6,6 +6,7 @@ import weakref
 from collections.abc import Iterator
 from typing import Literal, NamedTuple
 
+from neurove_core.estimator import Estimator
 from neurove_core.models.bundle import Bundle
 from neurove_protocol.errors import Conflict
 from neurove_service import logs
@@ -41,6 +42,11 @@ class Plan(NamedTuple):
             return Roles(self.other, self.active, probation=True)
         return Roles(self.active, self.other, probation=self.phase == "probation")
 
+    @classmethod
+    def resumed(cls, tried: Estimator, proven: Estimator) -> "Plan":
+        """A probation that goes on after a restart."""
+        return cls(Serving(tried, 0), Serving(proven, 0), phase="probation")
+
     @property
     def tried(self) -> Serving | None:
         """The model that serves and may still be rolled back."""
@@ -70,6 +76,7 @@ class SharedPlan:
         self.rollbacks = 0  # automatic ones
         self.rolled_back: Serving | None = None  # the newest model that was rolled back
         self.condition = threading.Condition()  # notified at each new plan
+        self.passed: set[str] = set()  # digests of the models that need no probation any more
         self.closing = threading.Event()
         self._one_change = threading.Lock()
         self._streams: weakref.WeakSet[StreamView] = weakref.WeakSet()

@@ -13,6 +13,7 @@ Step = Literal[
     "shadow",
     "active",
     "probation",
+    "waiting",
     "done",
     "rolled_back",
     "refused",

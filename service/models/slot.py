@@ -5,13 +5,16 @@ from pathlib import Path
 
 from neurove_core.estimator import Estimator
 from neurove_core.models.bundle import Bundle
-from neurove_protocol.errors import BadModel, UnknownModel
+from neurove_protocol.control import ModelInfo
+from neurove_protocol.errors import Untrained
 from neurove_service import logs
-from neurove_service.models import admission
+from neurove_service.models import admission, restart
 from neurove_service.models.change import Change, Context, Rules
 from neurove_service.models.library import Available, Files, Library, nothing_pushed
 from neurove_service.models.plan import Plan, SharedPlan
+from neurove_service.models.probation import OnTrial, no_trial
 from neurove_service.models.progress import OnProgress, silent
+from neurove_service.models.record import golden_fault
 from neurove_service.streams.model_source import StreamView
 from neurove_service.streams.roles import Roles, Serving
 
@@ -31,6 +34,9 @@ class ModelSlot:
         pushed: files of the bundles that were pushed to this node, by digest.
         kept: digests of the last active model and the one before; if they can be loaded, they take precedence over
             `model`.
+        trained_only: whether the node refuses untrained models.
+        trial: digest of the model whose probation waited for windows; it serves first, on probation.
+        on_trial: see `probation.OnTrial`.
 
     Raises:
         BadModel, UnknownModel: the first model cannot be loaded.
@@ -46,14 +52,30 @@ class ModelSlot:
         *,
         pushed: Files = nothing_pushed,
         kept: tuple[str | None, str | None] = (None, None),
+        trained_only: bool = False,
+        trial: str | None = None,
+        on_trial: OnTrial = no_trial,
     ) -> None:
         library = Library(models_dir, pushed)
-        active, previous = (_kept(library, digest) if digest else None for digest in kept)
-        estimator = Estimator(_first(library, model, active))
+        active, previous = (restart.kept(library, digest, trained_only) if digest else None for digest in kept)
+        estimator = Estimator(restart.first(library, model, active, trained_only))
         estimator.warm_up()
         self._shared = SharedPlan(Serving(estimator, 0), previous)
+        self._golden_fault = golden_fault(estimator)
+        if self._golden_fault:
+            log.error("golden test of the first model fails", why=self._golden_fault)
+        else:
+            self._shared.passed.add(estimator.bundle.digest)
+        self._first = estimator
         self.closing = self._shared.closing  # set when the node stops; a probation then ends without a last step
-        self._context = Context(self._shared, library, rules, on_changed, free_bytes)
+        self._context = Context(self._shared, library, rules, on_changed, free_bytes, trained_only, on_trial)
+        tried = restart.kept(library, trial, trained_only) if trial else None
+        if tried is not None and tried.digest != estimator.bundle.digest:
+            restart.try_again(self._shared, tried)
+
+    def resume(self) -> None:
+        """Go on with the probation that waited for windows before a restart; does nothing without one."""
+        restart.resume(self._context)
 
     @property
     def active(self) -> Serving:
@@ -80,6 +102,30 @@ class ModelSlot:
         """Number of automatic rollbacks since the start."""
         return self._shared.rollbacks
 
+    @property
+    def faults(self) -> list[str]:
+        """What is wrong with the models that answer now, one sentence each."""
+        plan = self._shared.current
+        answering = [plan.active, plan.other] if plan.phase == "canary" else [plan.active]
+        bundles = [one.estimator.bundle for one in answering if one is not None]
+        found = [f"model {one.name} is untrained: its estimates have no meaning" for one in bundles if not one.trained]
+        if self._golden_fault and plan.active.estimator is self._first:
+            found.append(self._golden_fault)
+        return found
+
+    def is_built_in(self, digest: str) -> bool:
+        """Whether a model belongs to this installation."""
+        return self._context.library.is_built_in(digest)
+
+    def check_trained(self, info: ModelInfo) -> None:
+        """Refuse an untrained model on a node that takes only trained ones.
+
+        Raises:
+            Untrained: the model is untrained.
+        """
+        if self._context.trained_only and not info.trained:
+            raise Untrained(info.name)
+
     def roles(self, stream: str) -> Roles:
         """Which models work on a stream from its next packet on."""
         return self._shared.current.roles(stream)
@@ -103,10 +149,12 @@ class ModelSlot:
         expect: str | None = None,
         shadow_s: float = 0.0,
         canary: frozenset[str] = frozenset(),
+        force: str | None = None,
         on_progress: OnProgress = silent,
     ) -> tuple[Bundle, Serving]:
-        """Make a model the active one. The previous model serves until the new one is ready; it stays after a refusal.
+        """Make a model the active one; if it is active already, nothing changes.
 
+        The previous model serves until the new one is ready; it stays after a refusal.
         The call returns when streams answer with the new model. Its probation goes on; its end is the last step that
         `on_progress` gets. A change during a probation ends it: the model on probation passes.
 
@@ -115,16 +163,19 @@ class ModelSlot:
             expect: the first 8 or more digits of the digest of the active model; another active model is a conflict.
             shadow_s: time in shadow before activation, in which the model is compared with the active one [s].
             canary: change only these streams; a second call without it changes the other streams too.
+            force: why no difference from the active model may refuse the new one; None: differences count if the active
+                model has a proven record, see `record.why_unproven`.
             on_progress: called at each step, on this thread; after the return on a thread of the slot.
 
         Returns:
-            the previous model, and the model that now serves the streams concerned.
+            the previous model, or the model itself if it was active already, and the model that now serves the streams
+            concerned.
 
         Raises:
-            UnknownModel, BadModel, Conflict, NoMemory, TooSlow, Diverged: nothing changed.
+            UnknownModel, BadModel, Untrained, Conflict, NoMemory, TooSlow, Diverged: nothing changed.
         """
         with self._shared.one_change(on_progress):
-            return Change(self._context, on_progress).activate(model, expect, shadow_s, canary)
+            return Change(self._context, on_progress).activate(model, expect, shadow_s, canary, force)
 
     def rollback(self, *, expect: str | None = None, on_progress: OnProgress = silent) -> tuple[Bundle, Serving]:
         """Activate the previous model again.
@@ -152,23 +203,3 @@ class ModelSlot:
     def close(self) -> None:
         """Stop waiting in a change or a probation; no probation passes after this."""
         self._shared.close()
-
-
-def _first(library: Library, model: str, kept: Bundle | None) -> Bundle:
-    """The model that a node starts with."""
-    try:
-        configured = library.open(model)
-    except (BadModel, UnknownModel) as error:
-        if kept is None:
-            raise
-        log.warning("configured model not loaded", model=model, why=error.message, serving=kept.name)
-        return kept
-    return kept or configured
-
-
-def _kept(library: Library, digest: str) -> Bundle | None:
-    try:
-        return library.find(digest)
-    except (BadModel, UnknownModel) as error:
-        log.warning("cannot restore the last active model", digest=digest, why=error.message)
-        return None

@@ -73,14 +73,19 @@ class Service:
         self._store = ModelStore(
             config.state_folder, config.models_dir, config.store_mib << 20, verifier(config.trusted_keys)
         )
+        last = self._last_active()
         self._slot = ModelSlot(
             config.model,
             config.models_dir,
             _rules(config),
             on_changed=self._save_active,
             pushed=self._store.files,
-            kept=self._last_active(),
+            kept=(last.digest, last.previous) if last else (None, None),
+            trained_only=bool(config.trusted_keys),
+            trial=last.trial if last else None,
+            on_trial=self._save_trial,
         )
+        self._slot.resume()
 
     def run(self) -> None:
         """Serve until the stop event is set, then end everything in order.
@@ -201,20 +206,22 @@ class Service:
         notify("STATUS=serving")
         notify("READY=1")
 
-    def _last_active(self) -> tuple[str | None, str | None]:
-        """Digests of the last active model and the one before, if they take precedence over the configured model."""
+    def _last_active(self) -> Active | None:
+        """The last active model, if it takes precedence over the configured model."""
         active = self._active_file.active
         if active is None:
-            return None, None
+            return None
         if active.configured != self._config.model:
             log.info("configured model is newer than the last active one", model=self._config.model)
-            return None, None
+            return None
         try:
-            self._store.signed(active.digest)
+            for digest in (active.digest, active.trial):
+                if digest is not None:
+                    self._store.signed(digest)
         except NeuroVEError as error:
-            log.warning("cannot restore the last active model", digest=active.digest, why=error.message)
-            return None, None
-        return active.digest, active.previous
+            log.warning("cannot restore the last active model", digest=digest, why=error.message)
+            return None if digest == active.digest else active.model_copy(update={"trial": None})
+        return active
 
     def _save_active(self, model: Bundle) -> None:
         previous, highest = self._slot.previous, self._active_file.highest_release
@@ -225,5 +232,19 @@ class Service:
                 previous=previous.digest if previous else None,
                 configured=self._config.model,
                 highest_release=max(highest, release),
+            )
+        )
+
+    def _save_trial(self, tried: Bundle | None, proven: Bundle) -> None:
+        """Save a model whose probation waits for windows, next to the model before it; None: it waits no more."""
+        before = self._active_file.active
+        same = before is not None and before.digest == proven.digest
+        self._active_file.keep(
+            Active(
+                digest=proven.digest,
+                previous=before.previous if before is not None and same else None,
+                configured=self._config.model,
+                highest_release=self._active_file.highest_release,
+                trial=tried.digest if tried is not None else None,
             )
         )

@@ -73,7 +73,7 @@ class Handlers:
         HealthRequest.decode(request)
         streams = self._streams()
         refused = self._refused_streams()
-        ok, why = node_verdict(streams, refused)
+        ok, why = node_verdict(streams, refused, self._slot.faults)
         active = self._slot.active
         reply = HealthReply(
             node=self._node,
@@ -114,16 +114,18 @@ class Handlers:
         """Pull a bundle, check it and store it; `activate` lets it serve."""
         wanted = PushRequest.decode(request)
         with self._progress(report) as on_progress:
-            model, signed, fetched = self._store.fetch(wanted, pull, stop, on_progress, self._check_release)
+            model, signed, fetched = self._store.fetch(wanted, pull, stop, on_progress, self._admit)
         info = model.info.model_copy(update={"signature": signed.state})
         return PushReply(node=self._node, model=info, fetched=fetched).encode()
 
     def activate(self, request: bytes, report: Callable[[bytes], None] = lambda _: None) -> bytes:
-        """Change the model; the previous one serves until the new one is ready. Answers when the probation has ended.
+        """Change the model; the previous one serves until the new one is ready.
+
+        It answers when the probation has ended, or when the probation waits for windows.
 
         Raises:
             RolledBack: the model did not pass its probation.
-            Untrusted, Downgrade, and the errors of ModelSlot.activate: nothing changed.
+            Untrusted, Untrained, Downgrade, and the errors of ModelSlot.activate: nothing changed.
         """
         wanted = ActivateRequest.decode(request)
         with self._progress(report) as report_step:
@@ -131,17 +133,18 @@ class Handlers:
 
             def on_progress(progress: Progress) -> None:
                 report_step(progress)
-                if progress.step in ("done", "rolled_back"):
+                if progress.step in ("done", "rolled_back", "waiting"):
                     ended.append(progress)
 
             for info in self._slot.available().models:
                 if info.name == wanted.model or info.digest.startswith(wanted.model):
-                    self._check_release(info, self._store.signed(info.digest))
+                    self._admit(info, self._store.signed(info.digest))
             previous, serving = self._slot.activate(
                 wanted.model,
                 expect=wanted.expect,
                 shadow_s=wanted.shadow_s,
                 canary=frozenset(wanted.canary),
+                force=wanted.force,
                 on_progress=on_progress,
             )
             while not (ended or wanted.canary):
@@ -164,6 +167,7 @@ class Handlers:
             active=self._info(serving.estimator.bundle.info),
             previous=self._info(previous.info),
             epoch=serving.epoch,
+            changed=previous.digest != serving.estimator.bundle.digest,
         )
         return reply.encode()
 
@@ -183,8 +187,18 @@ class Handlers:
                 on_progress(Progress("refused", error.message))
             raise
 
-    def _check_release(self, info: ModelInfo, signed: Signed) -> None:
-        """Refuse a release below the highest that has served, unless a trusted signature allows the downgrade."""
+    def _admit(self, info: ModelInfo, signed: Signed) -> None:
+        """Refuse a model that this node must not use.
+
+        A release below the highest that has served needs a trusted signature that allows the downgrade. The trained
+        models of this installation are exempt: they are the way back without any bundle.
+
+        Raises:
+            Untrained, Downgrade: the model is refused.
+        """
+        self._slot.check_trained(info)
+        if info.trained and self._slot.is_built_in(info.digest):
+            return
         release, highest = signed.release_of(info), self._active_file.highest_release
         if not manifest.allowed(release, highest, signed.allow_downgrade):
             raise Downgrade(info.name, release, highest)

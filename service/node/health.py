@@ -1,6 +1,7 @@
 """One verdict per stream and for the node."""
 
 import time
+from collections.abc import Sequence
 
 from neurove_protocol.control import StreamStatus
 from neurove_service.latency import latency
@@ -37,9 +38,12 @@ def stream_status(node: str, stream: Stream, now_ns: int | None = None) -> Strea
     )
 
 
-def node_verdict(streams: list[StreamStatus], refused_streams: int = 0) -> tuple[bool, str]:
+def node_verdict(
+    streams: list[StreamStatus], refused_streams: int = 0, model_faults: Sequence[str] = ()
+) -> tuple[bool, str]:
     """Whether a node is healthy, and a sentence with the reason."""
-    bad = [f"{status.stream} is {status.verdict}: {status.why}" for status in streams if status.verdict in _BAD]
+    bad = list(model_faults)
+    bad += [f"{status.stream} is {status.verdict}: {status.why}" for status in streams if status.verdict in _BAD]
     bad += [f"{refused_streams} streams refused: max_streams reached"] if refused_streams else []
     if bad:
         return False, "; ".join(bad)

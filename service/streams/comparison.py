@@ -22,6 +22,9 @@ NEWEST_WINDOWS = 256
 _LATENCY_WINDOWS = 16
 _RATE_FLOOR = 0.01
 
+MAX_M_S, MAX_RAD_S = 200.0, 100.0
+"""RMS speeds that no camera of ours has: a model that estimates more is wrong without any comparison."""
+
 
 class TrialLimits(NamedTuple):
     """The limits of a tried model."""
@@ -30,6 +33,7 @@ class TrialLimits(NamedTuple):
     rate_ratio: float = 8.0  # ratio of the firing rates of both models, in either direction
     latency_share: float = 0.5  # median time for a window, as a share of the window's duration
     own: metadata.BundleLimits = metadata.BundleLimits()  # further limits that the model's bundle sets
+    compared: bool = True  # whether differences from the other model count; without them the model is judged alone
 
     def and_of(self, bundle: Bundle) -> "TrialLimits":
         """These limits together with those of a bundle, which may be stricter than the node but not laxer."""
@@ -91,6 +95,11 @@ class TrialFigures(NamedTuple):
         apart = [np.linalg.norm(pair.tried[part] - pair.proven[part]) for pair in self.pairs]
         return float(np.mean(apart)) if apart else 0.0
 
+    def speed(self, part: slice) -> float:
+        """RMS speed of the tried model: the linear part 0:3 [m/s] or the angular part 3:6 [rad/s]."""
+        rows = np.array([pair.tried[part] for pair in self.pairs])
+        return float(np.sqrt(np.mean((rows**2).sum(axis=1)))) if len(rows) else 0.0
+
     @property
     def latency_ratio(self) -> float:
         """Median time for a window, as a multiple of the proven model's; 0 if either model has no time yet."""
@@ -128,12 +137,17 @@ def violation(figures: TrialFigures, limits: TrialLimits, newest: int = NEWEST_W
         bound_ms = limits.latency_share * figures.window_ms
         if figures.latency_ms > bound_ms:
             return Violation("latency_ms", figures.latency_ms, bound_ms)
-        ratio = limits.own.latency_ratio
+        ratio = limits.own.latency_ratio if limits.compared else None
         if ratio is not None and len(figures.proven_ms) >= MIN_WINDOWS and figures.latency_ratio > ratio:
             return Violation("latency_ratio", figures.latency_ratio, ratio)
     if len(figures.pairs) < MIN_WINDOWS:
         return None
     recent = figures._replace(pairs=figures.pairs[-newest:])
+    for field, part, most in (("speed_m_s", slice(0, 3), MAX_M_S), ("speed_rad_s", slice(3, 6), MAX_RAD_S)):
+        if recent.speed(part) > most:
+            return Violation(field, recent.speed(part), most)
+    if not limits.compared:
+        return None
     if recent.divergence > limits.divergence:
         return Violation("divergence", recent.divergence, limits.divergence)
     if recent.rate_ratio > limits.rate_ratio:

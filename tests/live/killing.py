@@ -4,6 +4,7 @@ import contextlib
 import signal
 import threading
 import time
+from dataclasses import replace
 
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.models import bundle
@@ -50,7 +51,7 @@ class Node:
             (models,) = ask.models(transport, self.config)
             assert more or not self.may_serve or models.active.digest in self.may_serve, "a wrong model serves"
             assert models.unreadable == {}, models.unreadable
-            assert ask.health(transport, self.config)[0].ok
+            assert ask.health(transport, self.config)[0].ok == models.active.trained
             yield process, transport, models
 
     def kill_in_a_change(self, seed, *, at_step=None, after_s=None):
@@ -60,7 +61,7 @@ class Node:
             digest of the new model, the last reported step, and digest of the model that served before.
         """
         path = self.folder / f"model{seed}.safetensors"
-        bundle.save(bundle.untrained(seed, CONFIG, f"model{seed}"), path)
+        bundle.save(replace(bundle.untrained(seed, CONFIG, f"model{seed}"), trained=True), path)  # for the health
         reported, reached = ["nothing"], threading.Event()
 
         def on_progress(progress):

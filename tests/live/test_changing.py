@@ -53,8 +53,16 @@ def done(name):
     return ActivateReply(node=name, active=NEW, previous=OLD, epoch=1)
 
 
+def already_active(name):
+    return ActivateReply(node=name, active=NEW, previous=NEW, epoch=1, changed=False)
+
+
 def has_it(name):
     return PushReply(node=name, model=NEW, fetched=1234)
+
+
+def had_it(name):
+    return PushReply(node=name, model=NEW, fetched=0)
 
 
 def refuses(error):
@@ -100,32 +108,56 @@ def test_one_of_several_nodes_must_be_named_before_anything_changes(network, run
     assert [node.asked for node in nodes.values()] == [[], ["new"]]
 
 
-def test_after_a_refusal_the_remaining_nodes_are_not_asked_and_are_listed(network, run):
+def test_after_a_refusal_the_other_nodes_are_changed_and_a_summary_lists_every_node(network, run):
     endpoint, put = network
-    nodes = put(n1=done, n2=refuses(UnknownModel("new", ("old",))), n3=done)
-    code, out, err = run("activate", "new", "--connect", endpoint, "--all", "--json")
-    assert code == 1
-    assert [json.loads(line)["node"] for line in out.splitlines()] == ["n1", "n1", "n2"]
-    assert err == "neurove: n2: model='new': not on this node; available: old; not changed: n3\n"
-    assert [node.asked for node in nodes.values()] == [["new"], ["new"], []]
+    nodes = put(n1=done, n2=refuses(UnknownModel("new", ("old",))), n3=already_active)
+    code, out, err = run("activate", "new", "--connect", endpoint, "--all")
+    assert code == 4
+    assert err == "neurove: n2: model='new': not on this node; available: old\n"
+    assert out.splitlines()[-4:] == [
+        "summary of 3 nodes: 1 changed, 1 unchanged, 1 refused",
+        f"  n1  changed: new ({'b' * 12}) is active and replaces old ({'a' * 12})",
+        "  n2  refused: model='new': not on this node; available: old",
+        f"  n3  unchanged: already has new ({'b' * 12}) as its active model",
+    ]
+    assert [node.asked for node in nodes.values()] == [["new"]] * 3
 
 
-def test_a_push_to_all_reports_the_nodes_that_store_the_bundle_and_the_one_that_refuses(network, run, tmp_path):
+def test_the_summary_for_programs_is_the_last_line(network, run):
     endpoint, put = network
-    nodes = put(n1=has_it, n2=refuses(NoStore("it has no state_dir")))
+    put(n1=done, n2=refuses(UnknownModel("new", ("old",))))
+    code, out, _ = run("activate", "new", "--connect", endpoint, "--all", "--json")
+    assert code == 4
+    summary = json.loads(out.splitlines()[-1])["summary"]
+    assert {node: one["result"] for node, one in summary.items()} == {"n1": "changed", "n2": "refused"}
+
+
+def test_a_push_to_all_says_which_nodes_store_the_bundle_have_it_already_or_refuse_it(network, run, tmp_path):
+    endpoint, put = network
+    nodes = put(n1=has_it, n2=refuses(NoStore("it has no state_dir")), n3=had_it)
     (tmp_path / "new.safetensors").write_bytes(b"whatever it is")
     code, out, err = run("push", tmp_path / "new.safetensors", "--connect", endpoint, "--all")
-    assert code == 1
+    assert code == 4
     assert out.splitlines()[1] == f"n1: new ({'b' * 12}) is stored, 1,234 bytes transferred"
+    assert f"n3: already has new ({'b' * 12}), no bytes transferred" in out.splitlines()
     assert err == "neurove: n2: this node stores no pushed models: it has no state_dir\n"
-    assert [node.asked for node in nodes.values()] == [["new.safetensors"]] * 2
+    assert [node.asked for node in nodes.values()] == [["new.safetensors"]] * 3
 
 
-def test_a_conflict_on_the_last_node_keeps_its_own_exit_code(network, run):
+@pytest.mark.parametrize(
+    ("second", "code"), [(Conflict("another client was first"), 3), (UnknownModel("new", ("old",)), 1)]
+)
+def test_if_all_nodes_refuse_the_exit_code_is_that_of_the_errors(network, run, second, code):
     endpoint, put = network
-    put(n1=done, n2=refuses(Conflict("another client was first")))
-    code, _, err = run("activate", "new", "--connect", endpoint, "--all")
-    assert (code, err) == (3, "neurove: n2: conflict: another client was first\n")
+    put(n1=refuses(Conflict("another client was first")), n2=refuses(second))
+    assert run("activate", "new", "--connect", endpoint, "--all")[0] == code
+
+
+def test_a_conflict_of_one_node_keeps_its_own_exit_code(network, run):
+    endpoint, put = network
+    put(n1=refuses(Conflict("another client was first")))
+    code, _, err = run("activate", "new", "--connect", endpoint, "--all", "--force", "we know")
+    assert (code, err) == (3, "neurove: n1: conflict: another client was first\n")
 
 
 def test_an_internal_error_of_a_node_reaches_its_caller_and_the_node_keeps_answering(network):

@@ -60,7 +60,8 @@ class Made:
 
 
 def _released(model: Bundle, release: int) -> Bundle:
-    return replace(model, metadata=Metadata(release=release))
+    """As a trained model: a node that trusts keys takes no other."""
+    return replace(model, trained=True, metadata=Metadata(release=release))
 
 
 def _tensors(change: Callable[[dict[str, torch.Tensor], str], None]) -> Callable[[bytes], bytes]:
@@ -108,7 +109,7 @@ def _slow() -> Bundle:
     )
     zeros, ones = torch.zeros(6), torch.ones(6)
     about = Metadata(release=_RELEASE)
-    return Bundle("too-slow", False, "a test", config, NeuroVE(config).eval(), zeros, ones, metadata=about)  # trained
+    return Bundle("too-slow", True, "a test", config, NeuroVE(config).eval(), zeros, ones, metadata=about)
 
 
 _SPOILT: dict[str, Callable[[bytes], bytes]] = {

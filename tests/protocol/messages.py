@@ -169,9 +169,16 @@ EXAMPLES: dict[str, Fields] = {
     "ChunkRequest": {"v": 1, "offset": 1_048_576, "length": 478_208},
     "ProgressReply": {"v": 1, "node": "rover-1", "step": "fetching", "text": "1.0 of 1.5 MiB"},
     "PushReply": {"v": 1, "node": "rover-1", "model": MODEL, "fetched": 1_526_784},
-    "ActivateRequest": {"v": 1, "model": "spire-7", "expect": "6e0a5e5e", "shadow_s": 30.0, "canary": ["cam0"]},
+    "ActivateRequest": {
+        "v": 1,
+        "model": "spire-7",
+        "expect": "6e0a5e5e",
+        "shadow_s": 30.0,
+        "canary": ["cam0"],
+        "force": "new lens",
+    },
     "RollbackRequest": {"v": 1, "expect": "5e5e5e5e"},
-    "ActivateReply": {"v": 1, "node": "rover-1", "active": MODEL, "previous": MODEL, "epoch": 3},
+    "ActivateReply": {"v": 1, "node": "rover-1", "active": MODEL, "previous": MODEL, "epoch": 3, "changed": True},
     "ErrorReply": {
         "v": 1,
         "code": "unknown_model",
@@ -408,10 +415,13 @@ ANY: dict[str, st.SearchStrategy[Fields]] = {
             "expect": st.none() | prefixes,
             "shadow_s": st.floats(0, 3600),
             "canary": st.lists(names, max_size=3),
+            "force": st.none() | sentences.filter(bool).map(lambda text: text[:200]),
         }
     ),
     "RollbackRequest": st.fixed_dictionaries({"expect": st.none() | prefixes}),
-    "ActivateReply": st.fixed_dictionaries({"node": names, "active": models, "previous": models, "epoch": counts}),
+    "ActivateReply": st.fixed_dictionaries(
+        {"node": names, "active": models, "previous": models, "epoch": counts, "changed": st.booleans()}
+    ),
     "ErrorReply": st.fixed_dictionaries(
         {
             "code": sentences,

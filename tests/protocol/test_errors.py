@@ -37,6 +37,7 @@ from neurove_protocol.errors import (
     UnknownFormat,
     UnknownModel,
     UnsupportedVersion,
+    Untrained,
     Untrusted,
     shown,
 )
@@ -54,6 +55,7 @@ ERRORS: list[NeuroVEError] = [
     UnknownModel("spire-9", ("spire-7",)),
     BadModel("spire-8", "the header names no network"),
     Untrusted("spire-8", "unknown_key", "signed by a key that is not trusted"),
+    Untrained("spire-8"),
     Downgrade("spire-8", 3, 4),
     NoStore("neither models_dir nor state_dir is configured"),
     TooLarge("spire-9.safetensors", 300_000_000, 268_435_456),

@@ -47,6 +47,7 @@ NULLABLE = {
     ("ModelsReply", "previous"),
     ("PushRequest", "signature"),
     ("ActivateRequest", "expect"),
+    ("ActivateRequest", "force"),
     ("RollbackRequest", "expect"),
 }
 FREE_MAPS = ("details", "unreadable", "figures", "partial")
@@ -121,6 +122,7 @@ OUT_OF_BOUND: dict[str, dict[str, tuple[Any, ...]]] = {
         "expect": ("", "5e5e5e5", "5E5E5E5E", "5e" * 33),
         "shadow_s": (-0.5, 3600.5),
         "canary": (["a/b"], [""]),
+        "force": ("", "m" * 201),
     },
     "RollbackRequest": {"expect": ("", "5e5e5e5")},
     "ActivateReply": {"node": ("",), "epoch": (-1,)},

@@ -1,4 +1,5 @@
 import time
+from dataclasses import replace
 
 import pytest
 
@@ -20,7 +21,7 @@ SMALL = ModelConfig(
 def models_dir(tmp_path_factory):
     folder = tmp_path_factory.mktemp("models")
     for seed, name in ((1, "one"), (2, "two")):
-        bundle.save(bundle.untrained(seed, SMALL, name), folder / f"{name}.safetensors")
+        bundle.save(replace(bundle.untrained(seed, SMALL, name), trained=True), folder / f"{name}.safetensors")
     return folder
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from neurove_core.files import atomic_path
 from neurove_core.geometry.motion import Poses, Twists, twists
-from neurove_core.io.archive import BROKEN_ZIP
+from neurove_core.io.archive import BROKEN_ZIP, member
 from neurove_core.io.checked import Piece, cleaned, numbered
 from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.faults import Faults
@@ -180,7 +180,7 @@ def _member(path: Path, name: str) -> Iterator[tuple[IO[bytes], tuple[int, ...],
         BrokenRecording: the header or, during reading, the compressed data is truncated or corrupt.
     """
     try:
-        with zipfile.ZipFile(path) as archive, archive.open(f"{name}.npy") as file:
+        with member(path, f"{name}.npy") as file:
             version = np.lib.format.read_magic(file)
             header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
             shape, _, dtype = header(file)

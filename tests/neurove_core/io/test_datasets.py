@@ -34,6 +34,19 @@ from tests.datasets import (
 )
 from tests.recordings import assert_same, read, read_broken
 
+
+def without(events: Events, first: int, stop: int) -> Events:
+    return Events(*(np.delete(column, slice(first, stop)) for column in events))
+
+
+def unread(path: Path) -> str:
+    """Why no event of a file can be read."""
+    recording = open_source(str(path))
+    assert read(recording).n == 0
+    (fault,) = recording.faults.unread
+    return f"{fault.where}: {fault.why}"
+
+
 each_layout = pytest.mark.parametrize("written", [mvsec_file, dsec_file, m3ed_file, own_file])
 
 
@@ -69,7 +82,7 @@ def test_since_does_not_read_earlier_events(written, name, tmp_path):
         corrupt_chunk(path, file[name], 0)
     recording = open_source(str(path), SENSOR)
     events = EVENTS if written is m3ed_file else LATE
-    assert read_broken(recording)[0].n == 0
+    assert read_broken(recording)[0].t[0] == events.t[CHUNK]
     assert_same(Events.join(list(recording.since(int(events.t[700])))), events.span(700, 1000))
 
 
@@ -136,7 +149,7 @@ def test_a_corrupt_file_is_refused_with_our_error_or_read_without_an_invalid_eve
     ],
 )
 @pytest.mark.parametrize("written", [mvsec_file, dsec_file, m3ed_file])
-def test_an_invalid_event_ends_the_recording_at_its_row(written, column, value, why, tmp_path):
+def test_an_invalid_event_is_skipped_and_named_by_its_row(written, column, value, why, tmp_path):
     path, row = written(tmp_path), 537
     with h5py.File(path, "r+") as file:
         if written is mvsec_file:
@@ -148,19 +161,19 @@ def test_an_invalid_event_ends_the_recording_at_its_row(written, column, value, 
             del group[column]
             group[column] = rows
     events, error = read_broken(open_source(path, SENSOR))
-    assert_same(events, (EVENTS if written is m3ed_file else LATE).span(0, row))
+    assert_same(events, without(EVENTS if written is m3ed_file else LATE, row, row + 1))
     assert error is not None
     assert str(error.details["where"]).startswith(f"row {row} of ")
     assert re.search(why, error.message)
 
 
 @pytest.mark.parametrize(("written", "name"), [(dsec_file, "events/y"), (m3ed_file, "prophesee/left/y")])
-def test_an_unreadable_chunk_ends_the_recording_at_its_first_row(written, name, tmp_path):
+def test_an_unreadable_chunk_is_skipped_and_named_by_its_first_row(written, name, tmp_path):
     path = Path(written(tmp_path))
     with h5py.File(path) as file:
         corrupt_chunk(path, file[name], 4)
     events, error = read_broken(open_source(str(path), SENSOR))
-    assert_same(events, (EVENTS if written is m3ed_file else LATE).span(0, 4 * CHUNK))
+    assert_same(events, without(EVENTS if written is m3ed_file else LATE, 4 * CHUNK, 5 * CHUNK))
     assert error is not None
     assert str(error.details["where"]).startswith(f"row {4 * CHUNK} of ")
 
@@ -181,30 +194,26 @@ def test_columns_of_unequal_length_give_their_common_rows_and_then_an_error(tmp_
 def test_a_table_of_another_shape_or_type_is_refused_by_name(tmp_path):
     with h5py.File(tmp_path / "a.hdf5", "w") as file:
         file["davis/left/events"] = np.zeros((5, 3))
-    with pytest.raises(BrokenRecording, match=r"davis/left/events: expected numbers of shape \(N, 4\)"):
-        read(open_source(str(tmp_path / "a.hdf5")))
+    assert "expected numbers of shape (N, 4)" in unread(tmp_path / "a.hdf5")
     for rows in ([b"one", b"two"], np.zeros(2, np.longdouble), np.zeros(2, np.float16)):
         with h5py.File(tmp_path / "b.h5", "w") as file:
             for name in "pxyt":
                 file[f"events/{name}"] = rows
-        with pytest.raises(BrokenRecording, match="expected numbers of shape"):
-            read(open_source(str(tmp_path / "b.h5")))
+        assert "expected numbers of shape" in unread(tmp_path / "b.h5")
 
 
 def test_rows_that_were_never_written_are_refused(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for name in "pxyt":
             file.create_dataset(f"events/{name}", (1 << 60,), "u2", chunks=(1000,))
-    with pytest.raises(BrokenRecording, match="1152921504606846976 rows were never written"):
-        read(open_source(str(tmp_path / "a.h5")))
+    assert "1152921504606846976 rows were never written" in unread(tmp_path / "a.h5")
 
 
 def test_too_large_chunks_are_refused_before_decompression(tmp_path):
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for name in "pxyt":
             file.create_dataset(f"events/{name}", (10,), "i8", maxshape=(None,), chunks=(9_000_000,), compression=1)
-    with pytest.raises(BrokenRecording, match="chunks of 72000000 bytes; at most 67108864"):
-        read(open_source(str(tmp_path / "a.h5")))
+    assert "chunks of 72000000 bytes; at most 67108864" in unread(tmp_path / "a.h5")
 
 
 def test_a_long_file_is_read_in_bounded_chunks_and_memory(tmp_path):

@@ -10,11 +10,9 @@ import pytest
 
 from neurove_core.geometry import rotations
 from neurove_core.geometry.motion import twists
-from neurove_core.io import BrokenRecording
 from neurove_core.io.formats.hdf5 import mvsec
 from neurove_core.sources import open_source
 from neurove_protocol import Sensor
-from neurove_protocol.errors import InvalidField
 from tests.builders import SENSOR
 from tests.datasets import CHUNK, DAY_US, LATE, corrupt_chunk, make_imu, make_poses, matrices, own_file, write_mvsec
 from tests.recordings import all_samples, shared
@@ -95,24 +93,25 @@ def test_mvsec_without_a_truth_file_has_no_poses(tmp_path):
 
 
 @pytest.mark.parametrize(("row", "value"), [(7, np.nan), (7, np.inf), (7, 1.0)])
-def test_an_invalid_imu_sample_ends_the_stream_at_its_row(row, value, tmp_path):
+def test_an_invalid_imu_sample_is_skipped_and_named_by_its_row(row, value, tmp_path):
     imu = make_imu(start_us=DAY_US)
     path = write_mvsec(tmp_path, LATE, imu=imu)
     with h5py.File(path, "r+") as file:
         file["davis/left/imu_ts"][row] = value
-    blocks = open_source(path).imu()
-    assert next(blocks).t.tolist() == imu.t[:row].tolist()
-    with pytest.raises(BrokenRecording, match=f"row {row} of davis/left/imu"):
-        next(blocks)
+    recording = open_source(path)
+    assert all_samples(recording).t.tolist() == np.delete(imu.t, row).tolist()
+    (fault,) = recording.faults.found
+    assert fault.where == f"row {row} of davis/left/imu"
 
 
 def test_images_of_another_type_are_refused(tmp_path):
     path = write_mvsec(tmp_path, LATE, images=np.zeros((2, 260, 346)))  # type: ignore[arg-type]  # on purpose
-    with pytest.raises(BrokenRecording, match="expected images of uint8, not float64"):
-        list(open_source(path).frames())
+    recording = open_source(path)
+    assert not list(recording.frames())
+    assert "expected images of uint8, not float64" in recording.faults.unread[0].why
 
 
-def test_an_unreadable_imu_chunk_ends_the_stream_at_its_first_row(tmp_path):
+def test_an_unreadable_imu_chunk_is_skipped_and_named_by_its_first_row(tmp_path):
     path = Path(own_file(tmp_path))
     with h5py.File(path, "r+") as file:
         imu = make_imu(250, start_us=DAY_US)
@@ -121,23 +120,27 @@ def test_an_unreadable_imu_chunk_ends_the_stream_at_its_first_row(tmp_path):
             file.create_dataset(f"imu/{name}", data=rows, chunks=chunks, compression=hdf5plugin.Zstd())
     with h5py.File(path) as file:
         corrupt_chunk(path, file["imu/gyro"], 1)
-    blocks = open_source(str(path)).imu()
-    assert next(blocks).t.tolist() == imu.t[:CHUNK].tolist()
-    with pytest.raises(BrokenRecording, match=f"row {CHUNK} of imu"):
-        next(blocks)
+    recording = open_source(str(path))
+    assert all_samples(recording).t.tolist() == np.delete(imu.t, slice(CHUNK, 2 * CHUNK)).tolist()
+    (fault,) = recording.faults.found
+    assert (fault.where, fault.count) == (f"row {CHUNK} of imu", CHUNK)
 
 
-def test_the_error_for_images_out_of_order_names_the_row(tmp_path):
+def test_an_image_out_of_order_is_skipped_and_named_by_its_row(tmp_path):
     path = write_mvsec(tmp_path, LATE, images=np.zeros((4, 260, 346), np.uint8))
     with h5py.File(path, "r+") as file:
         file["davis/left/image_raw_ts"][2] = 1.0
-    with pytest.raises(BrokenRecording, match="row 2 of davis/left/image_raw"):
-        list(open_source(path).frames())
+    recording = open_source(path)
+    assert len(list(recording.frames())) == 3
+    assert recording.faults.found[0].where == "row 2 of davis/left/image_raw"
 
 
-def test_the_error_for_a_truth_that_is_not_a_rigid_transform_names_the_row(tmp_path):
+def test_a_pose_that_is_not_a_rigid_transform_is_skipped_and_named_by_its_row(tmp_path):
     path = write_mvsec(tmp_path, LATE, poses=make_poses(start_us=DAY_US))
     with h5py.File(tmp_path / "indoor_flying1_gt.hdf5", "r+") as file:
         file["davis/left/odometry"][5, 0, 0] = 3.0
-    with pytest.raises(InvalidField, match="row 5 of davis/left/odometry: matrix="):
-        open_source(path).poses()
+    recording = open_source(path)
+    poses = recording.poses()
+    assert poses is not None
+    assert poses.t.tolist() == np.delete(make_poses(start_us=DAY_US).t, 5).tolist()
+    assert "row 5 of davis/left/odometry" in recording.faults.found[0].where

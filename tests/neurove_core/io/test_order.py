@@ -41,6 +41,11 @@ CASES = {
     "one late": (events_at(STEADY[:1000], [STEADY[1000] - 99_000], STEADY[1001:]), 1_999, {Reason.LATE: 1}),
     "one very late": (events_at(STEADY + 9 * SECOND, [0], STEADY + 12 * SECOND), 4_000, {Reason.LATE: 1}),
     "stale start": (events_at(STEADY[:10] + 500 * SECOND, STEADY), 2_000, {Reason.STALE_START: 10}),
+    "one very late among the first": (
+        events_at(STEADY[:7] + 9 * SECOND, [0], STEADY + 10 * SECOND),
+        2_007,
+        {Reason.LATE: 1},
+    ),
     "restart": (events_at(STEADY + 500 * SECOND, STEADY), 4_000, {Reason.NEW_CLOCK: 1}),
     "two restarts": (events_at(STEADY, STEADY, STEADY), 6_000, {Reason.NEW_CLOCK: 2}),
     "one far ahead": (events_at(STEADY, [10**15], STEADY + 3 * SECOND), 4_000, {Reason.TIME_JUMP: 1}),

@@ -2,11 +2,16 @@
 
 import json
 
+import numpy as np
 import pytest
 
+from neurove_core.io.formats.packet_log.layout import pack_columns, pack_frame
+from neurove_core.io.formats.packet_log.writer import PacketWriter
+from neurove_core.io.recording import Frame, Triggers
 from neurove_core.sources import open_source
 from neurove_protocol import Sensor
-from tests.builders import make_events
+from neurove_protocol.events import encode_packet
+from tests.builders import make_events, make_packet
 from tests.neurove_core.io.test_prophesee import dat
 from tests.recordings import ecd_text, shared
 
@@ -31,6 +36,31 @@ def test_convert_writes_the_layout_of_dsec(run, tmp_path):
     assert "2,000 events" in found
     again = open_source(str(tmp_path / "a.h5"), Sensor(64, 48))
     assert sum(chunk.n for chunk in again.chunks()) == 2000
+
+
+def test_convert_says_what_the_target_cannot_hold(run, tmp_path):
+    pytest.importorskip("hdf5plugin")
+    edges = Triggers(np.array([5, 9]), np.array([0, 0], np.uint8), np.array([1, 0], np.uint8))
+    with PacketWriter(tmp_path / "a.mcap") as writer:
+        writer.write("cam0", encode_packet(make_packet()), 0)
+        writer.add("cam0", "triggers", pack_columns("triggers", edges), 0)
+        writer.add("cam0", "frames", pack_frame(Frame(0, np.zeros((4, 4), np.uint8))), 0)
+    out = tmp_path / "a.h5"
+    code, found, err = run("convert", tmp_path / "a.mcap", out, "--json")
+    assert (code, json.loads(found)["left_out"]) == (0, ["frames", "triggers"])
+    assert err == f"neurove: {out} lacks frames, triggers: .h5 cannot hold them, .mcap can\n"
+    _, found, err = run("convert", tmp_path / "a.mcap", tmp_path / "b.mcap", "--json")
+    assert (json.loads(found)["left_out"], err) == ([], "")
+
+
+@pytest.mark.parametrize("arguments", [["convert", "sim://wall?seconds=0.1"], ["simulate", "wall", "--out"]])
+def test_a_file_that_exists_is_replaced_only_with_force(run, tmp_path, arguments):
+    out = tmp_path / "a.mcap"
+    out.write_text("mine")
+    code, _, err = run(*arguments, out, *(["--seconds", 0.1] if arguments[0] == "simulate" else []))
+    assert (code, "the file exists; --force replaces it" in err, out.read_text()) == (2, True, "mine")
+    code, _, _ = run(*arguments, out, "--force", *(["--seconds", 0.1] if arguments[0] == "simulate" else []))
+    assert (code, out.read_bytes()[1:5]) == (0, b"MCAP")
 
 
 def test_convert_keeps_the_triggers_of_a_real_bag(run, tmp_path):

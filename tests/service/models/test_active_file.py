@@ -4,7 +4,7 @@ import pytest
 
 from neurove_service.models.active_file import Active, ActiveFile
 
-SAVED = Active(digest="5e" * 32, previous=None, configured="default", highest_release=7)
+SAVED = Active(digest="5e" * 32, previous=None, configured="default", highest_release=7, trial="6e" * 32)
 
 
 def test_a_saved_record_is_read_after_a_restart(tmp_path):
@@ -13,6 +13,11 @@ def test_a_saved_record_is_read_after_a_restart(tmp_path):
     again = ActiveFile(tmp_path / "new")
     assert (again.active, again.highest_release) == (SAVED, 7)
     assert [file.name for file in (tmp_path / "new").iterdir()] == ["active.json"]
+
+
+def test_a_record_without_a_trial_is_one_of_an_earlier_version(tmp_path):
+    fields = SAVED.model_dump(exclude={"trial"})
+    assert Active.model_validate(fields).trial is None
 
 
 @pytest.mark.parametrize("seed", range(0, 200, 13))

@@ -1,5 +1,6 @@
 """A model change while streams run: the estimates, window by window."""
 
+import contextlib
 import itertools
 import threading
 from dataclasses import replace
@@ -10,12 +11,13 @@ import torch
 from neurove_core.config import WindowConfig
 from neurove_core.models import bundle
 from neurove_protocol import Flag
-from neurove_protocol.errors import Conflict, Diverged, InvalidField, NoMemory, NothingBefore, TooSlow
+from neurove_protocol.errors import Conflict, Diverged, InvalidField, NoMemory, NothingBefore, TooSlow, Untrained
 from neurove_service.models.change import Rules
 from neurove_service.models.slot import ModelSlot
 from neurove_service.streams.comparison import TrialLimits
 from neurove_service.streams.stream import Stream
 from tests.builders import make_packets
+from tests.bundles import proven
 from tests.service.conftest import SMALL, arrived
 
 WINDOW_US = 50_000
@@ -26,10 +28,13 @@ LAX = TrialLimits(divergence=1e9, rate_ratio=1e9, latency_share=1e9)
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("swap")
     for seed, name in ((1, "one"), (2, "two"), (3, "three")):
-        bundle.save(bundle.untrained(seed, SMALL, name), folder / f"{name}.safetensors")
+        bundle.save(proven(bundle.untrained(seed, SMALL, name)), folder / f"{name}.safetensors")
     one = bundle.load(folder / "one.safetensors")
-    bundle.save(replace(one, name="similar", offset=torch.full((6,), 1e-4)), folder / "similar.safetensors")
-    bundle.save(replace(one, name="wild", scale=torch.full((6,), 1e4)), folder / "wild.safetensors")
+    plain = replace(one, golden=None)  # the golden test is that of other scales
+    bundle.save(replace(plain, name="similar", offset=torch.full((6,), 1e-4)), folder / "similar.safetensors")
+    bundle.save(replace(plain, name="wild", scale=torch.full((6,), 50.0)), folder / "wild.safetensors")
+    bundle.save(replace(plain, name="absurd", scale=torch.full((6,), 1e4)), folder / "absurd.safetensors")
+    bundle.save(bundle.untrained(7, SMALL, "random"), folder / "random.safetensors")
     short = SMALL.model_copy(update={"window": WindowConfig(duration_us=20_000, bins=5)})
     bundle.save(bundle.untrained(4, short, "short"), folder / "short.safetensors")
     wide = SMALL.model_copy(update={"canonical": SMALL.canonical.model_copy(update={"width": 30})})
@@ -125,8 +130,11 @@ def test_the_old_model_answers_every_window_before_the_change_and_the_new_one_ev
 
 
 def test_a_change_reports_every_step(slots):
-    progress, slot = [], slots(probation_s=0.05)
+    progress, slot = [], slots(probation_s=0.5)
+    stream, packets = Stream("cam0", slot), make_packets(300)
+    feed(stream, packets[:100])
     slot.activate("two", on_progress=progress.append)
+    feed(stream, packets[100:])
     assert slot.await_probation(10)
     wait_until(lambda: steps(progress)[-1] == "done")
     assert steps(progress) == [
@@ -440,6 +448,163 @@ def test_a_model_that_breaks_a_limit_on_probation_is_rolled_back_automatically(s
     assert steps(progress)[-1] == "rolled_back"
     assert live.estimates[-1].model == "one"
     assert [one.seq for one in live.estimates] == list(range(len(live.estimates)))
+
+
+STRICT = TrialLimits(divergence=1e-6, rate_ratio=1.0, latency_share=1e9)
+
+
+@pytest.fixture
+def camera(slots):
+    """Makes a running stream of a slot."""
+    with contextlib.ExitStack() as stack:
+
+        def make(slot):
+            live = stack.enter_context(Live(Stream("cam0", slot), make_packets(4_000, n=50, step_us=25_000)))
+            wait_until(lambda: len(live.estimates) > 3)
+            return live
+
+        yield make
+
+
+@pytest.mark.parametrize("shadow_s", [0.0, 0.5])
+@pytest.mark.parametrize("active", ["random", "similar"])
+def test_a_model_without_a_proven_record_refuses_no_other_by_its_difference(slots, camera, active, shadow_s):
+    slot, progress = slots(active, probation_s=0.3, probation=STRICT, shadow=STRICT), []
+    camera(slot)
+    slot.activate("two", shadow_s=shadow_s, on_progress=progress.append)
+    wait_until(lambda: steps(progress)[-1] in ("done", "rolled_back"))
+    assert (steps(progress)[-1], slot.active.estimator.bundle.name) == ("done", "two")
+    why = {"random": "it is untrained", "similar": "its bundle has no golden test"}[active]
+    assert f"judged by its own limits only: {active} has no proven record, because {why}" in "".join(
+        one.text for one in progress if one.step == "probation"
+    )
+
+
+def test_a_model_is_a_measure_only_after_its_own_probation(slots, camera):
+    slot, progress = slots("random", probation_s=0.3, probation=STRICT), []
+    camera(slot)
+    slot.activate("one", on_progress=progress.append)
+    wait_until(lambda: steps(progress)[-1] == "done")
+    slot.activate("two", on_progress=progress.append)
+    wait_until(lambda: steps(progress)[-1] == "rolled_back")
+    assert "divergence" in slot.last_change
+
+
+def test_own_limits_refuse_absurd_speeds_without_a_comparison(slots, camera):
+    slot, progress = slots("random", probation_s=60.0, probation=STRICT), []
+    camera(slot)
+    slot.activate("absurd", on_progress=progress.append)
+    wait_until(lambda: steps(progress)[-1] == "rolled_back")
+    assert "the bound is 200" in slot.last_change
+
+
+def test_a_forced_change_is_not_refused_by_a_difference_and_its_reason_is_logged(slots, camera, capsys):
+    slot, progress = slots(probation_s=0.3, probation=STRICT, shadow=STRICT), []
+    camera(slot)
+    slot.activate("wild", shadow_s=0.5, force="new gear ratio", on_progress=progress.append)
+    assert "forced (new gear ratio): no difference from one refuses it" in slot.last_change
+    wait_until(lambda: steps(progress)[-1] == "done")
+    assert slot.active.estimator.bundle.name == "wild"
+    assert "reason='new gear ratio'" in capsys.readouterr().out
+
+
+def test_a_forced_change_does_not_overrule_a_fault(slots, camera):
+    slot, progress = slots(), []
+    camera(slot)
+    _, serving = slot.activate("two", force="now", on_progress=progress.append)
+    Poisoned(serving.estimator, "nan").now()
+    wait_until(lambda: steps(progress)[-1] == "rolled_back")
+    assert "not finite" in slot.last_change
+
+
+def test_a_probation_without_windows_waits_for_them_and_says_so(slots):
+    kept, progress = [], []
+    slot = slots(probation_s=0.1, on_changed=lambda model: kept.append(model.name))
+    slot.activate("two", on_progress=progress.append)
+    wait_until(lambda: steps(progress)[-1] == "waiting")
+    assert (kept, slot.plan.phase) == ([], "probation")
+    assert slot.last_change == "two is active, but its probation waits for windows: 0 so far, at least 8 are needed"
+    stream = Stream("cam0", slot)
+    feed(stream, make_packets(40, n=50, step_us=25_000))
+    wait_until(lambda: steps(progress)[-1] == "done")
+    assert (kept, slot.last_change) == (["two"], "two is active: it passed its probation")
+    assert steps(progress).count("waiting") == 1
+
+
+def test_a_model_whose_probation_waits_serves_on_probation_after_a_restart(slots):
+    kept, trials = [], []
+
+    def on_trial(tried, proven):
+        trials.append((tried and tried.name, proven.name))
+
+    first = slots(probation_s=0.1, on_trial=on_trial)
+    first.activate("two")
+    wait_until(lambda: trials == [("two", "one")])
+    one, two = first.previous.digest, first.active.estimator.bundle.digest
+    first.close()
+    again = slots(
+        probation_s=0.1,
+        kept=(one, None),
+        trial=two,
+        on_changed=lambda model: kept.append(model.name),
+        on_trial=on_trial,
+    )
+    assert (again.active.estimator.bundle.name, again.previous.name, again.plan.phase) == ("two", "one", "probation")
+    again.resume()
+    wait_until(lambda: len(trials) == 2)
+    stream = Stream("cam0", again)
+    feed(stream, make_packets(40, n=50, step_us=25_000))
+    wait_until(lambda: kept == ["two"])
+    assert trials == [("two", "one"), ("two", "one"), (None, "one")]
+    assert again.rollback()[1].estimator.bundle.name == "one"
+
+
+def test_activating_the_active_model_changes_nothing_and_keeps_the_previous_one(slots):
+    slot, progress = slots(), []
+    slot.activate("two")
+    digest = slot.active.estimator.bundle.digest
+    before, plan = slot.previous, slot.plan
+    for model, expect in (("two", None), (digest[:8], None), ("two", before.digest)):  # as a repeated roll-out does
+        old, serving = slot.activate(model, expect=expect, on_progress=progress.append)
+        assert (old.digest, serving.estimator.bundle.digest) == (digest, digest)
+    assert (slot.plan, slot.previous) == (plan, before)
+    assert steps(progress) == ["done"] * 3
+    assert slot.rollback()[1].estimator.bundle.name == "one"
+
+
+def test_a_node_for_trained_models_takes_no_untrained_one(slots, folder):
+    slot = slots(trained_only=True)
+    for model in ("random", "untrained"):
+        with pytest.raises(Untrained, match=f"model {model}: it is untrained; a node with trusted_keys takes only"):
+            slot.activate(model)
+        with pytest.raises(Untrained):
+            slots(model, trained_only=True)
+    assert slot.active.epoch == 0
+    other = slots()
+    random = other.activate("random")[1].estimator.bundle.digest
+    one = slot.active.estimator.bundle.digest
+    again = slots("one", trained_only=True, kept=(random, random))
+    assert (again.active.estimator.bundle.name, again.previous) == ("one", None)
+    last = slots("one", kept=(one, random))
+    assert last.previous.name == "random"
+
+
+def test_a_node_that_serves_another_model_than_the_configured_one_says_so_first(slots, capsys):
+    two = slots("two").active.estimator.bundle.digest
+    capsys.readouterr()
+    slots("one", kept=(two, None))
+    first = capsys.readouterr().out.splitlines()[0]
+    assert "another model than the configured one serves" in first
+    assert "configured=one serving=two" in first
+
+
+def test_an_untrained_model_that_answers_is_a_fault_of_the_node(slots):
+    slot = slots()
+    assert slot.faults == []
+    slot.activate("random", canary=frozenset({"cam0"}))
+    assert slot.faults == ["model random is untrained: its estimates have no meaning"]
+    slot.rollback()
+    assert slot.faults == []
 
 
 def test_a_model_on_probation_passes_when_a_later_change_follows(slots):

@@ -223,6 +223,12 @@ def test_few_events_and_a_young_state_are_flagged(stream):
     assert all(Flag.LOW_ACTIVITY in one.flags for one in estimates)
     assert flagged(estimates, Flag.SETTLING) == [0, 1, 2, 3]
     assert flagged(estimates, Flag.RESET) == [0]
+    assert not any(Flag.UNTRAINED in one.flags for one in estimates)
+
+
+def test_every_estimate_of_an_untrained_model_is_flagged():
+    estimates = feed(Stream("cam0", _slot()), make_packets(40))
+    assert estimates
     assert all(Flag.UNTRAINED in one.flags for one in estimates)
 
 

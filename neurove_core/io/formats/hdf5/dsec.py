@@ -12,7 +12,6 @@ lens, as attributes). All of these `t` [us] are on the sensor's clock: they alre
 Sources: https://dsec.ifi.uzh.ch/data-format, and uzh-rpg/DSEC, scripts/utils/eventslicer.py.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Self
@@ -23,10 +22,10 @@ from neurove_core.geometry.motion import Poses, Twists
 from neurove_core.io.errors import BrokenRecording
 from neurove_core.io.formats.hdf5.file import Column, dataset, has, opened, value
 from neurove_core.io.formats.hdf5.poses import stored_poses, table
-from neurove_core.io.formats.hdf5.tables import EventTable, ImuTable, TableRecording, seek_indexed
+from neurove_core.io.formats.hdf5.tables import EventTable, ImuTable, TableRecording, row_indexed
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import InvalidField
-from neurove_protocol.events import Events, Sensor
+from neurove_protocol.events import Sensor
 
 DSEC_SENSOR: Final = Sensor(640, 480)
 """The Prophesee Gen3.1 that recorded the data set."""
@@ -79,17 +78,19 @@ class DsecRecording(TableRecording):
     def event_table(self, file: Any) -> EventTable:
         """The columns t, x, y, p."""
         columns = tuple(dataset(self.path, file, f"events/{name}") for name in "txyp")
-        note = ", which is DSEC's, because the file does not give its own: give --sensor WIDTHxHEIGHT"
-        return EventTable("events", columns, _unchanged, self.offset_us, note if self.assumed else "")
+        return EventTable("events", columns, _unchanged, self.offset_us)
 
-    def since(self, t_us: int) -> Iterator[Events]:
-        """As `chunks`, from this time on, found with the file's millisecond index."""
-        with opened(self.path) as file:
-            events = self.event_table(file)
-            if has(file, "ms_to_idx"):
-                yield from seek_indexed(self.path, events, self.sensor, dataset(self.path, file, "ms_to_idx"), t_us)
-            else:
-                yield from super(DsecRecording, self).since(t_us)
+    @property
+    def sensor_note(self) -> str:
+        """That the sensor is assumed, if it is."""
+        note = ", which is DSEC's, because the file does not give its own: give --sensor WIDTHxHEIGHT"
+        return note if self.assumed else ""
+
+    def first_row(self, file: Any, table: EventTable, t_us: int) -> int:
+        """As in `TableRecording`, found with the file's millisecond index."""
+        if not has(file, "ms_to_idx"):
+            return super(DsecRecording, self).first_row(file, table, t_us)
+        return row_indexed(table, dataset(self.path, file, "ms_to_idx"), t_us)
 
     def imu_table(self, file: Any) -> ImuTable | None:
         """The group `imu`, in the frame that the source used."""
@@ -100,15 +101,15 @@ class DsecRecording(TableRecording):
         return ImuTable("imu", columns, _unchanged, np.eye(3))
 
     def poses(self) -> Poses | None:
-        """The group `poses`, or None.
+        """The group `poses`, or None. Invalid rows are skipped.
 
         Raises:
-            BrokenRecording, InvalidField: the poses are invalid; the error names the row.
+            BrokenRecording: the file is truncated or corrupt.
         """
         if "poses" not in self.held:
             return None
         with opened(self.path) as file:
-            return stored_poses(self.path, file)
+            return stored_poses(self.path, file, self.faults.begin("poses"))
 
     def twists(self) -> Twists | None:
         """The group `twists`; without that group, twists from the poses; None without both.

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from neurove_core.extras import MissingExtra
 from neurove_core.io.errors import BrokenRecording, MissingFilter, UnknownSource
+from neurove_core.io.unpack import FREE_BYTES, MAX_RATIO
 
 MAX_CHUNK_BYTES: Final = 64 << 20
 """Largest stored chunk of a data set. HDF5 decompresses a chunk at once, so this limit bounds the memory."""
@@ -138,6 +139,19 @@ def _check_filters(path: Path, name: str, found: Any) -> None:
             raise MissingFilter(path, name, lacking[0]) from None
 
 
+def check_ratio(path: Path, columns: Sequence[Any]) -> None:
+    """Refuse data sets whose rows are implausibly larger than what the file stores of them; see `unpack`.
+
+    Raises:
+        BrokenRecording: a data set is larger.
+    """
+    for column in columns:
+        size, stored = column.size * column.dtype.itemsize, column.id.get_storage_size()
+        if size > FREE_BYTES + MAX_RATIO * stored and not column.is_virtual:
+            why = f"its {stored} stored bytes become {size}, more than {MAX_RATIO} times as many"
+            raise BrokenRecording(path, column.name.strip("/"), why)
+
+
 def value(path: Path, file: Any, name: str) -> Any:
     """The full value of a small data set: a number, an array, or a text as str.
 
@@ -178,6 +192,7 @@ def all_rows(path: Path, name: str, columns: Sequence[Any]) -> list[Column]:
     Raises:
         BrokenRecording: a row cannot be read, or the columns differ in length.
     """
+    check_ratio(path, columns)
     lengths = [int(column.shape[0]) for column in columns]
     rows, why = read_rows(columns, 0, min(lengths))
     if why:

@@ -25,8 +25,9 @@ import numpy as np
 
 from neurove_core.io.checked import ordered
 from neurove_core.io.errors import BrokenRecording, MissingGeometry
-from neurove_core.io.formats.hdf5.file import FAULTS, Column, dataset, has, opened, read_rows, records
-from neurove_core.io.formats.hdf5.tables import EventTable, TableRecording
+from neurove_core.io.faults import Tally
+from neurove_core.io.formats.hdf5.file import FAULTS, Column, dataset, has, opened, records
+from neurove_core.io.formats.hdf5.tables import EventTable, TableRecording, row_blocks
 from neurove_core.io.order import Where
 from neurove_core.io.recording import CHUNK_EVENTS, Triggers
 from neurove_protocol.errors import InvalidField
@@ -90,25 +91,26 @@ class PlainRecording(TableRecording):
 
     def event_table(self, file: Any) -> EventTable:
         """The table of the events."""
-        table = _event_table(self.path, file, self.layout)
+        return _event_table(self.path, file, self.layout)
+
+    @property
+    def sensor_note(self) -> str:
+        """That the sensor is assumed, if it is."""
         note = ", which is EDS's, because the file does not give its own: give --sensor WIDTHxHEIGHT"
-        return table._replace(note=note) if self.assumed else table
+        return note if self.assumed else ""
 
     def triggers(self) -> Iterator[Triggers]:
         """The edges on the trigger inputs of a Prophesee file; see `Recording`."""
         if "triggers" in self.held:
-            yield from ordered(self._edges(), self.faults.begin("triggers"))
+            tally = self.faults.begin("triggers")
+            yield from ordered(self._edges(tally), tally)
 
-    def _edges(self) -> Iterator[tuple[Where, Triggers]]:
+    def _edges(self, tally: Tally) -> Iterator[tuple[Where, Triggers]]:
         with opened(self.path) as file:
             table = records(self.path, file, EXT_TRIGGER, ("p", "t", "id"))
-            n = int(table.shape[0])
-            for at in range(0, n, CHUNK_EVENTS):
-                (rows,), unread = read_rows((table,), at, min(at + CHUNK_EVENTS, n))
+            for at, (rows,) in row_blocks(self.path, EXT_TRIGGER, (table,), tally, CHUNK_EVENTS):
                 channel, level = (rows["id"] & 0xFF).astype(np.uint8), (rows["p"] > 0).astype(np.uint8)
                 yield _row_of(at, EXT_TRIGGER), Triggers(rows["t"].astype(np.int64), channel, level)
-                if unread:
-                    raise BrokenRecording(self.path, f"row {at + len(rows)} of {EXT_TRIGGER}", unread)
 
 
 def _row_of(first: int, name: str) -> Where:

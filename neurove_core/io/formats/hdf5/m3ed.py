@@ -8,7 +8,6 @@ after each millisecond) and `calib`: `intrinsics` (fx fy cx cy), `distortion_coe
 Source: daniilidis-group/m3ed, build_system/bag_processing/rosbag2hdf5.py.
 """
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, Self
@@ -21,10 +20,10 @@ from neurove_core.geometry.motion import Poses
 from neurove_core.io.errors import BrokenRecording
 from neurove_core.io.formats.hdf5.file import Column, dataset, has, opened, value
 from neurove_core.io.formats.hdf5.poses import m3ed_poses
-from neurove_core.io.formats.hdf5.tables import EventTable, ImuTable, TableRecording, chosen_topic, seek_indexed
+from neurove_core.io.formats.hdf5.tables import EventTable, ImuTable, TableRecording, chosen_topic, row_indexed
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import InvalidField
-from neurove_protocol.events import Events, Sensor
+from neurove_protocol.events import Sensor
 
 EVK4: Final = Sensor(1280, 720)
 """Sensor of both cameras, for a file without calibration."""
@@ -84,14 +83,12 @@ class M3edRecording(TableRecording):
         columns = tuple(dataset(self.path, file, f"{self.topic}/{name}") for name in "txyp")
         return EventTable(self.topic, columns, _unchanged)
 
-    def since(self, t_us: int) -> Iterator[Events]:
-        """As `chunks`, from this time on, found with the file's millisecond index."""
-        with opened(self.path) as file:
-            table, name = self.event_table(file), f"{self.topic}/ms_map_idx"
-            if has(file, name):
-                yield from seek_indexed(self.path, table, self.sensor, dataset(self.path, file, name), t_us)
-            else:
-                yield from super(M3edRecording, self).since(t_us)
+    def first_row(self, file: Any, table: EventTable, t_us: int) -> int:
+        """As in `TableRecording`, found with the file's millisecond index."""
+        name = f"{self.topic}/ms_map_idx"
+        if not has(file, name):
+            return super(M3edRecording, self).first_row(file, table, t_us)
+        return row_indexed(table, dataset(self.path, file, name), t_us)
 
     def imu_table(self, file: Any) -> ImuTable | None:
         """The IMU of the OVC, 400 Hz. Samples that were never taken are nan in the file and are left out."""
@@ -105,14 +102,16 @@ class M3edRecording(TableRecording):
     def poses(self) -> Poses | None:
         """Poses of FILE_pose_gt.h5 at the lidar's 10 Hz, in the world of the left camera's first pose; or None.
 
+        Invalid rows are skipped.
+
         Raises:
-            BrokenRecording, InvalidField: the poses are invalid; the error names the row.
+            BrokenRecording: the file is truncated or corrupt.
         """
         truth = truth_path(self.path)
         if "poses" not in self.held:
             return None
         with opened(truth) as file:
-            left = m3ed_poses(truth, file)
+            left = m3ed_poses(truth, file, self.faults.begin("poses"))
         rigid = np.array(self.to_left)
         offset_m = rotations.turn(left.orientation, np.broadcast_to(rigid[:, 3], left.position_m.shape))
         q = np.broadcast_to(rotations.quaternion_of(rigid[:, :3]), left.orientation.shape)

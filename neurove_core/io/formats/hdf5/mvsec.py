@@ -16,7 +16,9 @@ from numpy.typing import NDArray
 
 from neurove_core.geometry import rotations
 from neurove_core.geometry.motion import Poses
+from neurove_core.io.checked import until_broken
 from neurove_core.io.errors import BrokenRecording
+from neurove_core.io.faults import Reason, Tally
 from neurove_core.io.formats.hdf5.file import Column, dataset, has, opened, read_rows
 from neurove_core.io.formats.hdf5.poses import mvsec_odometry
 from neurove_core.io.formats.hdf5.tables import EventTable, ImuTable, TableRecording, chosen_topic
@@ -139,13 +141,12 @@ class MvsecRecording(TableRecording):
         return ImuTable(name, columns, _sample, np.array(CAMERA_FROM_IMU[self.topic]))
 
     def frames(self) -> Iterator[Frame]:
-        """All images of this camera, ordered by time.
+        """All images of this camera, ordered by time. An image that cannot be read, or is late, is skipped."""
+        if "frames" in self.held:
+            tally = self.faults.begin("frames")
+            yield from until_broken(self._frames(tally), tally)
 
-        Raises:
-            BrokenRecording: an image cannot be read, or its time is before that of the previous image.
-        """
-        if "frames" not in self.held:
-            return
+    def _frames(self, tally: Tally) -> Iterator[Frame]:
         name = f"{self.topic}/image_raw"
         with opened(self.path) as file:
             images = dataset(self.path, file, name, DAVIS346.height, DAVIS346.width)
@@ -155,24 +156,26 @@ class MvsecRecording(TableRecording):
             last_s = -np.inf
             for i in range(min(images.shape[0], times.shape[0])):
                 (image, t_s), why = read_rows((images, times), i, i + 1)
-                if not why and not (last_s <= t_s[0] < 1e12):
-                    why = f"t={t_s[0]} s is not a valid time, or is before the previous t={last_s} s"
                 if why:
-                    raise BrokenRecording(self.path, f"row {i} of {name}", why)
-                last_s = float(t_s[0])
-                yield Frame(round(last_s * 1e6), np.asarray(image[0], np.uint8))
+                    tally.add(Reason.DAMAGED, f"row {i} of {name}", why)
+                elif not (last_s <= t_s[0] < 1e12):
+                    why = f"t={t_s[0]} s is not a valid time, or is before the previous t={last_s} s"
+                    tally.add(Reason.LATE, f"row {i} of {name}", why)
+                else:
+                    last_s = float(t_s[0])
+                    yield Frame(round(last_s * 1e6), np.asarray(image[0], np.uint8))
 
     def poses(self) -> Poses | None:
-        """The odometry of FILE_gt.hdf5, at the lidar's 20 Hz; None without that file.
+        """The odometry of FILE_gt.hdf5, at the lidar's 20 Hz; None without that file. Invalid rows are skipped.
 
         Raises:
-            BrokenRecording, InvalidField: the poses are invalid; the error names the row.
+            BrokenRecording: the file is truncated or corrupt.
         """
         truth = truth_path(self.path)
         if not truth.is_file():
             return None
         with opened(truth) as file:
-            left = mvsec_odometry(truth, file)
+            left = mvsec_odometry(truth, file, self.faults.begin("poses"))
         return left if self.topic == "davis/left" else _poses_of_right_camera(left)
 
 

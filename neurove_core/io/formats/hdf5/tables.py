@@ -1,8 +1,8 @@
 """Readers of event and IMU tables in HDF5: they check every row, read bounded blocks, and start at any time."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -10,12 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.geometry.motion import Twists, twists
+from neurove_core.io.checked import Piece, as_recorded, cleaned, ordered
 from neurove_core.io.errors import BrokenRecording, UnknownSource
-from neurove_core.io.formats.hdf5.file import FAULTS, Column, opened, read_rows
+from neurove_core.io.faults import Faults, Reason, Tally
+from neurove_core.io.formats.hdf5.file import FAULTS, Column, check_ratio, opened, read_rows
+from neurove_core.io.order import Where
 from neurove_core.io.recording import CHUNK_EVENTS, EventsOnly, Imu, later
 from neurove_protocol.events import Events, Sensor
 
-_MAX_T_US = 1 << 62
+_MAX_T_US, _MAX_XY = 1 << 62, 1 << 40
 
 
 class EventTable(NamedTuple):
@@ -25,7 +28,6 @@ class EventTable(NamedTuple):
     columns: tuple[Any, ...]  # data sets, one row per event
     txyp: Callable[..., tuple[Column, Column, Column, Column]]  # rows of the columns -> t [us], x, y, p of any type
     offset_us: int = 0  # added to the times
-    note: str = ""  # on the sensor; ends the error text of an event outside it
 
     @property
     def n(self) -> int:
@@ -42,79 +44,81 @@ class EventTable(NamedTuple):
         return np.asarray(t.astype(np.float64) + self.offset_us)
 
 
-def event_chunks(path: Path, table: EventTable, sensor: Sensor, first: int = 0) -> Iterator[Events]:
-    """Events from row `first` on; see `Recording.chunks`.
+def event_pieces(path: Path, table: EventTable, tally: Tally, first: int = 0) -> Iterator[Piece]:
+    """Events from row `first` on, for `cleaned`. Rows that are not events, or cannot be read, are skipped."""
+    for at, rows in row_blocks(path, table.name, table.columns, tally, CHUNK_EVENTS, first):
+        with np.errstate(all="ignore"):  # nan, inf and overflow, which are counted
+            yield _decoded(table, rows, at, tally)
+
+
+def row_blocks(
+    path: Path, name: str, columns: Sequence[Any], tally: Tally, size: int, first: int = 0
+) -> Iterator[tuple[int, list[Column]]]:
+    """Blocks of up to `size` rows of all columns, each with its first row, from row `first` on.
+
+    A part that cannot be read is skipped up to the next stored chunk, and counted.
 
     Raises:
-        BrokenRecording: a row cannot be read, its event is outside the sensor, has an invalid polarity or is before the
-            previous event, or the columns differ in length. The error names the row.
+        BrokenRecording: the columns differ in length, or nothing can be read from a row on. It is raised at the end.
     """
-    n, not_before_us = table.n, None
-    for at in range(first, n, CHUNK_EVENTS):
-        rows, unread = read_rows(table.columns, at, min(at + CHUNK_EVENTS, n))
-        with np.errstate(all="ignore"):  # nan, inf and overflow, which are reported below
-            events, bad = valid_prefix(table, rows, sensor, not_before_us)
-        if events.n:
-            not_before_us = int(events.t[-1])
-            yield events
-        if bad or unread:
-            raise BrokenRecording(path, f"row {at + events.n} of {table.name}", bad or unread)
-    lengths = [int(column.shape[0]) for column in table.columns]
+    check_ratio(path, columns)
+    lengths = [int(column.shape[0]) for column in columns]
+    n, at = min(lengths), first
+    while at < n:
+        rows, unread = read_rows(columns, at, min(at + size, n))
+        if len(rows[0]):
+            yield at, rows
+        at += len(rows[0])
+        if unread:
+            chunked = [column.chunks[0] for column in columns if column.chunks]
+            after = min(((at // rows_each + 1) * rows_each for rows_each in chunked), default=n)
+            if after >= n:
+                raise BrokenRecording(path, f"row {at} of {name}", unread)
+            tally.add(Reason.DAMAGED, f"row {at} of {name}", unread, after - at)
+            at = after
     if max(lengths) > n:
-        raise BrokenRecording(path, f"row {n} of {table.name}", f"its columns have unequal lengths: {lengths}")
+        raise BrokenRecording(path, f"row {n} of {name}", f"its columns have unequal lengths: {lengths}")
 
 
-def valid_prefix(
-    table: EventTable, rows: list[Column], sensor: Sensor, not_before_us: int | None
-) -> tuple[Events, str]:
-    """The events before the first invalid one, and what is wrong with that one.
-
-    A polarity above 0 is ON; 0 or -1 is OFF.
-
-    Args:
-        table: the table of the rows.
-        rows: rows of its columns, of any number type.
-        sensor: the pixel array.
-        not_before_us: the time of the previous event, if there is one.
-    """
+def _decoded(table: EventTable, rows: list[Column], first: int, tally: Tally) -> Piece:
+    """The events of some rows, as recorded. A polarity above 0 is ON; 0 or -1 is OFF."""
     t, x, y, p = table.txyp(*rows)
-    in_time = (t > -_MAX_T_US) & (t < _MAX_T_US)
-    t_us = np.where(in_time, np.rint(t) if t.dtype.kind == "f" else t, 0).astype(np.int64) + table.offset_us
-    inside = (x >= 0) & (x < sensor.width) & (y >= 0) & (y < sensor.height)
-    before = np.concatenate([[t_us[0] if not_before_us is None else not_before_us], t_us[:-1]]) if t.size else t_us
-    good = in_time & inside & ((p == 0) | (p == 1) | (p == -1)) & (t_us >= before)
-    n = t.size if good.all() else int(good.argmin())
-    events = Events.from_columns(t_us[:n], x[:n], y[:n], p[:n] > 0)
-    if n == t.size:
-        return events, ""
-    if not in_time[n]:
-        return events, f"t={t[n]:g} is not a valid time"
-    if not inside[n]:
-        return events, f"an event at x={x[n]:g} y={y[n]:g} lies outside the sensor {sensor}{table.note}"
-    if t_us[n] < before[n]:
-        return events, f"t={t_us[n]} us comes after t={before[n]} us: time runs backwards"
-    return events, f"the polarity p={p[n]:g} is neither 1 nor 0 nor -1"
+    checks = (
+        (t, (t > -_MAX_T_US) & (t < _MAX_T_US), "t={:g} is not a valid time"),
+        (x, np.abs(x) < _MAX_XY, "x={:g} is not a column"),
+        (y, np.abs(y) < _MAX_XY, "y={:g} is not a row"),
+        (p, (p == 0) | (p == 1) | (p == -1), "the polarity p={:g} is neither 1 nor 0 nor -1"),
+    )
+    kept = np.ones(t.size, np.bool_)
+    for values, valid, why in checks:
+        bad = np.flatnonzero(kept & ~valid)
+        if bad.size:
+            tally.add(Reason.INVALID, f"row {first + bad[0]} of {table.name}", why.format(values[bad[0]]), bad.size)
+            kept &= valid
+    index = np.flatnonzero(kept)
+    t, x, y, p = (column if kept.all() else column[index] for column in (t, x, y, p))
+    t_us = (np.rint(t) if t.dtype.kind == "f" else t).astype(np.int64) + table.offset_us
+    x, y = (np.floor(column).astype(np.int64) if column.dtype.kind == "f" else column for column in (x, y))
+    return lambda i: f"row {first + int(index[i])} of {table.name}", as_recorded(t_us, x, y, p > 0)
 
 
-def seek_indexed(path: Path, table: EventTable, sensor: Sensor, index: Any, t_us: int) -> Iterator[Events]:
-    """Events from a time on, by an index of the first event at or after each millisecond of the table's own times.
+def row_indexed(table: EventTable, index: Any, t_us: int) -> int:
+    """A row before the events from a time on, by an index of the first event at or after each millisecond of the table.
 
-    An index that does not match the events is ignored: then all events are read.
+    It is 0 if the index does not match the events: then all events are read.
     """
     ms = min(max((t_us - table.offset_us) // 1000, 0), int(index.shape[0]) - 1)
-    first = 0
     try:
         entry = int(index[ms]) if ms >= 0 else 0
         around = table.times(max(entry - 1, 0), entry + 1)
-        if 0 < entry < table.n and around[0] < ms * 1000 + table.offset_us <= around[1]:
-            first = entry
+        found = 0 < entry < table.n and around[0] < ms * 1000 + table.offset_us <= around[1]
     except (*FAULTS, IndexError):
-        first = 0
-    yield from later(event_chunks(path, table, sensor, first), t_us)
+        return 0
+    return entry if found else 0
 
 
-def seek_ordered(path: Path, table: EventTable, sensor: Sensor, t_us: int) -> Iterator[Events]:
-    """Events from a time on, found by bisection of the times in the file."""
+def row_ordered(table: EventTable, t_us: int) -> int:
+    """A row before the events from a time on, by bisection of the times in the file; 0 if they cannot be read."""
     first, last = 0, table.n
     try:
         while first < last:
@@ -124,8 +128,8 @@ def seek_ordered(path: Path, table: EventTable, sensor: Sensor, t_us: int) -> It
             else:
                 last = middle
     except FAULTS:
-        first = 0
-    yield from later(event_chunks(path, table, sensor, first), t_us)
+        return 0
+    return first
 
 
 class ImuTable(NamedTuple):
@@ -138,32 +142,23 @@ class ImuTable(NamedTuple):
     may_miss: bool = False  # the table has nan for samples that were never taken; they are skipped
 
 
-def imu_blocks(path: Path, table: ImuTable) -> Iterator[Imu]:
-    """All samples, in the camera's optical frame.
-
-    Raises:
-        BrokenRecording: a row cannot be read, is not finite or is before the previous row; the error names the row.
-    """
-    n, not_before_us, step = min(int(column.shape[0]) for column in table.columns), -_MAX_T_US, CHUNK_EVENTS // 8
-    for at in range(0, n, step):
-        rows, unread = read_rows(table.columns, at, min(at + step, n))
+def imu_pieces(path: Path, table: ImuTable, tally: Tally) -> Iterator[tuple[Where, Imu]]:
+    """All samples that are finite, in the camera's optical frame; the others are counted."""
+    for at, rows in row_blocks(path, table.name, table.columns, tally, CHUNK_EVENTS // 8):
         with np.errstate(all="ignore"):
             t, accel, gyro = table.decode(*rows)
             known = np.asarray(np.isfinite(accel).all(axis=1) & np.isfinite(gyro).all(axis=1))
-            index = np.flatnonzero(known) if table.may_miss else np.arange(t.size)
-            t_us = np.where((t > -_MAX_T_US) & (t < _MAX_T_US), t, -_MAX_T_US)[index]
-            t_us = (np.rint(t_us) if t.dtype.kind == "f" else t_us).astype(np.int64)
-        good = known[index] & (t_us > -_MAX_T_US) & (np.diff(t_us, prepend=not_before_us) >= 0)
-        valid = index.size if good.all() else int(good.argmin())
-        keep = index[:valid]
-        if valid:
-            not_before_us = int(t_us[valid - 1])
-            yield Imu(t_us[:valid], accel[keep] @ table.rotation.T, gyro[keep] @ table.rotation.T)
-        if valid < index.size:
-            why = "the sample is not finite, or is before the previous sample"
-            raise BrokenRecording(path, f"row {at + index[valid]} of {table.name}", why)
-        if unread:
-            raise BrokenRecording(path, f"row {at + t.size} of {table.name}", unread)
+            in_time = (t > -_MAX_T_US) & (t < _MAX_T_US)
+        bad = np.flatnonzero(~in_time if table.may_miss else ~(known & in_time))
+        if bad.size:
+            tally.add(Reason.INVALID, f"row {at + bad[0]} of {table.name}", "the sample is not finite", bad.size)
+        keep = np.flatnonzero(known & in_time)
+        t_us = (np.rint(t[keep]) if t.dtype.kind == "f" else t[keep]).astype(np.int64)
+        yield _row_of(table.name, at, keep), Imu(t_us, accel[keep] @ table.rotation.T, gyro[keep] @ table.rotation.T)
+
+
+def _row_of(name: str, first: int, index: NDArray[np.intp]) -> Where:
+    return lambda i: f"row {first + int(index[i])} of {name}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,6 +171,7 @@ class TableRecording(EventsOnly):
     topic: str  # the group of the file that holds the stream
     held: tuple[str, ...]  # the value of `streams`
     endless: bool = False
+    faults: Faults = field(default_factory=Faults, compare=False, repr=False)
 
     @property
     def streams(self) -> tuple[str, ...]:
@@ -191,29 +187,42 @@ class TableRecording(EventsOnly):
         return None
 
     def chunks(self) -> Iterator[Events]:
-        """All events from the beginning; see `Recording`.
-
-        Raises:
-            BrokenRecording: a row cannot be read or is not an event of this sensor; the error names the row.
-        """
-        with opened(self.path) as file:
-            yield from event_chunks(self.path, self.event_table(file), self.sensor)
+        """All events from the beginning; see `Recording`."""
+        return self._cleaned(None)
 
     def since(self, t_us: int) -> Iterator[Events]:
-        """As `chunks`, from this time on, found by bisection of the times; earlier events are not read."""
+        """As `chunks`, from this time on; see `first_row`. Earlier events are not read."""
+        return later(self._cleaned(t_us), t_us)
+
+    @property
+    def sensor_note(self) -> str:
+        """What to add to the text for an event outside the sensor."""
+        return ""
+
+    def first_row(self, file: Any, table: EventTable, t_us: int) -> int:
+        """A row of the opened file before the events from a time on, found by bisection of the times."""
+        return row_ordered(table, t_us)
+
+    def _cleaned(self, t_us: int | None) -> Iterator[Events]:
+        tally = self.faults.begin("events")
+        return cleaned(self._pieces(t_us, tally), self.sensor, tally, self.sensor_note)
+
+    def _pieces(self, t_us: int | None, tally: Tally) -> Iterator[Piece]:
         with opened(self.path) as file:
-            yield from seek_ordered(self.path, self.event_table(file), self.sensor, t_us)
+            table = self.event_table(file)
+            first = 0 if t_us is None else self.first_row(file, table, t_us)
+            yield from event_pieces(self.path, table, tally, first)
 
     def imu(self) -> Iterator[Imu]:
-        """All samples, in the camera's optical frame; see `Recording`.
+        """All samples, in the camera's optical frame; see `Recording`."""
+        tally = self.faults.begin("imu")
+        return ordered(self._imu_pieces(tally), tally)
 
-        Raises:
-            BrokenRecording: a row cannot be read, is not finite or is before the previous row.
-        """
+    def _imu_pieces(self, tally: Tally) -> Iterator[tuple[Where, Imu]]:
         with opened(self.path) as file:
             table = self.imu_table(file)
             if table is not None:
-                yield from imu_blocks(self.path, table)
+                yield from imu_pieces(self.path, table, tally)
 
     def twists(self) -> Twists | None:
         """Twists from the poses, by `geometry.twists` with its filter; None without poses."""

@@ -1,6 +1,6 @@
 """Layout of NeuroVE recordings: MCAP files with the profile `neurove`. Every MCAP tool can list and split them.
 
-A stream has up to seven channels with the name `<stream>/<kind>` and the message encoding `msgpack`:
+A stream has up to eight channels with the name `<stream>/<kind>` and the message encoding `msgpack`:
 
 | kind | schema | content of a message |
 | --- | --- | --- |
@@ -11,6 +11,7 @@ A stream has up to seven channels with the name `<stream>/<kind>` and the messag
 | poses | neurove.poses.1 | `t`, `position_m`, `orientation` |
 | twists | neurove.twists.1 | `t`, `twist` |
 | frames | neurove.frames.1 | one image: `t_us`, `height`, `width`, `channels`, `image` (bytes, row-major) |
+| velocity | neurove.velocity.1 | a TwistEstimate; files of `neurove estimate` have this channel alone |
 
 Columns have the names and units of the types in `neurove_core.io.recording` and `neurove_core.geometry.motion`. A table
 is a msgpack map of `v` (1), `n` (number of rows) and the columns. A column is bytes: little-endian numbers, row-major.
@@ -27,7 +28,7 @@ import numpy as np
 
 from neurove_core.geometry.motion import Poses, Twists
 from neurove_core.io.recording import Frame, Imu, Triggers
-from neurove_protocol import camera, events
+from neurove_protocol import camera, events, velocity
 
 PROFILE: Final = "neurove"
 VERSION: Final = 1
@@ -63,12 +64,13 @@ class BadColumns(Exception):
 
 
 def schema_of(kind: str) -> tuple[str, str]:
-    """Return schema name and message encoding of a kind. For `events` and `camera` they are those of the wire.
+    """Return schema name and message encoding of a kind; those of the wire for `events`, `camera` and `velocity`.
 
     >>> schema_of("events")
     ('neurove.events.1', 'msgpack')
     """
-    wire = {"events": events.SCHEMA, "camera": camera.SCHEMA}.get(kind, f"application/msgpack;neurove.{kind}.{VERSION}")
+    schemas = {"events": events.SCHEMA, "camera": camera.SCHEMA, "velocity": velocity.SCHEMA}
+    wire = schemas.get(kind, f"application/msgpack;neurove.{kind}.{VERSION}")
     encoding, _, name = wire.partition(";")
     return name, encoding.removeprefix("application/")
 

@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple, Self, TypeVar
 import numpy as np
 
 from neurove_core.geometry.motion import Poses, Twists
-from neurove_core.io.checked import cleaned, ordered, unread
+from neurove_core.io.checked import cleaned, ordered, until_broken
 from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.faults import Faults, Reason, Tally
 from neurove_core.io.format import Format
@@ -170,11 +170,7 @@ class McapRecording(EventsOnly):
     def frames(self) -> Iterator[Frame]:
         """Yield the images of the converted recording."""
         tally = self.faults.begin("frames")
-        try:
-            for _, frame in self._messages("frames", layout.unpack_frame, tally):
-                yield frame
-        except BrokenRecording as error:
-            unread(tally, error)
+        return (frame for _, frame in until_broken(self._messages("frames", layout.unpack_frame, tally), tally))
 
     def poses(self) -> Poses | None:
         """Return the poses of the converted recording, or None."""
