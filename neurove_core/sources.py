@@ -127,7 +127,7 @@ def _plain(path: Path) -> Plain:
             suffix = suffix or (".txt" if is_text(head) else "")
             if not suffix and not compression_of(head) and not any(one.recognises(head) for one in _table().formats):
                 why = "its first bytes are of no known format" if head else "it gives nothing"
-                raise UnknownSource(path, f"{why}; a pipe needs a format that its content tells", supported())
+                raise UnknownSource(path, f"{why}; a pipe needs content that identifies its format", supported())
             path = piped(path, stream, head, path.name.removesuffix(path.suffix) + (suffix or path.suffix))
     if not path.is_file():
         raise UnknownSource(path, "it is no plain file, pipe or folder")
