@@ -24,8 +24,8 @@ class Format:
     """A format of recordings in files or folders.
 
     A module of a format ends in `FORMAT = Format(...)`. Several formats may share a suffix; the first one that accepts
-    the path opens it. Content has priority over the suffix: a format whose signature matches the first bytes of a file opens it,
-    whatever the name of the file is.
+    the path opens it. Content has priority over the suffix: a format whose signature matches the first bytes of a file
+    opens it, whatever the name of the file is.
     """
 
     about: str  # for people: what to give and what it is, such as "FILE.aedat4 (DV)"
