@@ -53,7 +53,9 @@ class DoubtfulUnit(RecordingError):
     code = "doubtful_time_unit"
 
     def __init__(self, path: Path, unit: str, why: str, guess: str | None) -> None:
-        cure = f"probably they are in {guess}: give --time-unit {guess}" if guess else "give --time-unit s, ms, us or ns"
+        cure = (
+            f"probably they are in {guess}: give --time-unit {guess}" if guess else "give --time-unit s, ms, us or ns"
+        )
         super().__init__(
             f"{path}: its times are implausible in {unit}, the unit of its layout: {why}; {cure} "
             f"(--time-unit {unit} accepts them as they are)",
@@ -80,7 +82,9 @@ def with_unit(recording: Recording, unit: str | None) -> Recording:
     if unit not in UNITS:
         raise InvalidField("recording", "time_unit", unit, f"one of {', '.join(UNITS)}")
     if not isinstance(recording, Timed):
-        raise InvalidField("recording", "time_unit", unit, f"the format of {recording.name} fixes the unit of its times")
+        raise InvalidField(
+            "recording", "time_unit", unit, f"the format of {recording.name} fixes the unit of its times"
+        )
     return recording.in_unit(unit)
 
 
@@ -113,6 +117,9 @@ def doubt(sample: TimeSample, unit: str) -> str:
 def guess(sample: TimeSample) -> str | None:
     """The unit in which the times are the most plausible, or None."""
     t = sample.times.astype(np.float64)
+    t = t[np.isfinite(t)]
+    if not t.size:
+        return None
     fractions = bool((t != np.rint(t)).any())
     plausible = [
         unit
