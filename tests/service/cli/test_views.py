@@ -7,7 +7,8 @@ import pytest
 from rich.console import Console
 
 from neurove_protocol.control import HealthReply, Losses, ModelInfo, ModelsReply
-from neurove_service.cli.views import Board, health_table, models_table
+from neurove_service.cli.board import Board
+from neurove_service.cli.views import health_table, models_table
 from neurove_service.node.health import stream_status
 from neurove_service.streams.intake import Arrival
 from neurove_service.streams.stream import Stream
