@@ -1,5 +1,6 @@
 """Composition root of the node: build, start, stop."""
 
+import functools
 import threading
 from collections.abc import Callable
 
@@ -29,6 +30,7 @@ from neurove_service.transport import EndpointError, OnTimedSample, Report, Tran
 log = logs.get(__name__)
 
 _ASK_CAMERA_S = 1.0
+_KNOWN_KEYS = 2048
 _CHUNK_S = 10.0
 _ROUTER_PATIENCE_S = 365 * 86_400.0
 
@@ -151,7 +153,7 @@ class Service:
 
     def _route(self, registry: StreamRegistry, put: Callable[[str, bytes, int, int | None], None]) -> OnTimedSample:
         """A subscriber's callback: queue each message in the worker of its stream."""
-        stream_of = self._keys.stream_of
+        stream_of = functools.lru_cache(_KNOWN_KEYS)(self._keys.stream_of)
 
         def on_sample(key: str, payload: bytes, received_ns: int, sent_us: int | None) -> None:
             try:
