@@ -3,12 +3,13 @@
 What is older than two windows is grey, and says since when: a table never shows an old value as a present one.
 """
 
+import itertools
 import statistics
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.panel import Panel
@@ -65,6 +66,11 @@ class Received:
     last_at: float = 0.0  # monotonic clock [s]
     last_wall: float = 0.0  # the same on the wall clock, to say since when
 
+    def copied(self) -> "Received":
+        """A copy that does not change while it is drawn, with the newest latencies only."""
+        newest_ms = self.latencies_ms[-_RATE_ESTIMATES:]
+        return replace(self, arrivals=self.arrivals.copy(), twists=self.twists.copy(), latencies_ms=newest_ms)
+
     @property
     def rate_hz(self) -> float:
         """Estimates per second, over the newest estimates."""
@@ -82,8 +88,7 @@ class Received:
         """Time between two estimates [s]: the length of a window, or longer where a source is played slowly."""
         if self.last is None:
             return 0.0
-        times = list(self.arrivals)
-        steps = [after - before for before, after in zip(times[:-1], times[1:], strict=True)]
+        steps = [after - before for before, after in itertools.pairwise(self.arrivals)]
         window_s = (self.last.end_us - self.last.start_us) / 1e6
         return max(window_s, statistics.median(steps) if steps else 0.0)
 
@@ -155,10 +160,11 @@ class Board:
             return self._streams.get(stream, Received())
 
     def streams(self) -> dict[str, Received]:
-        """What was received of every stream: live ones first, then by name."""
+        """Copies of what was received of every stream: live ones first, then by name."""
         now = self._clock()
         with self._lock:
-            return dict(sorted(self._streams.items(), key=lambda item: (not item[1].is_live(now), item[0])))
+            found = {name: one.copied() for name, one in self._streams.items()}
+        return dict(sorted(found.items(), key=lambda item: (not item[1].is_live(now), item[0])))
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         streams, now = self.streams(), self._clock()

@@ -77,4 +77,3 @@ class Notices:
             if silent_s is not None and silent_s > _LEAST_SILENCE_S and name not in self._silent:
                 self._silent.add(name)
                 yield f"{name}: {since(received, silent_s)}"
-

@@ -18,7 +18,6 @@ from neurove_service.cli.arguments import (
     client_config,
     command,
     flags,
-    seconds,
     subcommand,
     tell_faults,
 )
