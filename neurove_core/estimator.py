@@ -166,7 +166,7 @@ class Estimator:
     def follow(self, complete: Iterable[Window], state: StreamState) -> tuple[list[WindowEstimate], StreamState]:
         """The second half of push: estimate windows that this model, or one with the same windows, has made.
 
-        Where a window does not begin at the end of the one before, the network state is reset.
+        Where a window does not begin at the end of the one before, the network state is reset, unless it is bridged.
         """
         stream = _Progress(state, tuple(complete))
         self._answer([stream])
@@ -187,15 +187,15 @@ class Estimator:
         for turn in range(max((len(stream.windows) for stream in streams), default=0)):
             due = [stream for stream in streams if turn < len(stream.windows)]
             for stream in due:
-                self._reset_after_gap(stream, stream.windows[turn].start_us)
+                self._reset_after_gap(stream, stream.windows[turn])
             counts = [stream.windows[turn].counts for stream in due]
             steps = self._runner.run(counts, [stream.state.network for stream in due])
             for stream, (twists, network) in zip(due, steps, strict=True):
                 self._take(stream, stream.windows[turn], twists * self._scale + self._offset, network)
 
-    def _reset_after_gap(self, stream: _Progress, start_us: int) -> None:
-        """Reset the network state where the window at `start_us` does not follow the one before it."""
-        if stream.state.end_us not in (None, start_us):
+    def _reset_after_gap(self, stream: _Progress, window: Window) -> None:
+        """Reset the network state where a window does not follow the one before it."""
+        if stream.state.end_us not in (None, window.start_us) and not window.bridged:
             stream.state = stream.state._replace(network=self.network.initial_state(), age=0)
 
     def _take(self, stream: _Progress, window: Window, twists: NDArray[np.float64], network: State) -> None:

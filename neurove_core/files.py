@@ -1,9 +1,17 @@
-"""Atomic writes: a file has its new content or its old one, however the process ends."""
+"""Files: atomic writes, which leave the new content or the old one; TOML; the temporary folder of libraries.
+
+A writer of the command line inherits this from `atomic_path`, whatever library writes: one OSError that names the file
+that was asked for, and nothing left.
+"""
 
 import os
+import re
+import tempfile
+import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, Final
 
 
 @contextmanager
@@ -13,16 +21,73 @@ def atomic_path(path: Path) -> Iterator[Path]:
     Until then the file keeps its old content. Several processes may write the same file.
 
     Raises:
-        OSError: the file cannot be written; no temporary file is left.
+        OSError: the file cannot be written, as `write_errors`; no temporary file is left.
     """
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
     try:
-        yield part
-        sync(part)
-        part.replace(path)
-        sync(path.parent)
+        with write_errors(path, part):
+            yield part
+            sync(part)
+            part.replace(path)
+            sync(path.parent)
     finally:
         part.unlink(missing_ok=True)  # it exists only where writing failed
+
+
+@contextmanager
+def write_errors(path: Path, part: Path) -> Iterator[None]:
+    """Let an error of writing name the file that was asked for; the error of a library becomes an OSError.
+
+    HDF5 reports the error of the system only in its text, as an OSError or, where it closes the file, a RuntimeError.
+
+    Args:
+        path: the file that was asked for.
+        part: the file that is written.
+
+    Raises:
+        OSError: with the number of the system's error, its text and `path`.
+    """
+    try:
+        yield
+    except OSError as error:
+        number = error.errno if error.errno is not None else _errno_in(str(error))
+        if number is None or (error.filename is not None and os.fspath(error.filename) not in (str(path), str(part))):
+            raise
+        raise OSError(number, os.strerror(number), str(path)) from None
+    except RuntimeError as error:
+        number = _errno_in(str(error))
+        if number is None:
+            raise
+        raise OSError(number, os.strerror(number), str(path)) from None
+
+
+def _errno_in(text: str) -> int | None:
+    found = _ERRNO.search(text)
+    return int(found[1]) if found else None
+
+
+_ERRNO: Final = re.compile(r"\berrno = (\d+)")
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The content of a TOML file, which may begin with a byte order mark.
+
+    Raises:
+        OSError: the file cannot be read. ValueError: it is not UTF-8 or not TOML.
+    """
+    return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
+
+
+def allow_no_temporary_folder() -> None:
+    """Let torch run where no temporary folder can be written, as in a read-only image.
+
+    torch asks for a folder for compiled code when it is first used, although nothing is stored there. Without one it
+    fails, so it gets one that exists.
+    """
+    try:
+        tempfile.gettempdir()
+    except OSError:
+        os.environ.setdefault("TORCHINDUCTOR_CACHE_DIR", os.path.sep)
 
 
 def write_atomically(path: Path, data: bytes) -> None:

@@ -4,24 +4,37 @@ An unknown key or a wrong value stops the start with one sentence that names the
 source of the value.
 """
 
+import logging
 import os
+import re
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BeforeValidator, Field, ValidationError, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 from pydantic_settings import (
     BaseSettings,
     EnvSettingsSource,
     NoDecode,
     PydanticBaseSettingsSource,
     SettingsConfigDict,
-    TomlConfigSettingsSource,
 )
 
+from neurove_core.files import read_toml
 from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.events import PacketLimits
 from neurove_protocol.fields import WrongField
 from neurove_protocol.keys import DEFAULT_PREFIX, Keys, check_name
+from neurove_service.endpoints import check_endpoint
+
+log = logging.getLogger(__name__)
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 ENVIRONMENT = "NEUROVE_"
@@ -37,8 +50,21 @@ def _listed(value: object) -> object:
     return [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
 
 
-Endpoints = Annotated[tuple[str, ...], NoDecode, BeforeValidator(_listed)]
-Paths = Annotated[tuple[Path, ...], NoDecode, BeforeValidator(_listed)]
+def _given(value: object) -> object:
+    """A path, or several, that is not empty: an empty one would be the current folder."""
+    if isinstance(value, str) and not value.strip():
+        raise ValueError("must not be empty; the current folder is '.'")
+    return value
+
+
+Endpoints = Annotated[tuple[Annotated[str, AfterValidator(check_endpoint)], ...], NoDecode, BeforeValidator(_listed)]
+GivenPath = Annotated[Path, BeforeValidator(_given)]
+Paths = Annotated[tuple[GivenPath, ...], NoDecode, BeforeValidator(lambda value: _listed(_given(value)))]
+
+_OF_KUBERNETES = re.compile(
+    r"(\w+_)?(SERVICE_HOST|SERVICE_PORT(_\w+)?|PORT(_\d+_(TCP|UDP|SCTP)(_(PROTO|PORT|ADDR))?)?)"
+)
+"""What follows NEUROVE_ in the variables that Kubernetes sets in every pod for a service whose name begins so."""
 
 
 class _Settings(BaseSettings):
@@ -60,7 +86,7 @@ class _Settings(BaseSettings):
         DEFAULT_PREFIX, description="Key prefix of the deployment."
     )
     log_level: Literal["debug", "info", "warning", "error"] = Field("info", description="Least severe line logged.")
-    zenoh_config: Path | None = Field(
+    zenoh_config: GivenPath | None = Field(
         None, description="Zenoh configuration (JSON5) with further settings, such as TLS."
     )
 
@@ -90,8 +116,8 @@ class ServiceConfig(_Settings):
         (), validate_default=True, description="Endpoints to connect to, such as the one of a router."
     )
     model: str = Field("default", min_length=1, description="Active model at the start: its name, or a bundle file.")
-    models_dir: Path | None = Field(None, description="Folder of bundles that may be activated.")
-    state_dir: Path | None = Field(
+    models_dir: GivenPath | None = Field(None, description="Folder of bundles that may be activated.")
+    state_dir: GivenPath | None = Field(
         None, description="Folder of pushed models and of the state that survives a restart; default: models_dir."
     )
     trusted_keys: Paths = Field(
@@ -147,8 +173,13 @@ class ServiceConfig(_Settings):
     @field_validator("connect")
     @classmethod
     def _a_client_connects(cls, connect: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
-        if info.data.get("mode") == "client" and not connect:
+        mode, listen = info.data.get("mode"), info.data.get("listen")
+        if mode == "client" and not connect:
             raise ValueError("client mode needs an endpoint to connect to")
+        if not connect and listen == () and info.data.get("zenoh_config") is None:
+            raise ValueError(
+                f"{mode} mode needs an endpoint to listen on or to connect to: nothing could reach this node"
+            )
         return connect
 
     @property
@@ -177,7 +208,7 @@ def load(kind: type[SettingsT], flags: dict[str, Any], file: Path | None = None)
         ConfigError: for the first wrong setting.
     """
     layers = [
-        (f"file {file}" if file else "file", _from_file(kind, file) if file else {}),
+        (f"file {file}" if file else "file", _from_file(file) if file else {}),
         ("environment", _from_environment(kind)),
         ("flag", {name: value for name, value in flags.items() if value is not None}),
     ]
@@ -203,10 +234,9 @@ def _wrong(field: str, value: object, why: str, where: str, kind: type[_Settings
     return ConfigError(f"config: {field}={value!r} (from {where}): {why}", field=field, value=repr(value), bound=why)
 
 
-def _from_file(kind: type[_Settings], file: Path) -> dict[str, Any]:
+def _from_file(file: Path) -> dict[str, Any]:
     try:
-        file.read_bytes()  # the source below ignores a missing file
-        return TomlConfigSettingsSource(kind, file)()
+        return read_toml(file)
     except OSError as error:
         raise ConfigError(f"config file {file}: {error.strerror}") from None
     except ValueError as error:  # not TOML, not UTF-8
@@ -214,9 +244,16 @@ def _from_file(kind: type[_Settings], file: Path) -> dict[str, Any]:
 
 
 def _from_environment(kind: type[_Settings]) -> dict[str, Any]:
+    """The settings in the environment; an empty variable counts as unset."""
     known = {*ServiceConfig.model_fields, *ClientConfig.model_fields}
+    foreign = []
     for name, value in os.environ.items():
-        field = name.removeprefix(ENVIRONMENT).lower()
-        if name.startswith(ENVIRONMENT) and field not in known:
-            raise _wrong(field, value, "", "environment", kind)
-    return EnvSettingsSource(kind)()
+        rest = name.removeprefix(ENVIRONMENT)
+        if not name.startswith(ENVIRONMENT) or rest.lower() in known or not value.strip():
+            continue
+        if not _OF_KUBERNETES.fullmatch(rest):
+            raise _wrong(rest.lower(), value, "", "environment", kind)
+        foreign.append(name)
+    if foreign:
+        log.warning("ignored, set by Kubernetes for a service of this name: %s", ", ".join(sorted(foreign)))
+    return {name: value for name, value in EnvSettingsSource(kind)().items() if str(value).strip()}

@@ -5,18 +5,57 @@ import os
 import signal
 import socket
 import threading
+from collections.abc import Callable
+from types import FrameType
+from typing import Final
 
 _PARENT_CHECK_S = 0.5
+_ENDING: Final = (signal.SIGTERM, signal.SIGHUP)
 
 
-def stop_on_signals(*, with_parent: bool = False) -> threading.Event:
-    """An event that SIGINT and SIGTERM set; with `with_parent` also the death of the parent process.
+class Terminated(KeyboardInterrupt):
+    """A signal ends the command, which cleans up as after Ctrl-C."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        super().__init__(signal.Signals(number).name)
+
+
+def interrupt_on_signals() -> None:
+    """Let SIGTERM and SIGHUP end a command as Ctrl-C does, so that each `finally` runs.
+
+    A second one is ignored, because the cleanup is under way. SIGHUP stays ignored where it was, as under nohup. Does
+    nothing outside the main thread, which alone can set handlers.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return
+
+    def end(number: int, _: FrameType | None) -> None:
+        for one in _ENDING:
+            signal.signal(one, signal.SIG_IGN)
+        raise Terminated(number)
+
+    for one in _ENDING:
+        if signal.getsignal(one) is not signal.SIG_IGN:
+            signal.signal(one, end)
+
+
+def stop_on_signals(*, with_parent: bool = False, on_hangup: Callable[[], None] | None = None) -> threading.Event:
+    """An event that SIGINT, SIGTERM and SIGHUP set; with `with_parent` also the death of the parent process.
 
     Call it on the main thread.
+
+    Args:
+        with_parent: set the event also when the parent process ends.
+        on_hangup: what SIGHUP does instead, on a thread of its own; several calls do not overlap.
     """
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
+    if on_hangup is not None:
+        _call_on_hangup(on_hangup)
+    elif signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
+        signal.signal(signal.SIGHUP, lambda *_: stop.set())
     if with_parent:
         parent = os.getppid()
 
@@ -27,6 +66,17 @@ def stop_on_signals(*, with_parent: bool = False) -> threading.Event:
 
         threading.Thread(target=watch, name="parent watch", daemon=True).start()
     return stop
+
+
+def _call_on_hangup(on_hangup: Callable[[], None]) -> None:
+    one_at_once = threading.Lock()
+
+    def call() -> None:
+        with one_at_once:
+            on_hangup()
+
+    # a handler interrupts any line of the main thread, such as one that holds a lock of the log
+    signal.signal(signal.SIGHUP, lambda *_: threading.Thread(target=call, name="hangup", daemon=True).start())
 
 
 def notify(state: str) -> None:

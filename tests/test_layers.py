@@ -35,7 +35,7 @@ MAY_IMPORT = {
     "neurove_core.self_test": "config models estimator",
     "neurove_core.io": "extras figures geometry",
     "neurove_core.io.formats": "compiled files extras geometry io",
-    "neurove_core.sim": "config figures geometry io io.formats",
+    "neurove_core.sim": "compiled config figures geometry io io.formats",
     "neurove_core.sources": "io io.formats sim",
     "neurove_core.evaluation": "compiled figures geometry networks models estimator io",
     "neurove_core.training": (
@@ -50,10 +50,12 @@ MAY_IMPORT = {
     ),
     "neurove_core": "spiking models estimator sources",
     # neurove_service
-    "neurove_service.logs": "",
+    "neurove_service.output": "",
+    "neurove_service.logs": "output",
     "neurove_service.lifecycle": "",
     "neurove_service.latency": "",
-    "neurove_service.config": "",
+    "neurove_service.endpoints": "",
+    "neurove_service.config": "core:files endpoints",
     "neurove_service.guard": "logs",
     "neurove_service.transport": "logs guard",
     "neurove_service.streams": "core:ingest core:networks core:models core:estimator logs guard",

@@ -24,6 +24,7 @@ class Window(NamedTuple):
     counts: NDArray[np.uint8]  # (2n, H, W), saturating at 255: channel 2i is OFF, 2i + 1 is ON of bin i
     events: int  # of the whole sensor
     outside: int  # those whose pixel has no cell of the grid
+    bridged: bool = False  # windows before it were left out on purpose: the network state goes on over them
 
 
 class WindowsState(NamedTuple):
@@ -34,6 +35,7 @@ class WindowsState(NamedTuple):
     counts: NDArray[np.uint8] | None = None  # None while the open window is empty
     events: int = 0
     outside: int = 0
+    bridged: bool = False  # as in Window
 
 
 class Pushed(NamedTuple):
@@ -67,6 +69,9 @@ def push(
         the windows that end at or before the newest known time, oldest first, and the next state.
     """
     duration = config.duration_us
+    after = _inside(events, horizon_us, state, lut, config)
+    if after is not None:
+        return Pushed([], after, 0, 0)
     first_us, newest_us = horizon_us, horizon_us
     if events.n:
         first_us, newest_us = min(first_us, events.first_us), max(newest_us, events.last_us)
@@ -95,12 +100,28 @@ def push(
     return Pushed(windows, open_window.state(newest_us), late, skipped)
 
 
+def _inside(
+    events: Events | WireEvents, horizon_us: int, state: WindowsState, lut: NDArray[np.int32], config: WindowConfig
+) -> WindowsState | None:
+    """The state after events that all belong to the open window, as most small packets do; None for other events."""
+    start_us, counts = state.start_us, state.counts
+    if counts is None or start_us is None or not events.n:
+        return None
+    newest_us = max(events.last_us, horizon_us)
+    if newest_us >= start_us + config.duration_us or events.first_us < start_us:
+        return None
+    where = start_us, config.bin_us, lut, counts
+    outside = count_wire(events, *where) if isinstance(events, WireEvents) else count_events(events, *where)
+    horizon_us = max(newest_us, state.horizon_us)
+    return WindowsState(start_us, horizon_us, counts, state.events + events.n, state.outside + outside, state.bridged)
+
+
 class _Open:
     """The window into which events are counted."""
 
     def __init__(self, start_us: int, state: WindowsState, config: WindowConfig, canonical: CanonicalConfig) -> None:
         self.start_us, self.counts, self.events, self.outside = start_us, state.counts, state.events, state.outside
-        self._bin_us = config.bin_us
+        self._bridged, self._bin_us = state.bridged, config.bin_us
         self._shape = (2 * config.bins, canonical.height, canonical.width)
 
     def add(self, events: Events | WireEvents, lut: NDArray[np.int32]) -> None:
@@ -116,7 +137,7 @@ class _Open:
         return self.counts
 
     def close(self) -> Window:
-        return Window(self.start_us, self._grid(), self.events, self.outside)
+        return Window(self.start_us, self._grid(), self.events, self.outside, self._bridged)
 
     def state(self, horizon_us: int) -> WindowsState:
-        return WindowsState(self.start_us, horizon_us, self.counts, self.events, self.outside)
+        return WindowsState(self.start_us, horizon_us, self.counts, self.events, self.outside, self._bridged)

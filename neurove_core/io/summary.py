@@ -1,5 +1,6 @@
 """Statistics of a recording. Each stream is read once, with bounded memory."""
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from typing import Any, Final, NamedTuple, TypeVar
@@ -104,11 +105,14 @@ def survey(recording: Recording, seconds: float | None = None) -> Survey:
 
     Args:
         recording: the recording to read.
-        seconds: maximum duration of the events [s], from the first event. An endless recording needs it.
+        seconds: maximum duration of the events [s], from the first event; None or infinity: all. An endless recording
+            needs it.
 
     Raises:
         InvalidField: the recording is endless and `seconds` is not given, or `seconds` is not above 0.
     """
+    if seconds == math.inf:
+        seconds = None
     if seconds is None and recording.endless:
         raise InvalidField("info", "seconds", None, f"{recording.name} never ends: give the number of seconds")
     if seconds is not None and not seconds > 0:  # this form also refuses nan

@@ -18,7 +18,7 @@ from safetensors import SafetensorError
 from torch import Tensor, nn
 
 from neurove_core.config import Config, ModelConfig
-from neurove_core.files import write_atomically
+from neurove_core.files import allow_no_temporary_folder, write_atomically
 from neurove_core.models import golden
 from neurove_core.models.golden import Golden
 from neurove_core.models.metadata import BundleLimits, Metadata
@@ -186,6 +186,7 @@ def from_bytes(data: bytes, name: str) -> Bundle:
     Raises:
         BadModel: as `load`.
     """
+    allow_no_temporary_folder()
     header = read_header(data, name)
     try:
         tensors = safetensors.torch.load(data)

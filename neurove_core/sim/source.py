@@ -88,8 +88,8 @@ def _number(url: str, query: dict[str, str], field: str, default: float) -> floa
         value = float(query.get(field, default))
     except ValueError:
         value = math.nan
-    if math.isnan(value):
-        raise InvalidField(url, field, query[field], "a number is expected")
+    if math.isnan(value) or (math.isinf(value) and field != "seconds"):
+        raise InvalidField(url, field, query[field], "a finite number is expected")
     return value
 
 

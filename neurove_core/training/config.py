@@ -1,12 +1,12 @@
 """Configuration of a training run: the model, the training sequences, and the recipe."""
 
-import tomllib
 from pathlib import Path
 from typing import Annotated, Final, Self
 
 from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
 from neurove_core.config import Config, ModelConfig
+from neurove_core.files import read_toml
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.fields import WrongField
 
@@ -211,12 +211,12 @@ def load(source: str) -> TrainingConfig:
     if not path.suffix and (CONFIGS / f"{source}.toml").is_file():
         path = CONFIGS / f"{source}.toml"
     try:
-        return TrainingConfig.model_validate(tomllib.loads(path.read_text()))
+        return TrainingConfig.model_validate(read_toml(path))
     except OSError as error:
         known = ", ".join(sorted(found.stem for found in CONFIGS.glob("*.toml")))
         why = f"{error.strerror or error}; expected a TOML file or one of: {known}"
         raise InvalidField("training", "config", source, why) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise InvalidField("training", "config", source, f"not TOML: {error}") from None
     except ValidationError as error:
         wrong = WrongField.of(error)

@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from neurove_protocol import Sensor
 from neurove_protocol.errors import InvalidField, NeuroVEError
@@ -15,6 +15,9 @@ from neurove_service.config import ClientConfig, ServiceConfig, load
 
 if TYPE_CHECKING:
     from neurove_core.io import Recording
+
+MAX_SECONDS: Final = 1e9
+"""Longest time of a flag [s]: 31 years, which clocks and timers can hold."""
 
 Run = Callable[[argparse.Namespace], int]
 """Runs one command and returns its exit code."""
@@ -30,7 +33,7 @@ def command(parser: argparse.ArgumentParser, run: Run, *, as_json: bool = True) 
 
 def subcommand(commands: Any, name: str, run: Run, *, as_json: bool = True) -> argparse.ArgumentParser:
     """Add a command to a group; the first line of its function's docstring is its help."""
-    about = (run.__doc__ or "").splitlines()[0]
+    about = (run.__doc__ or "").partition("\n")[0]  # empty under PYTHONOPTIMIZE=2
     return command(commands.add_parser(name, help=about, description=about), run, as_json=as_json)
 
 
@@ -54,7 +57,7 @@ def add_playback_flags(parser: argparse.ArgumentParser, seconds_help: str) -> No
     parser.add_argument(
         "--speed", type=speed, default=1.0, metavar="R", help="sensor seconds per second, or max; default 1.0"
     )
-    parser.add_argument("--seconds", type=seconds, metavar="S", help=seconds_help)
+    parser.add_argument("--seconds", type=duration, metavar="S", help=seconds_help)
 
 
 def add_client_flags(parser: argparse.ArgumentParser) -> None:
@@ -86,6 +89,7 @@ def _default_text(value: object) -> str:
 
 def client_config(args: argparse.Namespace) -> ClientConfig:
     """The settings of a client; configures its log."""
+    logs.configure("warning")  # what the settings say while they are read
     config, _ = load(ClientConfig, flags(args, ClientConfig))
     logs.configure(config.log_level if "NEUROVE_LOG_LEVEL" in os.environ else "warning")
     return config
@@ -128,14 +132,19 @@ def speed(text: str) -> float:
 
 
 def seconds(text: str) -> float:
-    """A number of seconds above 0."""
+    """A number of seconds above 0, at most MAX_SECONDS."""
     try:
         value = float(text)
     except ValueError:
         value = math.nan
-    if not value > 0:
-        raise argparse.ArgumentTypeError(f"{text!r}: give seconds above 0")
+    if not 0 < value <= MAX_SECONDS:
+        raise argparse.ArgumentTypeError(f"{text!r}: give seconds above 0, at most {MAX_SECONDS:,.0f}")
     return value
+
+
+def duration(text: str) -> float:
+    """A number of seconds as `seconds`, or infinity for the text inf: no bound."""
+    return math.inf if text in ("inf", "max") else seconds(text)
 
 
 def tell_faults(recording: "Recording") -> None:

@@ -62,12 +62,13 @@ def _line(estimate: TwistEstimate) -> str:
 def _watch_table(config: ClientConfig, transport: Any, stop: threading.Event) -> int:
     from rich.live import Live
 
+    from neurove_service.cli.console import console
     from neurove_service.cli.views import Board
     from neurove_service.clients import ask
 
     board = Board()
     ask.listen(transport, config, board.on_estimate, board.on_status)
-    with Live(board, refresh_per_second=8):
+    with Live(board, console=console(), refresh_per_second=8):
         stop.wait()
     return 0
 
@@ -104,9 +105,9 @@ def _query(
     if args.json:
         print(json.dumps([reply.model_dump() for reply in replies]))
     else:
-        from rich.console import Console
+        from neurove_service.cli.console import console
 
-        Console().print(table(replies))
+        console().print(table(replies))
     return replies
 
 

@@ -15,8 +15,9 @@ def progress() -> Iterator[Callable[[str, int, int, str], None]]:
     if not sys.stderr.isatty():
         yield _print_line
         return
-    from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from neurove_service.cli.console import console
 
     columns = (
         TextColumn("{task.description}"),
@@ -24,7 +25,7 @@ def progress() -> Iterator[Callable[[str, int, int, str], None]]:
         TimeRemainingColumn(),
         TextColumn("{task.fields[detail]}"),
     )
-    with Progress(*columns, console=Console(stderr=True)) as bars:
+    with Progress(*columns, console=console(stderr=True)) as bars:
         tasks: dict[str, Any] = {}
 
         def show(task: str, done: int, of: int, detail: str) -> None:
@@ -41,11 +42,12 @@ def event_count(name: str) -> Iterator[Callable[[int], None]]:
     if not sys.stderr.isatty():
         yield lambda _: None
         return
-    from rich.console import Console
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+    from neurove_service.cli.console import console
+
     columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True)) as bar:
+    with Progress(*columns, console=console(stderr=True)) as bar:
         task = bar.add_task(name, total=None)
 
         def show(events: int) -> None:

@@ -123,9 +123,10 @@ def _check_height(what: str, estimate: TwistEstimate | None) -> Check:
 
 
 def _print_table(checks: list[Check]) -> None:
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
+
+    from neurove_service.cli.console import console
 
     table = Table("", "check", "state", "what to do", box=None, padding=(0, 2, 0, 0), header_style="dim")
     styles = {"ok": "green", "bad": "bold red", "info": "dim"}
@@ -133,8 +134,8 @@ def _print_table(checks: list[Check]) -> None:
         table.add_row(
             Text(check.level, style=styles[check.level]), Text(check.what), Text(check.state), Text(check.advice)
         )
-    console = Console()
-    (console if console.is_terminal else Console(width=_WIDE)).print(table)
+    usual = console()
+    (usual if usual.is_terminal else console(width=_WIDE)).print(table)
 
 
 def add_doctor(parser: argparse.ArgumentParser) -> None:

@@ -45,15 +45,15 @@ def reproduce_repriming(args: argparse.Namespace) -> int:
 
 def reproduce_sine(args: argparse.Namespace) -> int:
     """Repeat Tables I and II: regression and forecast of a sine by ASLSTM, ASLSTM-w/o, SLSTM and LTC."""
-    from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     from neurove_core.experiments.sine import report
+    from neurove_service.cli.console import console
 
     models, seeds = args.models.split(","), range(args.seed, args.seed + args.seeds)
     command_line, made_by = shlex.join(["neurove", *sys.argv[1:]]), commit()
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
+    with Progress(*columns, console=console(stderr=True), disable=not sys.stderr.isatty()) as bar:
         tasks: dict[tuple[str, int], Any] = {}
 
         def progress(model: str, seed: int, update: int, updates: int, mse: float) -> None:

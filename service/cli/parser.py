@@ -1,8 +1,54 @@
-"""The argument parser of every command: no abbreviated flags; an unknown command or flag names the nearest one."""
+"""The argument parser of every command: no abbreviated flags; an unknown command or flag names the nearest one.
+
+`type=int`, `type=float` and `type=Path` of any argument mean `whole_number`, `finite_number` and `given_path` of this
+module: no command gets an infinite number, one that no array can hold, or an empty path, which would be the current
+folder.
+"""
 
 import argparse
+import math
 from collections.abc import Iterable, Sequence
-from typing import Any, NoReturn
+from pathlib import Path
+from typing import Any, Final, NoReturn
+
+MAX_WHOLE: Final = 2**63 - 1
+"""Largest whole number of an argument: an int64."""
+
+
+def whole_number(text: str) -> int:
+    """A whole number that fits into 64 bits."""
+    try:
+        number = int(text)
+    except ValueError:  # also one of thousands of digits
+        raise argparse.ArgumentTypeError(f"{_clipped(text)}: give a whole number") from None
+    if abs(number) > MAX_WHOLE:
+        raise argparse.ArgumentTypeError(f"{_clipped(text)}: give a whole number of at most 64 bits")
+    return number
+
+
+def finite_number(text: str) -> float:
+    """A number that is neither infinite nor NaN."""
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise argparse.ArgumentTypeError(f"{_clipped(text)}: give a finite number")
+    return number
+
+
+def given_path(text: str) -> Path:
+    """A path that is not empty."""
+    if not text or "\0" in text:
+        raise argparse.ArgumentTypeError(f"{_clipped(text)}: give a path; the current folder is '.'")
+    return Path(text)
+
+
+def _clipped(text: str) -> str:
+    return repr(text if len(text) <= 80 else text[:77] + "...")
+
+
+_TYPES: Final = {int: whole_number, float: finite_number, Path: given_path}
 
 
 class Parser(argparse.ArgumentParser):
@@ -10,6 +56,8 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, **options: Any) -> None:
         super().__init__(allow_abbrev=False, **options)
+        for usual, checked in _TYPES.items():
+            self.register("type", usual, checked)
         self.commands: dict[str, Parser] = {}
 
     def add_commands(self) -> Any:

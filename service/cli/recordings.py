@@ -18,6 +18,7 @@ from neurove_service.cli.arguments import (
     add_recording_flags,
     client_config,
     command,
+    duration,
     refuse_existing,
     seconds,
     tell_faults,
@@ -81,11 +82,10 @@ def _status_line(path: Path) -> Iterator[Callable[[Any], None] | None]:
     if not sys.stderr.isatty():
         yield None
         return
-    from rich.console import Console
-
+    from neurove_service.cli.console import console
     from neurove_service.clients.recorder import as_json
 
-    with Console(stderr=True).status(f"recording {path}: waiting for packets") as status:
+    with console(stderr=True).status(f"recording {path}: waiting for packets") as status:
 
         def show(recorded: Any) -> None:
             lines = [f"{name}: {_line(one)}" for name, one in as_json(recorded).items()]
@@ -154,10 +154,9 @@ def _write(recording: Any, path: Path, *, as_json: bool) -> int:
 
 def info(args: argparse.Namespace) -> int:
     """Show what a recording holds: sensor, counts, rates, IMU and truth."""
-    from rich.console import Console
-
     from neurove_core.io import summary
     from neurove_core.sources import open_source
+    from neurove_service.cli.console import console
     from neurove_service.cli.views import survey_table
 
     recording = open_source(args.source, args.sensor, args.topic)
@@ -171,7 +170,7 @@ def info(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps(found.as_json()))
     else:
-        Console().print(survey_table(found))
+        console().print(survey_table(found))
     if args.plot:
         print(f"wrote {args.plot}", file=sys.stderr)
     if found.broken and not recording.faults.unread:
@@ -215,7 +214,7 @@ def add_record(parser: argparse.ArgumentParser) -> None:
     command(parser, record)
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="packet log to write, ending in .mcap")
     parser.add_argument("--stream", default="all", metavar="NAME,...", help="names of streams; default all")
-    parser.add_argument("--seconds", type=seconds, metavar="S", help="length of the recording; default: until Ctrl-C")
+    parser.add_argument("--seconds", type=duration, metavar="S", help="length of the recording; default: until Ctrl-C")
     parser.add_argument("--with-parent", action="store_true", help="end when the parent process ends")
     add_client_flags(parser)
 
@@ -237,7 +236,7 @@ def add_info(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("source", metavar="SOURCE", help="recording of any format, pattern:// or sim://")
     add_recording_flags(parser)
     most = f"default: all, of an endless source {_ENDLESS_S:.0f} s"
-    parser.add_argument("--seconds", type=seconds, metavar="S", help=f"seconds of the source to read; {most}")
+    parser.add_argument("--seconds", type=duration, metavar="S", help=f"seconds of the source to read; {most}")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw events, rate and truth (.png or .svg)")
 
 

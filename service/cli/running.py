@@ -33,6 +33,7 @@ _STREAM = "cam0"
 def serve(args: argparse.Namespace) -> int:
     """Run the service until SIGINT or SIGTERM."""
     stop = stop_on_signals(with_parent=args.with_parent)
+    logs.configure()  # what the settings say while they are read
     config, _ = load(ServiceConfig, flags(args, ServiceConfig), args.config)
     logs.configure(config.log_level)
 
@@ -99,18 +100,17 @@ def _player(args: argparse.Namespace, recording: Any, transport: Any, keys: Any)
 
 def demo(args: argparse.Namespace) -> int:
     """Run driver, service and consumer on any source, then print a summary."""
-    from rich.console import Console
-
     from neurove_core.sources import open_source
+    from neurove_service.cli.console import console
     from neurove_service.cli.demo import run
 
     stop = stop_on_signals()
     logs.configure("warning")
     endless = open_source(args.source, args.sensor, args.topic).endless
-    console = Console(stderr=args.json)
+    shown = console(stderr=args.json)
     duration_s = args.seconds
     if duration_s is None:
-        duration_s = _DEFAULT_DEMO_S if endless and not console.is_terminal else math.inf
+        duration_s = _DEFAULT_DEMO_S if endless and not shown.is_terminal else math.inf
     summary = run(
         args.source,
         sensor=str(args.sensor) if args.sensor else None,
@@ -120,7 +120,7 @@ def demo(args: argparse.Namespace) -> int:
         duration_s=duration_s,
         model=args.model,
         stop=stop,
-        console=console,
+        console=shown,
         screenshot=args.screenshot,
     )
     print(json.dumps(summary) if args.json else _summary_text(summary))
@@ -149,6 +149,7 @@ def _summary_text(summary: dict[str, Any]) -> str:
 
 def show_config(args: argparse.Namespace) -> int:
     """Print the settings that `neurove serve` would use, as TOML."""
+    logs.configure("warning")
     config, origin = load(ServiceConfig, flags(args, ServiceConfig), args.config)
     values = config.model_dump(mode="json")
     if args.json:

@@ -1,5 +1,6 @@
 """Outlets: what the worker of a stream needs from the network, and the routes of messages to the workers."""
 
+import functools
 from collections.abc import Callable
 
 from neurove_protocol import CameraInfo
@@ -14,6 +15,7 @@ from neurove_service.transport import OnTimedSample, Transport
 log = logs.get(__name__)
 
 _ASK_CAMERA_S = 1.0
+_KNOWN_KEYS = 2048
 
 
 def open_outlet(transport: Transport, keys: Keys, node: str, stream: str) -> Outlet:
@@ -35,10 +37,11 @@ def open_outlet(transport: Transport, keys: Keys, node: str, stream: str) -> Out
 
 def route(keys: Keys, registry: StreamRegistry, put: Callable[[str, bytes, int, int | None], None]) -> OnTimedSample:
     """A subscriber's callback: queue each message in the worker of its stream."""
+    stream_of = functools.lru_cache(_KNOWN_KEYS)(keys.stream_of)
 
     def on_sample(key: str, payload: bytes, received_ns: int, sent_us: int | None) -> None:
         try:
-            name = keys.stream_of(key)
+            name = stream_of(key)
         except NeuroVEError:  # not a valid name
             registry.refuse(key)
             return

@@ -88,8 +88,8 @@ class Answers:
             node=self._node,
             host=host,
         )
-        self._activity.add("windows", 1)
-        self._activity.add("estimates", 1)
+        self._activity.counters.windows += 1
+        self._activity.counters.estimates += 1
         return estimate
 
     def _host_time(self, end_us: int, packet: Packet, arrival: Arrival, now_ns: int) -> HostTime | None:

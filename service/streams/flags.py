@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 from neurove_core.estimator import WindowEstimate
 from neurove_protocol import CameraInfo, Flag
+from neurove_service.streams.lane import OpenWindow
 
 
 class _Gap(NamedTuple):
@@ -22,7 +23,7 @@ class Flags:
         self._missing = self._recoverable = False
 
     def set_next(self, flag: Flag) -> None:
-        """Set a flag on the next estimate; OVERLOAD waits until the gap that it caused is known."""
+        """Set a flag on the next estimate; OVERLOAD belongs to the windows of a gap if there is one."""
         self._pending.add(flag)
 
     def missing(self, *, recoverable: bool = False) -> None:
@@ -34,11 +35,11 @@ class Flags:
         self._recoverable = recoverable and not self._missing
         self._missing = True
 
-    def close_gap(self, start_us: int | None, end_us: int) -> None:
+    def close_gap(self, window: OpenWindow | None, end_us: int) -> None:
         """The next packet arrived: flag the windows of the gap before it, if packets were missing.
 
         Args:
-            start_us: sensor time up to which all events are known [us]; None before the first packet.
+            window: the open one; None before the first packet.
             end_us: start of the packet [us].
         """
         if not self._missing:
@@ -47,7 +48,7 @@ class Flags:
         if Flag.OVERLOAD in self._pending:
             flags.add(Flag.OVERLOAD)
             self._pending.discard(Flag.OVERLOAD)
-        start_us = end_us if start_us is None else start_us
+        start_us = end_us if window is None else window.horizon_us
         self._gaps.append(_Gap(start_us, max(end_us, start_us + 1), frozenset(flags), self._recoverable))
         self._missing = self._recoverable = False
 

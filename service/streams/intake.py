@@ -1,9 +1,10 @@
 """Intake: which packets of a stream are processed; every other one is counted by its cause and flags its windows."""
 
-from typing import NamedTuple
+from dataclasses import replace
+from typing import NamedTuple, cast
 
-from neurove_protocol import Flag
-from neurove_protocol.events import Packet
+from neurove_protocol import Events, Flag
+from neurove_protocol.events import Packet, WireEvents, WirePacket
 from neurove_service import logs
 from neurove_service.streams.activity import Activity
 from neurove_service.streams.age import Ages, newest_us
@@ -45,6 +46,7 @@ class Intake:
         self._sequence = Sequence()
         self._repetition = Repetition()
         self._delay_ns = 0  # of the newest packet, see Ages.learn
+        self._shed = False  # windows were left out before the next packet
 
     @property
     def delay_ns(self) -> int:
@@ -64,7 +66,8 @@ class Intake:
         if order in _LOSS_BY_ORDER:
             self._activity.lost(_LOSS_BY_ORDER[order], 1)
         elif order is Order.AFTER_GAP:
-            self._flags.missing(recoverable=True)
+            if lost or not self._shed:
+                self._flags.missing(recoverable=True)
             if lost:
                 self._activity.lost("gap_packets", lost)
                 log.warning("packets lost", stream=self._stream, gap=lost, total=self._activity.counters.gap_packets)
@@ -78,17 +81,44 @@ class Intake:
             log.info("driver restarted", stream=self._stream, seq=packet.seq)
         return order
 
-    def is_stale(self, packet: Packet, arrival: Arrival) -> bool:
-        """Learn from the times of a packet that is in order; whether it is too old to be processed."""
+    @property
+    def expected(self) -> int | None:
+        """Number of the next packet; None before the first one."""
+        return self._sequence.expected
+
+    def advance_run(self, marks: list[tuple[int, int]], received_ns: int) -> None:
+        """Accept packets that are all the expected ones, see Sequence.advance_run."""
+        self._sequence.advance_run(marks, received_ns)
+
+    def is_stale(self, packet: Packet, arrival: Arrival, packets: int = 1) -> bool:
+        """Learn from the times of a packet, or a run of packets, in order; whether it is too old to be processed."""
         self._delay_ns = self.ages.learn(
             newest_us(packet) if arrival.sent_us is None else arrival.sent_us, arrival.received_ns
         )
         if self._delay_ns + arrival.queued_ns - arrival.received_ns <= self._max_age_ns:
             self._repetition.add(packet)
             return False
-        self._activity.lost("stale_packets", 1)
+        self._activity.lost("stale_packets", packets)
         self._flags.missing()
         return True
+
+    def shed(self, packets: int) -> None:
+        """Expect that many missing numbers, of windows that this node left out whole: the next window is complete."""
+        self._sequence.skip(packets)
+        self._flags.set_next(Flag.OVERLOAD)
+        self._shed = True
+
+    def without_shed_events(self, packet: Packet, open_us: int | None) -> Packet:
+        """The first packet after shed windows without their events."""
+        if not self._shed:
+            return packet
+        self._shed = False
+        if open_us is None or packet.t0_us >= open_us:
+            return packet
+        events = packet.events.span(packet.events.before(open_us), packet.events.n)
+        if isinstance(packet, WirePacket):
+            return packet._replace(events=cast(WireEvents, events))
+        return replace(packet, events=cast(Events, events))
 
     def skip(self, packets: int, flag: Flag | None = None) -> None:
         """Expect that many missing numbers: these packets arrived, but this node refused or dropped them."""

@@ -38,6 +38,20 @@ class TimedEstimate(NamedTuple):
         return WindowResult(self.estimate.end_us, self.estimate.twists.mean(axis=0), self.rate)
 
 
+class OpenWindow(NamedTuple):
+    """The window that a lane fills."""
+
+    start_us: int
+    duration_us: int
+    horizon_us: int  # sensor time up to which all events are known
+    events: int
+
+    @property
+    def end_us(self) -> int:
+        """End of the window [us]."""
+        return self.start_us + self.duration_us
+
+
 class Lane:
     """One model's state on one stream.
 
@@ -61,6 +75,14 @@ class Lane:
     def next_us(self) -> int | None:
         """Start of the next window [us]; None before the first packet."""
         return self.state.windows.start_us
+
+    @property
+    def open_window(self) -> OpenWindow | None:
+        """The window that is filled now; None before the first packet."""
+        start_us, horizon_us, _, events, *_ = self.state.windows
+        if start_us is None:
+            return None
+        return OpenWindow(start_us, self.estimator.config.window.duration_us, horizon_us, events)
 
     def has_all_events(self, window: Window) -> bool:
         """Whether this lane got all events of a window."""

@@ -8,7 +8,7 @@ from neurove_protocol.events import Packet
 from neurove_service import logs
 from neurove_service.streams.comparison import Comparison
 from neurove_service.streams.history import History, Optics, Primed, RingSize, prime, zero_lane
-from neurove_service.streams.lane import Lane, Pace, TimedEstimate, replay
+from neurove_service.streams.lane import Lane, OpenWindow, Pace, TimedEstimate, replay
 from neurove_service.streams.ring import PackedWindow, pack
 from neurove_service.streams.roles import Roles, Serving
 from neurove_service.streams.standby import Standby
@@ -51,19 +51,21 @@ class Lanes:
         self._unanswered: Pushed | None = None  # windows on which the serving model failed
 
     @property
-    def horizon_us(self) -> int | None:
-        """Sensor time up to which all events are known [us]; None before the first packet."""
-        return self.serving_lane.state.windows.horizon_us if self.serving_lane else None
-
-    @property
-    def open_events(self) -> int:
-        """Number of events in the open window."""
-        return self.serving_lane.state.windows.events if self.serving_lane else 0
+    def open_window(self) -> OpenWindow | None:
+        """The open window of the serving lane; None before the first packet."""
+        return self.serving_lane.open_window if self.serving_lane else None
 
     @property
     def has_backlog(self) -> bool:
         """Whether the standby model has a backlog."""
         return self.standby is not None and self.standby.has_backlog
+
+    def leave_out_until(self, start_us: int) -> None:
+        """Leave out all windows before `start_us`, the open one included; the network state goes on over them."""
+        lane = self.serving_lane
+        assert lane is not None, "call assign first"
+        lane.state = lane.state._replace(windows=WindowsState(start_us, start_us, bridged=True))
+        self._unanswered = None
 
     def restart(self) -> None:
         """Forget all state of every model; the next packet begins a new sequence."""
@@ -113,6 +115,8 @@ class Lanes:
         assert lane is not None, "call assign first"
         pushed = self._unanswered or lane.estimator.to_windows(packet.events, lane.state, packet.t0_us)
         lane.state = lane.state._replace(windows=pushed.state)
+        if standby is None and not pushed.windows:
+            return Pushing([], lane.serving, pushed.late_events, 0, pushed.skipped_windows)
         try:
             answers = lane.follow(pushed.windows, checked=standby is not None)
         except Exception as error:

@@ -11,6 +11,9 @@ FROZEN_PACKETS = 4
 MIN_EVENTS = 16
 """Packets with fewer events may be equal by chance."""
 
+PERIOD_US = 2_000
+"""Of packets that follow each other faster, only some are compared [us]."""
+
 _REMEMBERED = 8  # packets: the longest cycle that is noticed
 _SAMPLE = 64  # events that are compared first
 
@@ -22,6 +25,7 @@ class Repetition:
         self._samples: deque[int] = deque(maxlen=_REMEMBERED)
         self._whole: deque[int] = deque(maxlen=_REMEMBERED)  # of packets whose sample was seen before
         self._repeated = 0
+        self._newest_us: int | None = None
 
     @property
     def frozen(self) -> bool:
@@ -30,24 +34,30 @@ class Repetition:
 
     def add(self, packet: Packet) -> None:
         """Compare a packet with the newest ones; a packet with few events says nothing."""
-        if packet.events.n < MIN_EVENTS:
+        if packet.events.n < MIN_EVENTS or self._is_soon(packet.t0_us):
             return
-        sample = _hash(packet, _SAMPLE)
+        self._newest_us = packet.t0_us
+        sample = hash(_bytes(packet, _SAMPLE))
         if sample not in self._samples:
             self._samples.append(sample)
             self._repeated = 0
             return
-        whole = _hash(packet, packet.events.n)
+        whole = zlib.crc32(_bytes(packet, packet.events.n))
         self._repeated = self._repeated + 1 if whole in self._whole else 0
         if whole not in self._whole:
             self._whole.append(whole)
 
+    def _is_soon(self, t0_us: int) -> bool:
+        return self._newest_us is not None and 0 <= t0_us - self._newest_us < PERIOD_US
 
-def _hash(packet: Packet, events: int) -> int:
-    """Hash of the first events of a packet, with times relative to its begin, and of their number in all."""
-    part = packet.events.span(0, events)
-    columns = part.columns() if isinstance(part, WireEvents) else part
-    found = packet.events.n
-    for column in (columns.t - packet.t0_us, columns.x, columns.y, columns.p):
-        found = zlib.crc32(column.tobytes(), found)
-    return found
+
+def _bytes(packet: Packet, events: int) -> bytes:
+    """The first events of a packet, with times relative to its begin, and the number of all."""
+    found = packet.events
+    count = found.n.to_bytes(4, "little")
+    if isinstance(found, WireEvents):
+        if events < found.n:
+            return count + found.blob[: events * (4 if found.wide else 2)].tobytes()  # times are enough
+        return count + found.blob.tobytes()
+    part = found.span(0, events)
+    return count + b"".join(column.tobytes() for column in (part.t - packet.t0_us, part.x, part.y, part.p))

@@ -20,6 +20,7 @@ class PackedWindow(NamedTuple):
     shape: tuple[int, ...]
     cells: NDArray[np.uint16] | NDArray[np.uint32] | None  # flat indices of nonzero cells; None: values has all cells
     values: NDArray[np.uint8]
+    bridged: bool = False  # as in Window
 
     @property
     def size(self) -> int:
@@ -29,10 +30,10 @@ class PackedWindow(NamedTuple):
     def window(self) -> Window:
         """The window, bit for bit."""
         if self.cells is None:
-            return Window(self.start_us, self.values.reshape(self.shape), self.events, self.outside)
+            return Window(self.start_us, self.values.reshape(self.shape), self.events, self.outside, self.bridged)
         counts = np.zeros(self.shape, np.uint8)
         counts.reshape(-1)[self.cells] = self.values
-        return Window(self.start_us, counts, self.events, self.outside)
+        return Window(self.start_us, counts, self.events, self.outside, self.bridged)
 
 
 def pack(window: Window) -> PackedWindow:
@@ -42,7 +43,9 @@ def pack(window: Window) -> PackedWindow:
     cells = found.astype(np.uint16) if flat.size <= 1 << 16 else found.astype(np.uint32)
     sparse = cells.nbytes + cells.size < flat.size
     about = window.start_us, window.events, window.outside, window.counts.shape
-    return PackedWindow(*about, cells, flat[cells]) if sparse else PackedWindow(*about, None, flat)
+    if sparse:
+        return PackedWindow(*about, cells, flat[cells], window.bridged)
+    return PackedWindow(*about, None, flat, window.bridged)
 
 
 class Ring:

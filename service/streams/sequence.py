@@ -59,7 +59,8 @@ class Sequence:
     def __init__(self) -> None:
         self._expected: int | None = None
         self._first_t0_us = self._t0_us = self._newest_ns = 0
-        self._recent: OrderedDict[int, int] = OrderedDict()  # number -> t0_us
+        self._recent: list[tuple[int, int] | None] = [None] * _REMEMBERED  # number and t0_us, at number % _REMEMBERED
+        self._length = 0  # packets since the begin of the sequence
         self._missing: OrderedDict[int, None] = OrderedDict()
         self._newest_gap: set[int] = set()  # numbers that are still missing in it
         self._unread = 0
@@ -82,6 +83,23 @@ class Sequence:
         self._expect_after(packet, received_ns)
         return True
 
+    @property
+    def expected(self) -> int | None:
+        """Number of the next packet; None before the first one."""
+        return self._expected
+
+    def advance_run(self, marks: list[tuple[int, int]], received_ns: int) -> None:
+        """Accept packets that are all the expected ones.
+
+        Args:
+            marks: number and t0_us of each.
+            received_ns: when the last one arrived [ns].
+        """
+        for seq, t0_us in marks:
+            self._recent[seq % _REMEMBERED] = (seq, t0_us)
+        self._length += len(marks) - 1
+        self._accept(*marks[-1], received_ns)
+
     def place(self, packet: Packet, received_ns: int = 0) -> tuple[Order, int]:
         """The order of a packet that is not the expected one.
 
@@ -95,7 +113,7 @@ class Sequence:
         seq, expected = packet.seq, self._expected
         if expected is None:
             return self._begin(packet, received_ns, Order.FIRST), 0
-        if self._recent.get(seq) == packet.t0_us:
+        if self._recent[seq % _REMEMBERED] == (seq, packet.t0_us):
             return self._place_repeat(packet, received_ns), 0
         if seq in self._missing and packet.t0_us <= self._t0_us:
             del self._missing[seq]
@@ -136,7 +154,7 @@ class Sequence:
             repeats.expected, repeats.length = packet.seq + 1, repeats.length + 1
         else:
             repeats = self._repeats = _Run(packet.seq, packet.seq + 1)
-        from_start = repeats.first == 0 and len(self._recent) > REPEATED_PACKETS
+        from_start = repeats.first == 0 and self._length > REPEATED_PACKETS
         if repeats.length >= (REWIND_PACKETS if from_start else REPEATED_PACKETS):
             return self._begin(packet, received_ns, Order.AFTER_RESTART)
         return Order.DUPLICATE
@@ -155,7 +173,8 @@ class Sequence:
 
     def _begin(self, packet: Packet, received_ns: int, order: Order) -> Order:
         self._first_t0_us = packet.t0_us
-        self._recent.clear()
+        self._recent = [None] * _REMEMBERED
+        self._length = 0
         self._missing.clear()
         self._newest_gap = set()
         self._other = None
@@ -163,17 +182,20 @@ class Sequence:
         return order
 
     def _expect_after(self, packet: Packet, received_ns: int) -> None:
-        self._expected, self._unread = packet.seq + 1, 0
-        self._t0_us, self._newest_ns = packet.t0_us, received_ns
-        self._remember(packet)
+        self._accept(packet.seq, packet.t0_us, received_ns)
+
+    def _accept(self, seq: int, t0_us: int, received_ns: int) -> None:
+        self._expected, self._unread = seq + 1, 0
+        self._t0_us, self._newest_ns = t0_us, received_ns
+        self._recent[seq % _REMEMBERED] = (seq, t0_us)
+        self._length += 1
         self._repeats = None
         if self._other is not None:
             self._other.interleaved, self._other.consecutive = True, 0
 
     def _remember(self, packet: Packet) -> None:
-        self._recent[packet.seq] = packet.t0_us
-        if len(self._recent) > _REMEMBERED:
-            self._recent.popitem(last=False)
+        self._recent[packet.seq % _REMEMBERED] = (packet.seq, packet.t0_us)
+        self._length += 1
 
     def _miss(self, first: int, stop: int) -> None:
         self._newest_gap = set(range(max(first, stop - _REMEMBERED), stop))

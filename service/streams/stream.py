@@ -1,11 +1,11 @@
 """Stream: the state of one camera stream; packet in, estimates out. It has no sockets and no threads."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from neurove_protocol import CameraInfo, Flag, Sensor, TwistEstimate
 from neurove_protocol.errors import InvalidField
-from neurove_protocol.events import Packet
+from neurove_protocol.events import Packet, PacketLimits
 from neurove_service import logs
 from neurove_service.streams.activity import Activity
 from neurove_service.streams.age import newest_us
@@ -15,6 +15,7 @@ from neurove_service.streams.history import RingSize
 from neurove_service.streams.intake import Arrival, Intake
 from neurove_service.streams.lanes import Lanes, Pushing, ServingModelFailed
 from neurove_service.streams.model_source import ModelSource
+from neurove_service.streams.runs import Run, Wanted, collect
 from neurove_service.streams.sequence import Order
 from neurove_service.streams.verdict import Verdicts
 
@@ -68,27 +69,57 @@ class Stream:
         """
         if packet.stream != self.name:
             raise InvalidField("event packet", "stream", packet.stream, f"received on the key of stream {self.name!r}")
-        activity, intake = self.activity, self._intake
-        activity.add("packets_received", 1)
-        activity.add("events_received", packet.events.n)
-        activity.heard(arrival.received_ns)
-        activity.taken_ns = arrival.queued_ns
-        order = intake.order(packet, arrival.received_ns)
+        self._heard(packet, arrival, 1)
+        order = self._intake.order(packet, arrival.received_ns)
         if order not in _PROCESSED:
             return []
         if order is Order.AFTER_RESTART:
             self._restart()
-            intake.ages.forget()
+            self._intake.ages.forget()
         self._restart_if_changed(packet)
-        if order is not Order.RECOVERED:  # its delay is that of a detour
-            if intake.is_stale(packet, arrival):
+        window = self.lanes.open_window
+        if order is Order.RECOVERED:  # its delay is that of a detour
+            if window is not None and newest_us(packet) < window.start_us:  # all of its windows are answered
+                self.activity.lost("out_of_order_packets", 1)
                 return []
-            self._flags.close_gap(self.lanes.horizon_us, packet.t0_us)
-        elif self._is_too_late(packet):
-            activity.lost("out_of_order_packets", 1)
+        elif self._intake.is_stale(packet, arrival):
             return []
-        pushing = self._push(packet)
-        activity.add("outside_events", pushing.outside_events)
+        else:
+            self._flags.close_gap(self.lanes.open_window, packet.t0_us)
+        return self._process(packet, arrival)
+
+    def collect(self, payloads: Sequence[bytes], limits: PacketLimits) -> Run | None:
+        """The packets at the begin of some payloads that `accept_run` takes at once; None if there are none.
+
+        Args:
+            payloads: of packets, in order of arrival.
+            limits: limits of packets.
+        """
+        window, expected = self.lanes.open_window, self._intake.expected
+        if window is None or expected is None or self.sensor is None:
+            return None
+        return collect(payloads, limits, Wanted(self.name, self.sensor, expected, window))
+
+    def accept_run(self, run: Run, arrival: Arrival) -> list[TwistEstimate]:
+        """Process a run of packets, the last of which arrived then, with the results of `accept` for each."""
+        packet, marks = run
+        self._heard(packet, arrival, len(marks))
+        self._intake.advance_run(marks, arrival.received_ns)
+        if self._intake.is_stale(packet, arrival, len(marks)):
+            return []
+        self._flags.close_gap(self.lanes.open_window, packet.t0_us)
+        return self._process(packet, arrival)
+
+    def _heard(self, packet: Packet, arrival: Arrival, packets: int) -> None:
+        self.counters.packets_received += packets
+        self.counters.events_received += packet.events.n
+        self.activity.heard(arrival.received_ns)
+        self.activity.taken_ns = arrival.queued_ns
+
+    def _process(self, packet: Packet, arrival: Arrival) -> list[TwistEstimate]:
+        activity, window = self.activity, self.lanes.open_window
+        pushing = self._push(self._intake.without_shed_events(packet, window.start_us if window else None))
+        self.counters.outside_events += pushing.outside_events
         if pushing.late_events:
             activity.lost("late_events", pushing.late_events)
         if pushing.skipped_windows:
@@ -120,9 +151,9 @@ class Stream:
         self.activity.add("refused_cameras", 1)
         self.activity.refusal = why
 
-    def failed(self) -> None:
-        """Count a packet that an internal error lost, and restart: the state may be half updated."""
-        self.activity.lost("failed_packets", 1)
+    def failed(self, packets: int = 1) -> None:
+        """Count packets that an internal error lost, and restart: the state may be half updated."""
+        self.activity.lost("failed_packets", packets)
         self._restart()
         self._flags.missing()
 
@@ -130,6 +161,16 @@ class Stream:
         """Count packets that the queue dropped."""
         self._intake.skip(packets, Flag.OVERLOAD)
         self.activity.lost("overload_packets", packets)
+
+    def shed(self, packets: int, start_us: int) -> None:
+        """Leave out all windows before `start_us`, with so many whole packets, because this node cannot keep up."""
+        window = self.lanes.open_window
+        assert window is not None
+        self._intake.shed(packets)
+        self.activity.lost("shed_windows", (start_us - window.start_us) // window.duration_us)
+        if packets:
+            self.activity.lost("overload_packets", packets)
+        self.lanes.leave_out_until(start_us)
 
     def set_camera(self, camera: CameraInfo) -> None:
         """Use this CameraInfo from the next packet on."""
@@ -141,15 +182,10 @@ class Stream:
             self._restart()
         log.info("camera info set", stream=self.name, sensor=str(camera.sensor), lens=camera.lens)
 
-    def _is_too_late(self, packet: Packet) -> bool:
-        """Whether all windows of a packet that was missing are answered."""
-        lane = self.lanes.serving_lane
-        open_us = lane.next_us if lane is not None else None
-        return open_us is not None and newest_us(packet) < open_us
-
     def _restart(self) -> None:
         """Forget the recurrent state and the open window; the next packet begins a new sequence."""
-        if self.lanes.open_events:
+        window = self.lanes.open_window
+        if window is not None and window.events:
             self.activity.lost("restart_windows", 1)
         self.lanes.restart()
         self._flags.forget_gaps()
@@ -157,7 +193,7 @@ class Stream:
 
     def _restart_if_changed(self, packet: Packet) -> None:
         """Restart if the packet comes from another sensor or another clock than the previous one."""
-        if self.sensor != packet.sensor:
+        if self.sensor is not packet.sensor and self.sensor != packet.sensor:
             if self.sensor is not None:
                 log.warning("sensor changed", stream=self.name, before=str(self.sensor), now=str(packet.sensor))
                 self._flags.set_next(Flag.SENSOR_CHANGED)
@@ -165,9 +201,9 @@ class Stream:
             self.sensor = packet.sensor
             if self.camera is not None and self.calibration is None:
                 self.refused_camera(f"the camera info is for {self.camera.sensor}, the stream sends {packet.sensor}")
-        horizon_us = self.lanes.horizon_us
-        if horizon_us is not None and packet.t0_us < horizon_us - CLOCK_RESET_US:
-            log.warning("sensor clock went backwards", stream=self.name, by_us=horizon_us - packet.t0_us)
+        window = self.lanes.open_window
+        if window is not None and packet.t0_us < window.horizon_us - CLOCK_RESET_US:
+            log.warning("sensor clock went backwards", stream=self.name, by_us=window.horizon_us - packet.t0_us)
             self._restart()
             self._intake.ages.forget()
 

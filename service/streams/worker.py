@@ -1,5 +1,6 @@
 """The queue and the thread of one stream: bytes in from Zenoh's thread, estimates out."""
 
+import itertools
 import threading
 import time
 from collections import deque
@@ -14,12 +15,15 @@ from neurove_protocol.velocity import TwistEstimate
 from neurove_service import logs
 from neurove_service.guard import Guard
 from neurove_service.streams.intake import Arrival
+from neurove_service.streams.overload import Overload, newest_whole_window
+from neurove_service.streams.runs import MAX_RUN, SMALL_BYTES
 from neurove_service.streams.stream import Stream
 
 log = logs.get(__name__)
 
 _IDLE_BEAT_S = 0.5
 _REOPEN_S = 0.5  # pause before the outlet is opened again after a failure
+_REST_S = 0.01  # pause of the loop after an error in it
 _RETRY_STANDBY_S = 0.002
 _MAX_PAUSE_S = 0.02
 _SAMPLE_BYTES = 256
@@ -59,6 +63,7 @@ class Inbox:
     def put(self, sample: Sample) -> None:
         """Append a sample; does not wait for the worker."""
         with self._changed:
+            waited = not self._samples
             self._samples.append(sample)
             self._bytes += sample.size
             oldest_ns = sample.received_ns - self._max_age_ns
@@ -67,22 +72,23 @@ class Inbox:
                 self._dropped += 1
                 if not self._samples:
                     break
-            self._changed.notify()
+            if waited:
+                self._changed.notify()
 
     def wake(self) -> None:
         """Let a waiting `take` return."""
         with self._changed:
             self._changed.notify_all()
 
-    def take(self, timeout_s: float) -> tuple[Sample | None, int]:
-        """The oldest sample, or None after the timeout; and the number of samples dropped since the last call."""
+    def take_all(self, timeout_s: float) -> tuple[deque[Sample], int]:
+        """All samples, oldest first, or none after the timeout; and how many were dropped since the last call."""
         with self._changed:
             if not self._samples:
                 self._changed.wait(timeout_s)
             dropped, self._dropped = self._dropped, 0
-            sample = self._samples.popleft() if self._samples else None
-            self._bytes -= sample.size if sample else 0
-            return sample, dropped
+            samples, self._samples = self._samples, deque()
+            self._bytes = 0
+            return samples, dropped
 
 
 class Outlet(NamedTuple):
@@ -121,6 +127,8 @@ class StreamWorker:
         self._standby_slots = standby_slots or threading.Semaphore()
         self._guard = guard or Guard()
         self._pause_until = 0.0  # a time, not a duration: packets that arrive in a pause must not extend it
+        self._pending: deque[Sample] = deque()  # taken out of the queue, not yet processed
+        self._overload = Overload()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"stream {stream.name}", daemon=True)
         self._thread.start()
@@ -150,8 +158,13 @@ class StreamWorker:
             self._set_camera(outlet.ask_camera)
         while not self._stopping.is_set():
             self.beat_ns = time.monotonic_ns()
+            first = self._pending[0] if self._pending else None
             with self._guard.at("stream loop", stream=self.stream.name):
                 self._turn(outlet)
+                continue
+            if first is not None and self._pending and self._pending[0] is first:
+                self._pending.popleft()  # it would fail again
+            self._stopping.wait(_REST_S)
         with self._guard.at("end of a stream", stream=self.stream.name):
             outlet.close()
 
@@ -165,15 +178,60 @@ class StreamWorker:
         return None
 
     def _turn(self, outlet: Outlet) -> None:
-        """Process the oldest sample, or else a step of the standby model."""
-        pause_s = max(0.0, self._pause_until - time.monotonic())
-        sample, dropped = self._inbox.take(pause_s if self.stream.lanes.has_backlog else _IDLE_BEAT_S)
-        if dropped:
-            self.stream.overloaded(dropped)
-        if sample is not None:
-            self._work(sample, outlet)
+        """Process the oldest samples, or else a step of the standby model."""
+        if not self._pending:
+            pause_s = max(0.0, self._pause_until - time.monotonic())
+            self._take(pause_s if self.stream.lanes.has_backlog else _IDLE_BEAT_S)
+        if self._pending:
+            self._work_next(outlet)
         elif self.stream.lanes.has_backlog:
             self._pause_until = time.monotonic() + self._run_standby()
+
+    def _take(self, timeout_s: float) -> None:
+        samples, dropped = self._inbox.take_all(timeout_s)
+        self._pending.extend(samples)
+        if dropped:
+            self.stream.overloaded(dropped)
+
+    def _work_next(self, outlet: Outlet) -> None:
+        now_ns = time.monotonic_ns()
+        if self._overload.must_shed(now_ns - self._pending[0].received_ns, now_ns):
+            self._take(0)
+            self._shed()
+        if len(self._pending) == 1 or not self._work_run(now_ns, outlet):
+            self._work(self._pending.popleft(), now_ns, outlet)
+
+    def _work_run(self, now_ns: int, outlet: Outlet) -> bool:
+        """Process the small packets at the begin of the queue at once; whether there are any."""
+        first = self._pending[0]
+        if first.is_camera or len(first.payload) > SMALL_BYTES:
+            return False
+        alike = itertools.takewhile(
+            lambda one: not one.is_camera and (one.sent_us is None) == (first.sent_us is None), self._pending
+        )
+        run = self.stream.collect([one.payload for one in itertools.islice(alike, MAX_RUN)], self._limits)
+        if run is None:
+            return False
+        packets = [self._pending.popleft() for _ in run.marks]
+        arrival = Arrival(packets[-1].received_ns, now_ns, packets[-1].sent_us)
+        try:
+            for estimate in self.stream.accept_run(run, arrival):
+                self._publish(estimate, outlet)
+        except Exception as error:  # noqa: BLE001  # as for a single packet
+            self._guard.caught("packet", error, stream=self.stream.name, packets=len(packets))
+            self.stream.failed(len(packets))
+        return True
+
+    def _shed(self) -> None:
+        """Leave out all windows before the newest one whose events have all arrived."""
+        window = self.stream.lanes.open_window
+        payloads = [None if one.is_camera else one.payload for one in self._pending]
+        found = newest_whole_window(payloads, self._limits, window) if window is not None else None
+        if found is None:
+            return
+        left_out = [self._pending.popleft() for _ in range(found.packets)]
+        self._pending.extendleft(reversed([sample for sample in left_out if sample.is_camera]))
+        self.stream.shed(sum(not sample.is_camera for sample in left_out), found.start_us)
 
     def _run_standby(self) -> float:
         """Run one step of the standby model; return the pause after it [s], which leaves the processor to others."""
@@ -186,12 +244,12 @@ class StreamWorker:
             self._standby_slots.release()
         return min(_MAX_PAUSE_S, time.monotonic() - began)  # as long as the step: half of the time
 
-    def _work(self, sample: Sample, outlet: Outlet) -> None:
+    def _work(self, sample: Sample, now_ns: int, outlet: Outlet) -> None:
         if sample.is_camera:
             self._set_camera(lambda: CameraInfo.decode(sample.payload))
             return
         try:
-            arrival = Arrival(sample.received_ns, time.monotonic_ns(), sample.sent_us)
+            arrival = Arrival(sample.received_ns, now_ns, sample.sent_us)
             packet = read_packet(sample.payload, self._limits)
             for estimate in self.stream.accept(packet, arrival):
                 self._publish(estimate, outlet)

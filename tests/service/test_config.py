@@ -33,6 +33,88 @@ def test_an_error_names_the_field_the_value_the_bound_and_the_source(flags, word
         assert word in raised.value.message
 
 
+@pytest.mark.parametrize(
+    ("endpoint", "words"),
+    [
+        ("localhost:7447", "did you mean 'tcp/localhost:7447'?"),
+        ("tcp://localhost:7447", "did you mean 'tcp/localhost:7447'?"),
+        ("tls://box:7447", "did you mean 'tls/box:7447'?"),
+        ("tcp:7447", "give PROTOCOL/HOST:PORT"),
+        ("http/localhost:80", "the protocols are tcp, udp"),
+        ("tcp/localhost", "no HOST:PORT after tcp/"),
+        ("tcp/localhost:70000", "a port is at most 65535"),
+        ("tcp/two words:1", "no HOST:PORT"),
+        ("unixsock-stream/", "give unixsock-stream/PATH"),
+    ],
+)
+@pytest.mark.parametrize("field", ["connect", "listen"])
+def test_a_wrong_endpoint_is_explained_without_the_words_of_zenoh(field, endpoint, words):
+    with pytest.raises(ConfigError) as raised:
+        load(ServiceConfig, {field: f"tcp/127.0.0.1:1,{endpoint}"})
+    assert f"{field}={endpoint!r} (from flag)" in raised.value.message
+    assert words in raised.value.message
+
+
+@pytest.mark.parametrize(
+    "endpoint",
+    ["tcp/[::1]:7447", "quic/robot-7.local:0", "tcp/127.0.0.1:1?prio=1-3#iface=lo", "unixsock-stream//run/n.sock"],
+)
+def test_right_endpoints_stay(endpoint):
+    assert load(ServiceConfig, {"connect": endpoint})[0].connect == (endpoint,)
+
+
+def test_an_empty_variable_counts_as_unset(monkeypatch):
+    for name in ("MODELS_DIR", "STATE_DIR", "ZENOH_CONFIG", "TRUSTED_KEYS", "LISTEN", "QUEUE_S", "NODE", "PORT"):
+        monkeypatch.setenv(f"NEUROVE_{name}", " " if name == "NODE" else "")
+    config, origin = load(ServiceConfig, {})
+    assert config == ServiceConfig()
+    assert set(origin.values()) == {"default"}
+
+
+@pytest.mark.parametrize("field", ["models_dir", "state_dir", "zenoh_config", "trusted_keys"])
+def test_an_empty_path_is_refused_not_the_current_folder(field, tmp_path):
+    with pytest.raises(ConfigError, match=f"{field}='' .from flag.: .*must not be empty"):
+        load(ServiceConfig, {field: ""})
+    file = tmp_path / "neurove.toml"
+    empty = '[""]' if field == "trusted_keys" else '""'
+    file.write_text(f"{field} = {empty}\n")
+    with pytest.raises(ConfigError, match="must not be empty"):
+        load(ServiceConfig, {}, file)
+
+
+@pytest.mark.parametrize("mode", ["peer", "router"])
+def test_a_node_that_neither_listens_nor_connects_is_refused_unless_a_zenoh_configuration_has_endpoints(mode, tmp_path):
+    with pytest.raises(ConfigError, match=f"{mode} mode needs an endpoint to listen on or to connect to"):
+        load(ServiceConfig, {"mode": mode, "listen": ""})
+    assert load(ServiceConfig, {"mode": mode, "listen": "", "connect": "tcp/127.0.0.1:1"})[0].listen == ()
+    assert load(ServiceConfig, {"mode": mode, "listen": "", "zenoh_config": str(tmp_path)})[0].listen == ()
+
+
+def test_variables_of_kubernetes_are_ignored_with_one_warning(monkeypatch, caplog):
+    of_kubernetes = {
+        "NEUROVE_SERVICE_HOST": "10.96.0.7",
+        "NEUROVE_SERVICE_PORT": "7447",
+        "NEUROVE_SERVICE_PORT_ZENOH": "7447",
+        "NEUROVE_PORT": "tcp://10.96.0.7:7447",
+        "NEUROVE_PORT_7447_TCP": "tcp://10.96.0.7:7447",
+        "NEUROVE_PORT_7447_TCP_ADDR": "10.96.0.7",
+        "NEUROVE_EDGE_SERVICE_HOST": "10.96.0.8",
+    }
+    for name, value in of_kubernetes.items():
+        monkeypatch.setenv(name, value)
+    config, _ = load(ServiceConfig, {})
+    assert config == ServiceConfig()
+    assert len(caplog.records) == 1
+    assert "set by Kubernetes" in caplog.text
+    assert all(name in caplog.text for name in of_kubernetes)
+
+
+def test_a_byte_order_mark_in_a_file_is_no_content(tmp_path):
+    file = tmp_path / "neurove.toml"
+    file.write_bytes('\ufeffnode = "x"\n'.encode())
+    assert load(ServiceConfig, {}, file)[0].node == "x"
+
+
 def test_an_unknown_key_of_a_file_or_the_environment_is_an_error(tmp_path, monkeypatch):
     file = tmp_path / "neurove.toml"
     file.write_text("que_s = 2.0\n")

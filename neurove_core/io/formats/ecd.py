@@ -1,10 +1,11 @@
-"""Reader of the Event Camera Dataset (Mueggler 2017): events as text lines `t[s] x y p`, and the lens as nine numbers.
+"""Reader of events as text, and of the Event Camera Dataset (Mueggler 2017): lines `t[s] x y p`, the lens in calib.txt.
+
+Other columns and separators are recognised, see `dialect`.
 
 The same folder, or the .zip in which the data set is distributed, may also hold groundtruth.txt, imu.txt, and
 images.txt with images.
 """
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,10 +16,12 @@ from numpy.typing import NDArray
 
 from neurove_core.geometry.motion import Poses, Twists, twists
 from neurove_core.io.archive import Place, folder_in_zip, read_image
-from neurove_core.io.checked import Piece, as_recorded, cleaned, ordered, until_broken
-from neurove_core.io.errors import BrokenRecording
+from neurove_core.io.checked import cleaned, ordered, until_broken
+from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.faults import Faults, Reason, Tally
 from neurove_core.io.format import Format
+from neurove_core.io.formats.columns import Unclear
+from neurove_core.io.formats.dialect import ECD, HEAD_BYTES, Dialect, count_lines, detect, is_blank, line_of, pieces
 from neurove_core.io.order import Where
 from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Frame, Imu, refuse_topic
 from neurove_protocol.camera import CameraInfo
@@ -31,8 +34,7 @@ DAVIS240C = Sensor(240, 180)
 MAX_T_S = 1e12  # [s]; a larger time is invalid
 UNIT_WITHIN = 1e-2  # accepted distance from 1 of a quaternion's length, for files with few digits
 _FILES = {"imu": "imu.txt", "frames": "images.txt", "poses": "groundtruth.txt"}
-_LINE = np.dtype([("t", "f8"), ("x", "i8"), ("y", "i8"), ("p", "i8")])
-_EVENT_LINE = re.compile(rb"\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?(\s+[-+]?\d{1,10}){2}\s+\+?[01]\s*")
+_ASSUMED = ", which is assumed, because the file does not give its sensor: give --sensor WIDTHxHEIGHT"
 _CALIB = "expected nine numbers: fx fy cx cy k1 k2 p1 p2 k3, focal lengths above 0"
 
 
@@ -57,6 +59,8 @@ class EcdRecording(EventsOnly):
     place: Place
     events_file: str
     streams: tuple[str, ...]
+    dialect: Dialect = ECD
+    assumed: bool = False  # neither the file nor the caller gives the sensor
     endless: bool = False
     faults: Faults = field(default_factory=Faults, compare=False, repr=False)
 
@@ -67,17 +71,19 @@ class EcdRecording(EventsOnly):
         Args:
             path: the file of events, or a .zip with an events.txt in it.
             name: the name of the recording.
-            sensor: the pixel array; by default that of a DAVIS240C.
+            sensor: the pixel array; by default that of the file, or of a DAVIS240C if the file does not give it.
 
         Raises:
             OSError: the file cannot be opened. InvalidField: the calib.txt of the folder is invalid.
-            UnknownSource: the .zip is not a zip file, or has no events.txt.
+            UnknownSource: the .zip is not a zip file, or has no events.txt; or the columns of the events are not clear.
         """
         path.open("rb").close()  # fail now if the file cannot be opened
         place, events_file = Place(path.parent), path.name
         if path.suffix.lower() == ".zip":
             place, events_file = Place(path, folder_in_zip(path, "events.txt")), "events.txt"
-        sensor = sensor or DAVIS240C
+        dialect = _dialect(path, place, events_file)
+        known = sensor or dialect.sensor
+        sensor = known or DAVIS240C
         lens = None
         if place.has("calib.txt"):
             with place.open("calib.txt") as file:
@@ -87,7 +93,7 @@ class EcdRecording(EventsOnly):
         if "frames" in others and not _has_images(place):  # images.txt without its images
             others.remove("frames")
         streams = ("events", *others)
-        return cls(path, name, sensor, lens, place, events_file, streams)
+        return cls(path, name, sensor, lens, place, events_file, streams, dialect, known is None)
 
     def camera(self, stream: str) -> CameraInfo | None:
         """The lens of calib.txt, or None without one."""
@@ -96,18 +102,8 @@ class EcdRecording(EventsOnly):
     def chunks(self) -> Iterator[Events]:
         """All events from the beginning; see `Recording`. Times are rounded to the nearest us."""
         tally = self.faults.begin("events")
-        return cleaned(self._pieces(tally), self.sensor, tally)
-
-    def _pieces(self, tally: Tally) -> Iterator[Piece]:
-        for first, lines in self._blocks(self.events_file):
-            try:
-                events = _parse(lines)
-            except ValueError:
-                valid = [_is_event(line) or _is_blank(line) for line in lines]
-                _count_lines(tally, first, lines, valid, "the line is not `t[s] x y p`")
-                lines = [line if good else b"" for line, good in zip(lines, valid, strict=True)]
-                events = _parse(lines)
-            yield _line_of(first, lines), events
+        found = pieces(self._blocks(self.events_file), self.dialect, tally)
+        return cleaned(found, self.sensor, tally, _ASSUMED if self.assumed else "")
 
     def imu(self) -> Iterator[Imu]:
         """The samples of imu.txt, `t ax ay az gx gy gz` [s, m/s2, rad/s]; see `Recording`.
@@ -156,7 +152,7 @@ class EcdRecording(EventsOnly):
         for first, lines in self._blocks(_FILES["frames"]):
             for i, line in enumerate(lines):
                 where = f"{_FILES['frames']} line {first + i}"
-                if _is_blank(line):
+                if is_blank(line):
                     continue
                 try:
                     frame = self._frame(line, where)
@@ -186,12 +182,12 @@ class EcdRecording(EventsOnly):
         """Times [us] (N,) and the other columns of a text file of numbers, in blocks of about BLOCK_BYTES."""
         for first, lines in self._blocks(name):
             valid = [_is_row(line, columns) for line in lines]
-            _count_lines(tally, first, lines, valid, f"the line is not {columns} numbers", name + " ")
+            count_lines(tally, first, lines, valid, f"the line is not {columns} numbers", name + " ")
             kept = [line if good else b"" for line, good in zip(lines, valid, strict=True)]
-            numbers = [line.split() for line in kept if not _is_blank(line)]
+            numbers = [line.split() for line in kept if not is_blank(line)]
             rows = np.array(numbers, np.float64) if numbers else np.empty((0, columns))
             t = np.rint(rows[:, 0] * 1e6).astype(np.int64)
-            yield _line_of(first, kept, name + " "), _Rows(t, rows[:, 1:])
+            yield line_of(first, kept, name + " "), _Rows(t, rows[:, 1:])
 
     def _blocks(self, name: str) -> Iterator[tuple[int, list[bytes]]]:
         """The number of the first line, and the lines of a file, in blocks of about BLOCK_BYTES."""
@@ -209,35 +205,6 @@ class EcdRecording(EventsOnly):
                 first += len(lines)
         if rest:
             yield first, [rest]
-
-
-def _is_blank(line: bytes) -> bool:
-    """Whether a line is blank or a comment."""
-    text = line.strip()
-    return not text or text.startswith(b"#")
-
-
-def _is_event(line: bytes) -> bool:
-    """Whether a line is an event."""
-    return _EVENT_LINE.fullmatch(line) is not None and abs(float(line.split()[0])) < MAX_T_S
-
-
-def _line_of(first: int, lines: list[bytes], prefix: str = "") -> Where:
-    """The line of row i of a block, which begins with line `first`."""
-
-    def where(i: int) -> str:
-        kept = [k for k, line in enumerate(lines) if not _is_blank(line)]
-        return f"{prefix}line {first + kept[i]}"
-
-    return where
-
-
-def _count_lines(tally: Tally, first: int, lines: list[bytes], valid: list[bool], why: str, prefix: str = "") -> None:
-    """Count the lines of a block that are not valid."""
-    if not all(valid):
-        at = valid.index(False)
-        text = lines[at][:60].decode("ascii", "backslashreplace")
-        tally.add(Reason.DAMAGED, f"{prefix}line {first + at}", f"{why}: {text!r}", valid.count(False))
 
 
 def _is_row(line: bytes, columns: int) -> bool:
@@ -263,6 +230,18 @@ def _has_images(place: Place) -> bool:
         words[1].decode("utf-8", "replace") for words in lines if len(words) == 2 and not words[0].startswith(b"#")
     ]
     return not paths or ".." in paths[0].split("/") or place.has(paths[0])
+
+
+def _dialect(path: Path, place: Place, events_file: str) -> Dialect:
+    try:
+        with place.open(events_file) as file:
+            head = file.read(HEAD_BYTES)
+    except BrokenRecording:
+        return ECD  # the first chunk of events reports it
+    try:
+        return detect(head)
+    except Unclear as error:
+        raise UnknownSource(path, str(error)) from None
 
 
 def parse_calib(path: Path, data: bytes, sensor: Sensor) -> CameraInfo:
@@ -291,25 +270,9 @@ def parse_calib(path: Path, data: bytes, sensor: Sensor) -> CameraInfo:
         raise InvalidField(str(path), "calib", text, _CALIB) from None
 
 
-def _parse(lines: list[bytes]) -> Events:
-    """The events of these lines as they are recorded. Blank lines and lines that begin with # are skipped.
-
-    Raises:
-        ValueError: a line is not `t[s] x y p`.
-    """
-    if lines and b"#" in b"".join(lines):
-        lines = [line for line in lines if not line.lstrip().startswith(b"#")]
-    if not any(map(bytes.strip, lines)):
-        return Events.empty()
-    rows = np.loadtxt(lines, _LINE, comments=None, ndmin=1)
-    if not (np.abs(rows["t"]) < MAX_T_S).all() or rows["p"].max() > 1 or rows["p"].min() < 0:  # in this form nan fails
-        raise ValueError("t is not finite or p is neither 0 nor 1")
-    return as_recorded(np.rint(rows["t"] * 1e6).astype(np.int64), rows["x"], rows["y"], rows["p"])
-
-
 def _accepts(path: Path) -> bool:
     """Whether this is a folder with events.txt, a text file, or an archive."""
-    return (path / "events.txt").is_file() if path.is_dir() else path.suffix.lower() in (".txt", ".zip")
+    return (path / "events.txt").is_file() if path.is_dir() else path.suffix.lower() in (".txt", ".csv", ".tsv", ".zip")
 
 
 def _open(path: Path, sensor: Sensor | None, topic: str | None) -> EcdRecording:
@@ -320,5 +283,7 @@ def _open(path: Path, sensor: Sensor | None, topic: str | None) -> EcdRecording:
 
 
 FORMAT = Format(
-    "a folder with events.txt, a FILE.zip with one, or FILE.txt (Event Camera Dataset)", _open, accepts=_accepts
+    "a folder with events.txt, a FILE.zip with one, or FILE.txt, FILE.csv, FILE.tsv (Event Camera Dataset, text)",
+    _open,
+    accepts=_accepts,
 )

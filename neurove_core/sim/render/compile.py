@@ -1,9 +1,9 @@
 """Compilation of the simulator's loops: without the GIL, and either fast or exact to the last bit."""
 
 from collections.abc import Callable
-from typing import Any, ParamSpec, TypeVar, cast
+from typing import ParamSpec, TypeVar
 
-import numba
+from neurove_core.compiled import compile_with
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -13,7 +13,7 @@ _HARMLESS = {"contract", "arcp", "nsz"}  # infinity marks an empty place, so nin
 
 def fast(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function; x / 0 is infinite, and the last bit of a result may differ from numpy."""
-    return _compiled(function, fastmath=_HARMLESS, error_model="numpy")
+    return compile_with(function, fastmath=_HARMLESS, error_model="numpy")
 
 
 def exact(function: Callable[P, R]) -> Callable[P, R]:
@@ -21,11 +21,4 @@ def exact(function: Callable[P, R]) -> Callable[P, R]:
 
     The flags are explicit, because a function without flags inherits those of the first `fast` function that calls it.
     """
-    return _compiled(function, fastmath=False, error_model="python")
-
-
-def _compiled(function: Callable[P, R], **how: Any) -> Callable[P, R]:
-    try:
-        return cast("Callable[P, R]", numba.njit(nogil=True, cache=True, **how)(function))
-    except RuntimeError:  # no place for a cache, as in a read-only image: compile at each start
-        return cast("Callable[P, R]", numba.njit(nogil=True, **how)(function))
+    return compile_with(function, fastmath=False, error_model="python")

@@ -1,10 +1,16 @@
 """Sigmoid and tanh of arrays, in place, for the compiled loops of recurrence.py and engine/cells.py."""
 
-import numba
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 
-fused = numba.njit(nogil=True, cache=True, fastmath={"contract", "reassoc", "nsz", "arcp"})
-"""Compile a loop whose rounding may depend on the machine: sums may be reordered, multiplications fused with sums."""
+from neurove_core.compiled import compile_with
+
+
+def fused(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a loop whose rounding may depend on the machine: sums are reordered, multiplications fused with sums."""
+    return compile_with(function, fastmath={"contract", "reassoc", "nsz", "arcp"})
 
 
 @fused

@@ -45,7 +45,7 @@ def test_a_new_bundle_can_be_inspected(run, tmp_path):
         (("drive", "nowhere.xyz"), "supported sources"),
         (("drive", "gopher://x"), "unknown scheme"),
         (("config", "show", "--queue-s", "-1"), "queue_s='-1' (from flag): Input should be greater than 0"),
-        (("health", "--connect", "nonsense"), "connect=nonsense"),
+        (("health", "--connect", "nonsense"), "connect='nonsense' (from flag): 'nonsense' is no endpoint"),
     ],
 )
 def test_wrong_usage_is_one_line_and_exit_code_2(run, tmp_path, monkeypatch, arguments, words):

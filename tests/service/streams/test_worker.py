@@ -1,15 +1,20 @@
 import threading
 import time
+from dataclasses import replace
 
 import pytest
 
-from neurove_protocol import CameraInfo, TwistEstimate
+from neurove_core.ingest.wire import read_packet
+from neurove_protocol import CameraInfo, Flag, TwistEstimate
 from neurove_protocol.errors import Malformed
 from neurove_protocol.events import PacketLimits, encode_packet
+from neurove_service.streams.intake import Arrival
 from neurove_service.streams.lanes import Lanes
+from neurove_service.streams.overload import Overload
 from neurove_service.streams.stream import Stream
 from neurove_service.streams.worker import Inbox, Outlet, Sample, StreamWorker
-from tests.builders import make_packets
+from tests.builders import make_packet, make_packets
+from tests.live.conftest import wait_until
 
 
 def sample(number, received_ns=0, size=0):
@@ -17,13 +22,8 @@ def sample(number, received_ns=0, size=0):
 
 
 def drain(inbox):
-    taken, dropped = [], 0
-    while True:
-        one, lost = inbox.take(0)
-        dropped += lost
-        if one is None:
-            return taken, dropped
-        taken.append(one.payload[0])
+    samples, dropped = inbox.take_all(0)
+    return [one.payload[0] for one in samples], dropped
 
 
 def test_an_inbox_keeps_the_order_and_loses_nothing_within_its_bounds():
@@ -104,18 +104,21 @@ def test_malformed_packets_are_counted_and_lose_nothing_else(worker, published):
 
 
 def test_an_internal_error_on_a_packet_does_not_end_the_stream(worker, published, monkeypatch, caplog):
-    accept = worker.stream.accept
+    push, planted = worker.stream.lanes.push, []
 
-    def faulty(packet, arrival):
-        if packet.seq == 20:
+    def faulty(packet):
+        if packet.seq >= 20 and not planted:
+            planted.append(packet)
             raise RuntimeError("planted")
-        return accept(packet, arrival)
+        return push(packet)
 
-    monkeypatch.setattr(worker.stream, "accept", faulty)
+    monkeypatch.setattr(worker.stream.lanes, "push", faulty)
     for packet in make_packets(100):
         worker.put_packet(encode_packet(packet), time.monotonic_ns())
-    published.wait_for(6)
-    assert worker.stream.counters.failed_packets == 1
+    published.wait_for(5)
+    counters = worker.stream.counters
+    assert 1 <= counters.failed_packets < 20
+    assert counters.resets == 1
 
 
 def test_a_standby_model_runs_however_often_packets_arrive(worker, monkeypatch):
@@ -145,3 +148,114 @@ def test_an_unreadable_camera_info_is_refused_and_the_stream_continues(slot):
     worker.stop()
     worker.join(5)
     assert published.closed.is_set()
+
+
+def test_packets_that_wait_together_give_the_same_estimates_as_one_by_one(slot):
+    packets = [replace(packet, seq=packet.seq + (packet.seq > 150)) for packet in make_packets(400, n=10, step_us=1000)]
+    payloads = [encode_packet(packet, "soa8" if packet.seq % 37 == 0 else None) for packet in packets]
+    payloads[60] = b"garbage"
+    expected = Stream("cam0", slot)
+    for payload in payloads:
+        try:
+            packet = read_packet(payload)
+        except Malformed:
+            expected.refused(time.monotonic_ns(), "")
+        else:
+            now_ns = time.monotonic_ns()
+            expected.accept(packet, Arrival(now_ns, now_ns, now_ns // 1000))
+    published = Published()
+    gate = threading.Event()
+    worker = StreamWorker(
+        Stream("cam0", slot),
+        lambda: published.open() if gate.wait(20) else None,
+        Inbox(60, 1 << 26),
+        PacketLimits(),
+    )
+    for payload in payloads:
+        now_ns = time.monotonic_ns()
+        worker.put_packet(payload, now_ns, now_ns // 1000)
+    gate.set()
+    published.wait_for(expected.counters.estimates)
+    wait_until(lambda: worker.stream.counters.packets_received == expected.counters.packets_received)
+    worker.stop()
+    worker.join(5)
+    counters = worker.stream.counters
+    assert counters == expected.counters
+    assert (counters.gap_packets, counters.malformed_packets) == (1, 1)
+    assert len(published.estimates) == 7
+
+
+def test_runs_and_single_packets_count_the_same_events(slot):
+    packets = make_packets(100, n=7, step_us=500)
+    alone, together = Stream("cam0", slot), Stream("cam0", slot)
+    now_ns = time.monotonic_ns()
+    arrival = Arrival(now_ns, now_ns, now_ns // 1000)
+    estimates = [one for packet in packets for one in alone.accept(packet, arrival)]
+    tick = make_packet(0, seq=101, t0_us=50_000)
+    found, index = [], 0
+    payloads = [encode_packet(packet) for packet in packets]
+    while index < len(payloads):
+        run = together.collect(payloads[index:], PacketLimits())
+        if run is None:
+            found += together.accept(read_packet(payloads[index]), arrival)
+            index += 1
+        else:
+            found += together.accept_run(run, arrival)
+            index += len(run.marks)
+    estimates += alone.accept(replace(tick, seq=100), arrival)
+    found += together.accept(replace(tick, seq=100), arrival)
+    assert len(found) == 1
+    assert [(one.twists, one.events, one.flags) for one in found] == [
+        (one.twists, one.events, one.flags) for one in estimates
+    ]
+    assert together.counters == alone.counters
+
+
+class SlowModel:
+    """Makes each window of a stream take longer than the window lasts."""
+
+    def __init__(self, stream, seconds):
+        push = stream.lanes.push
+
+        def slow(packet):
+            pushing = push(packet)
+            time.sleep(seconds * len(pushing.estimates))
+            return pushing
+
+        stream.lanes.push = slow
+
+
+def test_an_overloaded_worker_answers_whole_windows_of_the_newest_data(slot):
+    published = Published()
+    stream = Stream("cam0", slot, max_age_s=5)
+    SlowModel(stream, 0.15)  # windows of 50 ms: three times the load
+    worker = StreamWorker(stream, published.open, Inbox(60, 1 << 26), PacketLimits())
+    began = time.monotonic()
+    packets = make_packets(1200, n=20)  # 4.8 s
+    for packet in packets:
+        time.sleep(max(0.0, began + packet.t0_us * 1e-6 - time.monotonic()))
+        now_ns = time.monotonic_ns()
+        worker.put_packet(encode_packet(packet), now_ns, now_ns // 1000)
+    worker.stop()
+    worker.join(5)
+    late = published.estimates[len(published.estimates) // 2 :]
+    assert all(Flag.GAP not in one.flags for one in late)  # each has all of its events
+    assert all(Flag.RESET not in one.flags for one in late)
+    assert any(Flag.OVERLOAD in one.flags for one in late)
+    lost = stream.counters.losses().nonzero()
+    assert lost.keys() == {"overload_packets", "shed_windows"}
+    answered = stream.counters.windows + stream.counters.shed_windows
+    assert answered == published.estimates[-1].end_us // 50_000
+    assert late[-1].trace.queued_ns - late[-1].trace.received_ns < 600e6
+
+
+def test_a_stall_that_is_shorter_than_the_patience_loses_nothing():
+    overload = Overload()
+    ms = 1_000_000
+    assert not any(overload.must_shed(waited * ms, (1000 + waited) * ms) for waited in range(0, 900, 10))
+    assert not overload.must_shed(50 * ms, 2000 * ms)
+    assert not any(overload.must_shed(300 * ms, at * ms) for at in range(2100, 3000, 10))
+    assert overload.must_shed(300 * ms, 3200 * ms)
+    assert overload.must_shed(150 * ms, 3300 * ms)
+    assert not overload.must_shed(50 * ms, 3400 * ms)
+    assert not overload.must_shed(150 * ms, 9000 * ms)  # the overload has ended long ago

@@ -1,0 +1,44 @@
+"""Endpoints of Zenoh, checked before Zenoh sees them, so that an error says in our words what is wrong."""
+
+import re
+from typing import Final
+
+PROTOCOLS: Final = ("tcp", "udp", "tls", "quic", "ws", "unixsock-stream")
+"""Protocols of the installed Zenoh; each also in zenoh_config."""
+
+_EXAMPLE: Final = "such as tcp/127.0.0.1:7447"
+_HOST_PORT: Final = re.compile(r"(?:\[[0-9A-Fa-f:.%\w]+\]|[^\s:/\[\]]+):(\d{1,5})")
+
+
+def check_endpoint(text: str) -> str:
+    """An endpoint such as `tcp/127.0.0.1:7447`, with Zenoh's `?metadata` and `#config` where given.
+
+    Raises:
+        ValueError: it has another form; the text says which form is right.
+
+    >>> check_endpoint("tcp/[::1]:7447")
+    'tcp/[::1]:7447'
+    """
+    protocol, slash, rest = text.partition("/")
+    address = re.split(r"[?#]", rest, maxsplit=1)[0]
+    if not slash or protocol not in PROTOCOLS:
+        raise ValueError(_wrong_protocol(text))
+    if protocol == "unixsock-stream":
+        if not address:
+            raise ValueError(f"{text!r} has no path: give unixsock-stream/PATH")
+        return text
+    found = _HOST_PORT.fullmatch(address)
+    if not found:
+        raise ValueError(f"{text!r} has no HOST:PORT after {protocol}/: give an endpoint {_EXAMPLE}")
+    if int(found[1]) > 65535:
+        raise ValueError(f"{text!r}: port {found[1]}: a port is at most 65535")
+    return text
+
+
+def _wrong_protocol(text: str) -> str:
+    address = text.partition("://")[2] or text
+    if _HOST_PORT.fullmatch(address) and address.partition(":")[0] not in PROTOCOLS:
+        protocol = text.partition("://")[0]
+        meant = f"{protocol if protocol in PROTOCOLS else 'tcp'}/{address}"
+        return f"{text!r} is no endpoint: did you mean {meant!r}?"
+    return f"{text!r} is no endpoint: give PROTOCOL/HOST:PORT {_EXAMPLE}; the protocols are {', '.join(PROTOCOLS)}"
