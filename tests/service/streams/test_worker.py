@@ -139,9 +139,9 @@ def test_an_unreadable_camera_info_is_refused_and_the_stream_continues(slot):
 
     published = Published(broken)
     worker = StreamWorker(Stream("cam0", slot), published.open, Inbox(60, 1 << 26), PacketLimits())
-    worker.put_camera(b"garbage", 1)
+    worker.put_camera(b"garbage", time.monotonic_ns())
     good = CameraInfo(stream="cam0", width=64, height=48, lens="pinhole", fx=40, fy=40, cx=32, cy=24)
-    worker.put_camera(good.encode(), 1)
+    worker.put_camera(good.encode(), time.monotonic_ns())
     for packet in make_packets(30):
         worker.put_packet(encode_packet(packet), time.monotonic_ns())
     assert "uncalibrated" not in published.wait_for(2)[0].flags
