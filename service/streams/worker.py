@@ -56,7 +56,7 @@ class Inbox:
 
     def __init__(self, max_age_s: float, max_bytes: int) -> None:
         self._samples: deque[Sample] = deque()
-        self._max_age_ns, self._max_bytes = max_age_s * 1e9, max_bytes
+        self.max_age_s, self._max_age_ns, self._max_bytes = max_age_s, max_age_s * 1e9, max_bytes
         self._bytes = self._dropped = 0
         self._changed = threading.Condition()
 
@@ -128,7 +128,7 @@ class StreamWorker:
         self._guard = guard or Guard()
         self._pause_until = 0.0  # a time, not a duration: packets that arrive in a pause must not extend it
         self._pending: deque[Sample] = deque()  # taken out of the queue, not yet processed
-        self._overload = Overload()
+        self._overload = Overload(inbox.max_age_s)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"stream {stream.name}", daemon=True)
         self._thread.start()
