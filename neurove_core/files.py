@@ -4,6 +4,7 @@ A writer of the command line inherits this from `atomic_path`, whatever library 
 that was asked for, and nothing left.
 """
 
+import errno
 import os
 import re
 import tempfile
@@ -12,6 +13,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
+
+import numpy as np
 
 
 @contextmanager
@@ -100,6 +103,23 @@ def write_atomically(path: Path, data: bytes) -> None:
         part.write_bytes(data)
 
 
+def read_whole(path: Path) -> memoryview:
+    """The bytes of a file, in memory that may be written to; other threads go on while it is read.
+
+    Raises:
+        OSError: the file cannot be read, or it became shorter meanwhile.
+    """
+    with path.open("rb", buffering=0) as file:
+        data = np.empty(os.fstat(file.fileno()).st_size, np.uint8).data
+        done = 0
+        while done < len(data):
+            read = file.readinto(data[done:])
+            if not read:
+                raise OSError(errno.EIO, f"{done} of {len(data)} bytes could be read")
+            done += read
+    return data
+
+
 def sync(path: Path) -> None:
     """Wait until a file's content, or a folder's entries, are on the disk."""
     descriptor = os.open(path, os.O_RDONLY)
@@ -121,3 +141,14 @@ def move_folder(source: Path, target: Path) -> None:
     source.rename(target)
     sync(target.parent)
     sync(source.parent)
+
+
+def make_writable(folder: Path) -> None:
+    """Create a folder, unless it exists, and check that a file can be written into it.
+
+    Raises:
+        OSError: it cannot.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=folder) as file:
+        file.write(b"\0")

@@ -6,20 +6,19 @@ tensors for the architecture that the header declares, and that all values are f
 
 import hashlib
 import json
-import struct
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Literal, Self
+from typing import Final, Literal, Self
 
 import safetensors.torch
 import torch
 from pydantic import Field, ValidationError, ValidationInfo, field_validator
-from safetensors import SafetensorError
 from torch import Tensor, nn
 
 from neurove_core.config import Config, ModelConfig
-from neurove_core.files import allow_no_temporary_folder, write_atomically
+from neurove_core.files import allow_no_temporary_folder, read_whole, write_atomically
 from neurove_core.models import golden
+from neurove_core.models.container import Data, object_without_duplicates, read_container, read_tensors
 from neurove_core.models.golden import Golden
 from neurove_core.models.metadata import BundleLimits, Metadata
 from neurove_core.models.uncertainty import Uncertainty, why_no_correlation
@@ -33,15 +32,13 @@ from neurove_protocol.fields import WrongField
 BUNDLE_VERSION: Final = 1
 SUFFIX = ".safetensors"
 MAX_BYTES = 256 << 20
-MAX_HEADER_BYTES = 1 << 20
-MAX_TENSORS = 4096
 
 LinearUnit = Literal["m/s", "1/s per m of height"]
 METRIC: Final[LinearUnit] = "m/s"
 PER_HEIGHT: Final[LinearUnit] = "1/s per m of height"
 
 _KEY = "neurove"
-_OFFSET, _SCALE, _CORRELATION = "output.offset", "output.scale", "output.correlation"
+_SMALL = _OFFSET, _SCALE, _CORRELATION = "output.offset", "output.scale", "output.correlation"
 
 
 class UncertaintyHeader(Config):
@@ -170,13 +167,13 @@ def load(path: Path) -> Bundle:
         size = path.stat().st_size
         if size > MAX_BYTES:
             raise BadModel(path.name, f"size={size}: a bundle has at most {MAX_BYTES} bytes")
-        data = path.read_bytes()
+        data = read_whole(path)
     except OSError as error:
         raise BadModel(path.name, error.strerror or str(error)) from None
     return from_bytes(data, path.name)
 
 
-def from_bytes(data: bytes, name: str) -> Bundle:
+def from_bytes(data: Data, name: str) -> Bundle:
     """Check and load a bundle from its bytes.
 
     Args:
@@ -188,20 +185,19 @@ def from_bytes(data: bytes, name: str) -> Bundle:
     """
     allow_no_temporary_folder()
     header = read_header(data, name)
-    try:
-        tensors = safetensors.torch.load(data)
-    except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:
-        # the last two types: a tensor without elements may declare sizes that exceed torch's integers
-        raise BadModel(name, f"not a complete safetensors file: {error}") from None
+    tensors = read_tensors(data, name)
     test = golden.from_tensors(tensors, header.config, header.golden_tolerance, name)
     with torch.device("meta"):  # shapes without memory: a small header may declare terabytes of weights
         wanted = {**_stored(_network(header)), _OFFSET: torch.zeros(6), _SCALE: torch.ones(6)}
         if header.uncertainty is not None:
-            wanted[_CORRELATION] = torch.eye(6)
+            wanted[_CORRELATION] = torch.zeros(6, 6)  # not torch.eye: on this device it imports 800 modules
     _check_tensors(tensors, wanted, name)
     network = _network(header)
-    offset, scale = tensors.pop(_OFFSET), tensors.pop(_SCALE)
-    uncertainty = _uncertainty(header.uncertainty, tensors.pop(_CORRELATION, None), name)
+    # cloned, because the tensors are views of the whole file
+    offset, scale, correlation = (tensors.pop(key).clone() if key in tensors else None for key in _SMALL)
+    assert offset is not None
+    assert scale is not None
+    uncertainty = _uncertainty(header.uncertainty, correlation, name)
     network.load_state_dict(tensors, strict=False)  # names are checked; only the norms' batch counters are not stored
     return Bundle(
         name=header.name,
@@ -219,7 +215,7 @@ def from_bytes(data: bytes, name: str) -> Bundle:
     )
 
 
-def read_header(data: bytes, name: str) -> Header:
+def read_header(data: Data, name: str) -> Header:
     """Read and check the header in a bundle's bytes.
 
     Args:
@@ -229,15 +225,8 @@ def read_header(data: bytes, name: str) -> Header:
     Raises:
         BadModel: as `load`.
     """
-    if len(data) < 8:
-        raise BadModel(name, f"size={len(data)}: not a safetensors file")
-    (length,) = struct.unpack("<Q", data[:8])
-    if length > min(MAX_HEADER_BYTES, len(data) - 8):
-        raise BadModel(
-            name, f"header length {length}: not a safetensors file, or a header over {MAX_HEADER_BYTES} bytes"
-        )
+    entries = read_container(data, name).entries
     try:
-        entries = json.loads(data[8 : 8 + length], object_pairs_hook=object_without_duplicates)
         own = entries["__metadata__"][_KEY]
         fields = json.loads(own, object_pairs_hook=object_without_duplicates)
     except (KeyError, TypeError):
@@ -246,8 +235,6 @@ def read_header(data: bytes, name: str) -> Header:
         ) from None
     except (ValueError, RecursionError) as error:
         raise BadModel(name, f"its header cannot be read: {error}") from None
-    if len(entries) > MAX_TENSORS + 1:
-        raise BadModel(name, f"{len(entries) - 1} tensors: at most {MAX_TENSORS}")
     version = fields.get("bundle_version") if isinstance(fields, dict) else None
     if version != BUNDLE_VERSION:
         raise BadModel(name, f"bundle_version={shown(version)}: this program reads version {BUNDLE_VERSION}")
@@ -332,15 +319,3 @@ def _check_tensors(tensors: dict[str, Tensor], wanted: dict[str, Tensor], name: 
             raise BadModel(name, f"tensor {key!r} is {got}, its header's architecture needs {needs}")
         if not bool(torch.isfinite(tensor).all()):
             raise BadModel(name, f"tensor {key!r} holds values that are not finite")
-
-
-def object_without_duplicates(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Hook of `json.loads` that refuses duplicate keys, because JSON readers differ on which one counts.
-
-    Raises:
-        ValueError: a key occurs twice in one object.
-    """
-    fields = dict(pairs)
-    if len(fields) != len(pairs):
-        raise ValueError("a key occurs twice in one object")
-    return fields

@@ -89,7 +89,7 @@ def from_tensors(tensors: dict[str, Tensor], config: ModelConfig, tolerance: flo
         raise BadModel(name, "golden test: a count is 0, or a bit after the last cell is set")
     flat = np.zeros(cells, np.uint8)
     flat[seen[:cells] != 0] = counts
-    return Golden(flat.reshape(windows, *grid), twists.numpy(), tolerance)
+    return Golden(flat.reshape(windows, *grid), twists.numpy().copy(), tolerance)
 
 
 def _require(found: dict[str, Tensor], key: str, dtype: torch.dtype, shape: tuple[int, ...], name: str) -> None:

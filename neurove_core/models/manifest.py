@@ -18,7 +18,8 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey,
 from pydantic import ConfigDict, Field, ValidationError
 
 from neurove_core.config import Config
-from neurove_core.models.bundle import MAX_BYTES, Header, object_without_duplicates, read_header
+from neurove_core.models.bundle import MAX_BYTES, Header, read_header
+from neurove_core.models.container import Data, object_without_duplicates
 from neurove_core.models.metadata import MAX_RELEASE
 from neurove_core.models.signing_keys import key_id
 from neurove_protocol.errors import Downgrade, InvalidField, Untrusted, shown
@@ -58,7 +59,7 @@ class _File(_Strict):
 
 
 def sign(
-    data: bytes,
+    data: Data,
     key: Ed25519PrivateKey,
     *,
     release: int | None = None,
@@ -98,7 +99,7 @@ def sign(
     return canonical(_File(manifest=text, signature=signature, key_id=made.key_id).model_dump()).encode() + b"\n"
 
 
-def verify(data: bytes, signature: bytes, trusted: Iterable[Ed25519PublicKey], name: str = "bundle") -> Signed:
+def verify(data: Data, signature: bytes, trusted: Iterable[Ed25519PublicKey], name: str = "bundle") -> Signed:
     """Verify a bundle's signature: the manifest that a trusted key signed.
 
     The bundle's content is parsed only after the signature, size and digest have been verified.

@@ -20,7 +20,7 @@ from neurove_core.geometry.motion import Twists, twists
 from neurove_core.ingest import windows
 from neurove_core.ingest.windows import Window, WindowsState
 from neurove_core.io import Recording, UnknownSource
-from neurove_core.io.formats.pose_files import read_poses
+from neurove_core.io.formats.pose_files import read_truth
 from neurove_core.sources import open_source
 from neurove_core.training.config import RecordedConfig, TrainingConfig
 from neurove_core.training.data import FORMAT, Sequence, save
@@ -205,7 +205,7 @@ def _open(field: str, source: str, one: RecordedConfig) -> _OpenRecording:
     recording = open_source(source, topic=one.topic)
     if recording.endless:
         raise InvalidField("training", f"{field}.source", source, "it never ends: add ?seconds=S")
-    truth = twists(read_poses(Path(one.truth))) if one.truth else recording.twists()
+    truth = twists(read_truth(Path(one.truth))) if one.truth else recording.twists()
     if truth is None:
         raise InvalidField("training", f"{field}.truth", None, f"{source} has no truth: give a file of poses")
     camera = recording.camera(_STREAM)

@@ -174,6 +174,25 @@ def refuse_existing(what: str, field: str, path: Path, source: str | None, *, fo
         raise InvalidField(what, field, str(path), "the file exists; --force replaces it")
 
 
+def check_folder(what: str, field: str, path: Path) -> None:
+    """Create a folder for results, and refuse one that cannot be written, before the work begins.
+
+    Args:
+        what: the command.
+        field: name of the argument.
+        path: the folder.
+
+    Raises:
+        InvalidField: it cannot be created or written.
+    """
+    from neurove_core.files import make_writable
+
+    try:
+        make_writable(path)
+    except OSError as error:
+        raise InvalidField(what, field, str(path), f"files cannot be written: {error.strerror or error}") from None
+
+
 def commit() -> str:
     """The commit of the running code, with a + after local changes; outside a git checkout the package's version."""
     import importlib.metadata

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from neurove_core.models import manifest, signing_keys
+from neurove_core.models.container import Data
 from neurove_protocol.control import ModelInfo, SignatureState
 from neurove_protocol.errors import InvalidField, Untrusted
 
@@ -21,11 +22,11 @@ class Signed(NamedTuple):
         return info.release if self.release is None else self.release
 
 
-Verify = Callable[[bytes, bytes | None], Signed]
+Verify = Callable[[Data, bytes | None], Signed]
 """Bundle and signature to the signature state; raises NeuroVEError if this node must not use the bundle."""
 
 
-def verify_nothing(_: bytes, signature: bytes | None) -> Signed:
+def verify_nothing(_: Data, signature: bytes | None) -> Signed:
     """The rule of a node that trusts no key: it refuses nothing and trusts nothing."""
     return Signed("unsigned" if signature is None else "unchecked")
 
@@ -43,7 +44,7 @@ def verifier(keys: tuple[Path, ...]) -> Verify:
         return verify_nothing
     trusted = [signing_keys.read_public(_read(path), str(path)) for path in keys]
 
-    def verify(data: bytes, signature: bytes | None) -> Signed:
+    def verify(data: Data, signature: bytes | None) -> Signed:
         if signature is None:
             raise Untrusted("bundle", "unsigned", "this node accepts only signed models")
         signed = manifest.verify(data, signature, trusted)

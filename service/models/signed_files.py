@@ -4,6 +4,7 @@ import hashlib
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
+from neurove_core.files import read_whole
 from neurove_core.models import bundle, manifest
 from neurove_protocol.errors import NeuroVEError
 from neurove_service.models.signatures import Signed, Verify
@@ -42,7 +43,7 @@ class SignedFiles:
         if known is None or known[0] != key:
             result: Signed | NeuroVEError
             try:
-                result = self._verify(path.read_bytes(), signature.read_bytes() if signature.exists() else None)
+                result = self._verify(read_whole(path), signature.read_bytes() if signature.exists() else None)
             except NeuroVEError as error:
                 result = error.with_traceback(None)
             known = self._results[path] = key, result
@@ -57,7 +58,7 @@ class SignedFiles:
         known = self._digests.get(path)
         if known is None or known[0] != stamp:
             try:
-                known = self._digests[path] = stamp, hashlib.sha256(path.read_bytes()).hexdigest()
+                known = self._digests[path] = stamp, hashlib.sha256(read_whole(path)).hexdigest()
             except OSError:
                 return None
         return known[1]

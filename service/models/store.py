@@ -17,9 +17,10 @@ import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from neurove_core.files import move_folder, write_atomically
+from neurove_core.files import move_folder, read_whole, write_atomically
 from neurove_core.models import bundle, manifest
 from neurove_core.models.bundle import Bundle
+from neurove_core.models.container import Data
 from neurove_protocol.control import ModelInfo, PushRequest
 from neurove_protocol.errors import BadModel, NeuroVEError, NoQuota, NoSpace, NoStore, TooLarge
 from neurove_service import logs
@@ -121,7 +122,7 @@ class ModelStore:
             if _size(target / FILE) != wanted.size:
                 return self._fetch_new(wanted, target, pull, stop, on_progress, admit)
             on_progress(Progress("staged", "already stored"))
-            data = (target / FILE).read_bytes()
+            data = read_whole(target / FILE)
             try:
                 model, signed = self._check(data, wanted, admit)
             except BadModel:  # the file changed on the disk
@@ -148,7 +149,7 @@ class ModelStore:
         while True:
             resumed = _size(staging / FILE) > 0
             moved += pull_into(staging / FILE, wanted, pull, stop, on_progress, self._patience_s)
-            data = (staging / FILE).read_bytes()
+            data = read_whole(staging / FILE)
             if not resumed or hashlib.sha256(data).hexdigest() == wanted.digest:
                 break
             on_progress(Progress("fetching", "the bytes of an earlier push do not match; fetching starts again"))
@@ -168,7 +169,7 @@ class ModelStore:
         log.info("model pushed", model=model.name, digest=model.digest, signature=signed.state)
         return model, signed, moved
 
-    def _check(self, data: bytes, wanted: PushRequest, admit: Admit) -> tuple[Bundle, Signed]:
+    def _check(self, data: Data, wanted: PushRequest, admit: Admit) -> tuple[Bundle, Signed]:
         digest = hashlib.sha256(data).hexdigest()
         if digest != wanted.digest:
             raise BadModel(

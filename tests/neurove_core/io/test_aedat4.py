@@ -5,7 +5,7 @@ import struct
 import numpy as np
 import pytest
 
-from neurove_core.io import BrokenRecording, MissingGeometry, UnknownSource
+from neurove_core.io import Frame, MissingGeometry, UnknownSource
 from neurove_core.io.formats.aedat.aedat4 import EXPOSURE, EXTERNAL, GENERATOR, READOUT
 from neurove_core.sources import open_source
 from neurove_protocol import Events
@@ -83,12 +83,11 @@ def test_the_input_and_the_generator_of_a_camera_have_separate_channels(tmp_path
     assert not list(recording.imu())
 
 
-def test_triggers_whose_time_runs_backwards_raise_an_error(tmp_path):
-    data = with_triggers([(5, 1)], [(4, 2)])
-    triggers = open_source(put(tmp_path, "a.aedat4", data)).triggers()
-    assert next(iter(triggers)).t.tolist() == [5]
-    with pytest.raises(BrokenRecording, match="time runs backwards"):
-        next(iter(triggers))
+def test_late_triggers_are_discarded_and_counted(tmp_path):
+    recording = open_source(put(tmp_path, "a.aedat4", with_triggers([(5, 1)], [(4, 2)], [(6, 1)])))
+    assert all_triggers(recording).t.tolist() == [5, 6]
+    (fault,) = recording.faults.found
+    assert (fault.stream, fault.reason, fault.count) == ("triggers", "late", 1)
 
 
 @pytest.mark.parametrize("part", [0.3, 0.7])
@@ -96,17 +95,22 @@ def test_every_stream_of_a_truncated_file_gives_its_complete_packets_and_then_na
     data = shared("aedat4/davis346.aedat4").read_bytes()
     full = open_source(put(tmp_path, "a.aedat4", data))
     truncated = open_source(put(tmp_path, "b.aedat4", data[: int(part * len(data))]))
-    places = set()
     for stream in ("imu", "frames", "triggers", "chunks"):
-        got = []
-        with pytest.raises(BrokenRecording) as caught:
-            got.extend(getattr(truncated, stream)())  # keeps the items before the error
-        places.add(caught.value.details["where"])
+        got, want = list(getattr(truncated, stream)()), list(getattr(full, stream)())
         assert got
-        for piece, want in zip(got, getattr(full, stream)(), strict=False):
-            for a, b in zip(piece, want, strict=True):
-                np.testing.assert_array_equal(a, b)
+        if stream == "frames":
+            got, want = [joined_frames(got)], [joined_frames(want)]
+        for some, others in zip(zip(*got, strict=True), zip(*want, strict=True), strict=True):
+            part_of, whole = np.concatenate(some), np.concatenate(others)
+            assert part_of.size
+            np.testing.assert_array_equal(part_of, whole[: len(part_of)])
+    places = {fault.where for fault in truncated.faults.unread}
+    assert len(truncated.faults.found) == 4
     assert len(places) == 1  # all streams end at the same place
+
+
+def joined_frames(frames: list[Frame]) -> tuple[np.ndarray, np.ndarray]:
+    return np.array([frame.t_us for frame in frames]), np.stack([frame.image for frame in frames])
 
 
 # --- packets and streams of events -----------------------------------------------------------------------------------
@@ -115,21 +119,52 @@ def test_every_stream_of_a_truncated_file_gives_its_complete_packets_and_then_na
 @pytest.mark.parametrize(
     ("t", "x", "why"),
     [
-        ((20, 30, 40), (1, 64, 3), "event 1 at x=64 y=2 lies outside the sensor 64x48"),
-        ((20, 19, 40), (1, 2, 3), "event 1 at t=19 us comes after t=20 us"),
-        ((9, 30, 40), (1, 2, 3), "event 0 at t=9 us comes after t=10 us"),
-        ((9, 30, 20), (1, 2, 3), "event 0 at t=9 us comes after t=10 us"),
+        ((20, 30, 40), (1, 64, 3), "x=64 y=2 lies outside the sensor 64x48"),
+        ((20, 30, 40), (1, 0xFFFF, 3), "x=-1 y=2 lies outside the sensor 64x48"),
+        ((20, 19, 40), (1, 2, 3), "t=19 us comes after t=20 us"),
+        ((9, 30, 40), (1, 2, 3), "t=9 us comes after t=10 us"),
     ],
 )
-def test_a_packet_with_a_bad_event_ends_the_recording_before_that_event(t, x, why, tmp_path):
-    first = Events.from_columns([5, 10], [1, 2], [3, 4], [0, 1])
+def test_a_bad_event_is_skipped_and_named_by_its_packet(t, x, why, tmp_path):
+    first, last = Events.from_columns([5, 10], [1, 2], [3, 4], [0, 1]), Events.from_columns([50], [1], [3], [0])
     second = Events.from_columns(t, x, [2, 2, 2], [1, 1, 1])
-    file = aedat4([first, second, second], SENSOR)
+    file = aedat4([first, second, last], SENSOR)
     events, error = read_broken(open_source(put(tmp_path, "a.aedat4", file.data)))
-    assert_same(events, Events.join([first, second.span(0, int(why[6]))]))
+    assert events.t.tolist() == sorted({5, 10, 50} | ({20, 30, 40} & set(t)) - ({30} if x[1] > 63 else set()))
     assert error is not None
     assert error.details["where"] == f"byte {file.starts[1]}"
     assert why in error.message
+
+
+@pytest.mark.parametrize("shift", [1, 50, 8])
+def test_after_a_damaged_packet_the_next_one_is_found(shift, tmp_path):
+    packets = [make_events(50, seed=i, start_us=i * 200_000) for i in range(4)]
+    file = aedat4(packets, SENSOR)
+    data = bytearray(file.data)
+    data[file.starts[1] : file.starts[1] + shift] = b"\xff" * shift  # the header of the second packet, or more
+    recording = open_source(put(tmp_path, "a.aedat4", bytes(data)))
+    assert_same(read(recording), Events.join([packets[0], packets[2], packets[3]]))
+    (fault,) = recording.faults.found
+    assert (fault.reason, fault.where) == ("damaged", f"byte {file.starts[1]}")
+
+
+@pytest.mark.parametrize("name", ["davis346", "dvxplorer"])
+def test_any_damaged_byte_of_a_packet_loses_at_most_that_packet_of_a_real_recording(name, tmp_path):
+    data = shared(f"aedat4/{name}.aedat4").read_bytes()[:900_000]
+    whole = read(open_source(put(tmp_path, "a.aedat4", data)))
+    rng = np.random.default_rng(0)
+    for at in rng.integers(20_000, 800_000, 6).tolist():
+        damaged = bytearray(data)
+        damaged[at] ^= 0xFF
+        recording = open_source(put(tmp_path, "b.aedat4", bytes(damaged)))
+        assert read(recording).n > whole.n - 3000
+
+
+def test_a_chosen_event_stream_is_read_and_another_is_refused(tmp_path):
+    path = put(tmp_path, "a.aedat4", aedat4([EVENTS], SENSOR).data)
+    assert_same(read(open_source(path, topic="0")), EVENTS)
+    with pytest.raises(UnknownSource, match="no event stream '1'; its event streams are 0"):
+        open_source(path, topic="1")
 
 
 def test_a_packet_without_events_gives_no_chunk(tmp_path):

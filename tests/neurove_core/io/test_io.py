@@ -223,7 +223,6 @@ def large_evt2(events: Events) -> bytes:
 @pytest.mark.parametrize(
     ("source", "why"),
     [
-        ("missing.raw", "no such file or folder"),
         ("", "the folder has no events.txt"),
         ("a.xyz", "unknown suffix '.xyz'"),
         ("events", "the file has no suffix"),
@@ -243,3 +242,9 @@ def test_the_error_of_an_unknown_source_lists_the_supported_sources(source, why,
         assert all(line in caught.value.message for line in supported())
     assert caught.value.code == "unknown_source"
     assert caught.value.details["why"]
+
+
+def test_the_error_of_a_missing_file_is_one_line_without_the_list_of_formats(tmp_path):
+    with pytest.raises(UnknownSource) as caught:
+        open_source(str(tmp_path / "missing.raw"))
+    assert caught.value.message == f"source {str(tmp_path / 'missing.raw')!r}: no such file or folder"

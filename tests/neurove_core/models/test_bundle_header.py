@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import neurove_core
-from neurove_core.models import bundle, golden, manifest
+from neurove_core.models import bundle, container, golden, manifest
 from neurove_core.models.bundle import Header
 from neurove_core.models.metadata import BundleLimits, MadeBy, Metadata
 from neurove_protocol.errors import BadModel
@@ -162,7 +162,7 @@ def test_random_headers_are_refused(fields):
 def test_two_hundred_thousand_empty_tensors_are_refused_before_any_is_created():
     empty = {"dtype": "F32", "shape": [0], "data_offsets": [0, 0]}
     message = refusal(with_entries(lambda entries: entries.update({f"t{i}": empty for i in range(200_000)})))
-    assert f"over {bundle.MAX_HEADER_BYTES} bytes" in message
+    assert f"over {container.MAX_HEADER_BYTES} bytes" in message
 
 
 def test_a_pickle_is_refused_and_none_of_its_opcodes_runs(tmp_path):
@@ -181,6 +181,6 @@ def test_the_page_of_the_format_names_every_field_and_limit():
     named = [*Header.model_fields, *MadeBy.model_fields, *BundleLimits.model_fields, *manifest.Signed.model_fields]
     named += [*bundle.UncertaintyHeader.model_fields, "spread.weight", "spread.bias", "output.correlation"]
     assert [name for name in named if f"`{name}`" not in page] == []
-    for bound in (bundle.MAX_BYTES >> 20, bundle.MAX_HEADER_BYTES >> 20, golden.MAX_CELLS >> 20):
+    for bound in (bundle.MAX_BYTES >> 20, container.MAX_HEADER_BYTES >> 20, golden.MAX_CELLS >> 20):
         assert f"{bound} MiB" in page
-    assert f"{bundle.MAX_TENSORS:,};" in page
+    assert f"{container.MAX_TENSORS:,};" in page

@@ -1,27 +1,29 @@
-"""AEDAT4 files of DV: compressed packets of events, inertial samples, frames and triggers.
+"""AEDAT4 files of DV: compressed packets of events, inertial samples, frames and triggers."""
 
-The package `aedat` decodes the packets.
-"""
-
+import re
 import struct
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, Self, TypeVar
+from typing import BinaryIO, NamedTuple, Self, TypeVar
+from xml.etree import ElementTree
 
-import aedat
 import numpy as np
-from numpy.typing import NDArray
 
+from neurove_core.io.checked import as_recorded, cleaned, ordered, until_broken
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
+from neurove_core.io.faults import Faults, Reason, Tally
 from neurove_core.io.format import Format
-from neurove_core.io.recording import EventsOnly, Frame, Imu, Triggers, in_chunks, refuse_topic, valid_prefix
-from neurove_protocol.errors import EventOutsideSensor, InvalidField, TimeBackwards
-from neurove_protocol.events import Events, Sensor, check_events
+from neurove_core.io.formats.aedat.flatbuffer import MAX_PACKET_BYTES, BadPacket, events_of, frame_of, tables_of
+from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Frame, Imu, Triggers
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import Events, Sensor
 
 _MAGIC = b"#!AER-DAT4.0\r\n"
 MAX_HEADER_BYTES = 16 << 20  # a header has about 3,000 bytes
 _PACKET_HEADER = struct.Struct("<ii")  # stream, size of the packet after this header [bytes]
+_PACKET_START = re.compile(rb"\x04\x22\x4d\x18|\x28\xb5\x2f\xfd|(?<=.{8})(?:EVTS|IMUS|TRIG|FRME)", re.DOTALL)
+"""First bytes of compressed content, or the identifier at byte 8 of uncompressed content."""
 
 G_M_S2 = 9.80665
 """Standard gravity: DV writes accelerations in this unit."""
@@ -29,8 +31,9 @@ G_M_S2 = 9.80665
 EXTERNAL, GENERATOR, READOUT, EXPOSURE = range(4)
 """Channels of the triggers: the camera's input, its generator, and the readout and exposure of a frame."""
 
-_KINDS = {"events": "events", "imus": "imu", "frame": "frames", "triggers": "triggers"}  # type of the decoder -> stream
-_UNITS = ("accelerometer", "gyroscope")
+_KINDS = {"EVTS": "events", "IMUS": "imu", "FRME": "frames", "TRIG": "triggers"}  # type in the header -> stream
+_T = (0, "<i8")  # field of a time in the table of an inertial sample or a trigger
+_UNITS = tuple((field, "<f4") for field in range(2, 8))  # accelerometer x y z, gyroscope x y z
 _EDGES = {  # source in the file -> channel and level; a pulse is one rising edge
     1: (EXTERNAL, 1),
     2: (EXTERNAL, 0),
@@ -46,8 +49,19 @@ _EDGES = {  # source in the file -> channel and level; a pulse is one rising edg
 T = TypeVar("T")
 
 
-class _Fault(Exception):
-    """The decoder cannot continue."""
+class _Stream(NamedTuple):
+    """A stream that the header names."""
+
+    number: int
+    kind: str  # as in `Recording.streams`
+    source: str  # the camera
+    sensor: Sensor | None  # None without a valid size
+
+
+class _Header(NamedTuple):
+    streams: list[_Stream]
+    start: int  # byte of the first packet
+    end: int  # byte after the last packet; -1 if the recorder did not write it
 
 
 class _Packet(NamedTuple):
@@ -58,164 +72,148 @@ class _Packet(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Aedat4Recording(EventsOnly):
-    """An .aedat4 file; see `Recording`. Of several streams of one kind it reads the one with the lowest number."""
+    """One camera of an .aedat4 file; see `Recording`.
+
+    Of several streams of one kind it reads that of the same camera, otherwise the one with the lowest number.
+    """
 
     path: Path
     name: str
     sensor: Sensor
     numbers: Mapping[str, int]  # stream number by kind, for the kinds in the file
     endless: bool = False
+    faults: Faults = field(default_factory=Faults, compare=False, repr=False)
 
     @classmethod
-    def open(cls, path: Path, sensor: Sensor | None = None) -> Self:
-        """Open the recording in this file.
+    def open(cls, path: Path, sensor: Sensor | None = None, topic: str | None = None) -> Self:
+        """Open one camera of this file.
 
         Args:
             path: the .aedat4 file.
             sensor: its pixel array, which takes precedence over the size in the file.
+            topic: number of the event stream; the default is the lowest.
 
         Raises:
-            UnknownSource: the file is not AEDAT4, or has no event stream.
+            UnknownSource: the file is not AEDAT4, has no event stream, or has no event stream of this number.
             MissingGeometry: its event stream has no valid sensor size.
             BrokenRecording: its header is truncated or corrupt.
         """
         with path.open("rb") as file:
             if not _MAGIC.startswith(file.read(len(_MAGIC))):
                 raise UnknownSource(path, "the file does not begin with the AEDAT4 signature")
-            _read_header(path, file)
-        try:
-            streams = _guarded(lambda: aedat.Decoder(path).id_to_stream())
-        except _Fault as fault:
-            raise BrokenRecording(path, f"byte {len(_MAGIC)}", f"the header cannot be read: {fault}") from None
-        ids = sorted(key for key, stream in streams.items() if stream["type"] == "events")
-        if not ids:
+            streams = _read_header(path, file).streams
+        cameras = {str(stream.number): stream for stream in streams if stream.kind == "events"}
+        if not cameras:
             raise UnknownSource(path, "the file has no event stream")
-        try:
-            sensor = sensor or Sensor(streams[ids[0]]["width"], streams[ids[0]]["height"])
-        except InvalidField:
-            raise MissingGeometry(path) from None
-        name = path.name if len(ids) == 1 else f"{path.name} (stream {ids[0]}, the first of {len(ids)} event streams)"
-        kinds = ((_KINDS.get(streams[key]["type"]), key) for key in sorted(streams, reverse=True))
-        numbers = {kind: key for kind, key in kinds if kind}
+        if topic not in (None, *cameras):
+            raise UnknownSource(path, f"it has no event stream {topic!r}; its event streams are {', '.join(cameras)}")
+        chosen = cameras[topic] if topic is not None else next(iter(cameras.values()))
+        sensor = sensor or chosen.sensor
+        if sensor is None:
+            raise MissingGeometry(path)
+        name = path.name
+        if topic is not None:
+            name = f"{path.name} (stream {topic})"
+        elif len(cameras) > 1:
+            name = f"{path.name} (stream {chosen.number}, the first of {len(cameras)} event streams)"
+        by_kind = sorted(streams, key=lambda stream: (stream.source == chosen.source, -stream.number))
+        numbers = {stream.kind: stream.number for stream in by_kind} | {"events": chosen.number}
         return cls(path, name, sensor, numbers)
 
     @property
     def streams(self) -> tuple[str, ...]:
         """The streams in the header."""
-        return tuple(kind for kind in _KINDS.values() if kind in self.numbers)
+        return tuple(kind for kind in ("events", "imu", "frames", "triggers") if kind in self.numbers)
 
     def chunks(self) -> Iterator[Events]:
-        """All events from the beginning; see `Recording`. Times are Unix time [us]. Other streams are skipped.
-
-        Raises:
-            BrokenRecording: a packet is truncated or corrupt, or an event is outside the sensor or earlier than the one
-                before it. The error names the first byte of the packet.
-        """
-        not_before_us = None
-        for start, packet in self._packets("events"):
-            events = Events.from_records(packet["events"])
-            try:
-                check_events(events, self.sensor, not_before_us)
-            except (EventOutsideSensor, TimeBackwards) as error:
-                yield from in_chunks(valid_prefix(events, self.sensor, not_before_us))
-                raise BrokenRecording(self.path, f"byte {start}", f"in this packet, {error.message}") from None
-            yield from in_chunks(events)
-            not_before_us = int(events.t[-1]) if events.n else not_before_us
+        """All events from the beginning; see `Recording`. Times are Unix time [us]. Other streams are skipped."""
+        tally = self.faults.begin("events")
+        return cleaned(self._decoded("events", _events_of, tally), self.sensor, tally)
 
     def imu(self) -> Iterator[Imu]:
         """All samples; see `Recording`. The axes are those of the unit, because the file does not give its mounting.
 
         DV writes deg/s and g. A stationary, upright DAVIS346 measures about -9.8 m/s2 in y, as in the optical frame.
-
-        Raises:
-            BrokenRecording: as `chunks`.
         """
-        not_before_us = None
-        for start, packet in self._packets("imu"):
-            rows = packet["imus"]
-            t = rows["t"].astype(np.int64)
-            not_before_us = self._ordered(start, t, not_before_us)
-            accel, gyro = (np.stack([rows[f"{kind}_{axis}"] for axis in "xyz"], -1) for kind in _UNITS)
-            if t.size:
-                yield Imu(t, accel.astype(np.float64) * G_M_S2, np.radians(gyro.astype(np.float64)))
+        tally = self.faults.begin("imu")
+        return ordered(self._decoded("imu", _imu_of, tally), tally)
 
     def triggers(self) -> Iterator[Triggers]:
         """All edges; see `Recording`. DV writes edges of the camera's input (channel EXTERNAL) and also of the frames.
 
         The edges of a packet are sorted by time. Entries for a reset of the clock are skipped.
-
-        Raises:
-            BrokenRecording: as `chunks`.
         """
-        not_before_us = None
-        for start, packet in self._packets("triggers"):
-            rows = packet["triggers"][np.isin(packet["triggers"]["source"], list(_EDGES))]
-            rows = rows[np.argsort(rows["t"], kind="stable")]
-            t = rows["t"].astype(np.int64)
-            not_before_us = self._ordered(start, t, not_before_us)
-            edges = np.array([_EDGES[source] for source in rows["source"].tolist()], np.uint8).reshape(-1, 2)
-            if t.size:
-                yield Triggers(t, edges[:, 0].copy(), edges[:, 1].copy())
+        tally = self.faults.begin("triggers")
+        return ordered(self._decoded("triggers", _triggers_of, tally), tally)
 
     def frames(self) -> Iterator[Frame]:
-        """All images; see `Recording`. A frame smaller than the sensor is not padded.
+        """All images; see `Recording`. A frame smaller than the sensor is not padded. A late one is skipped."""
+        tally = self.faults.begin("frames")
+        last_us: int | None = None
+        for where, (t_us, image) in until_broken(self._decoded("frames", frame_of, tally), tally):
+            if last_us is not None and t_us < last_us:
+                tally.add(Reason.LATE, where, f"t={t_us} us comes after t={last_us} us: time runs backwards")
+            else:
+                last_us = t_us
+                yield Frame(t_us, np.ascontiguousarray(image))
 
-        Raises:
-            BrokenRecording: as `chunks`.
-        """
-        not_before_us = None
-        for start, packet in self._packets("frames"):
-            frame = packet["frame"]
-            t_us = int(frame["exposure_begin_t"])
-            not_before_us = self._ordered(start, np.array([t_us]), not_before_us)
-            yield Frame(
-                t_us, np.ascontiguousarray(frame["pixels"][..., :3] if frame["pixels"].ndim == 3 else frame["pixels"])
-            )
-
-    def _ordered(self, start: int, t: NDArray[np.int64], not_before_us: int | None) -> int | None:
-        """Check that these times [us] do not decrease. Return the last one, or `not_before_us` without times."""
-        if not t.size:
-            return not_before_us
-        if (np.diff(t) < 0).any() or (not_before_us is not None and t[0] < not_before_us):
-            raise BrokenRecording(self.path, f"byte {start}", "time runs backwards in this packet")
-        return int(t[-1])
-
-    def _packets(self, kind: str) -> Iterator[tuple[int, Any]]:
-        """The first byte and the decoded content of each packet of the stream of this kind.
-
-        The decoder does not report its position or the place of an error, and it does not check the lengths. So this
-        method reads and checks each packet header before the decoder does.
-        """
+    def _decoded(self, kind: str, decode: Callable[[bytes], T], tally: Tally) -> Iterator[tuple[str, T]]:
+        """The place and the content of each packet of a kind. A packet that cannot be decoded is skipped."""
         wanted = self.numbers.get(kind)
         if wanted is None:
             return
         with self.path.open("rb") as file:
-            at, end = _read_header(self.path, file)
-            size = file.seek(0, 2)
-            decoder = _guarded(lambda: aedat.Decoder(self.path))
-            while at != end:
-                if _packet(file, at, size) is None:
-                    if end < 0 and at == size:  # the recorder stopped between two packets
-                        return
-                    raise BrokenRecording(
-                        self.path, f"byte {at}", f"the file ends at byte {size}, before its packets do"
-                    )
+            for packet in self._packets(file, tally):
+                if packet.stream != wanted:
+                    continue
+                where = f"byte {packet.start}"
+                file.seek(packet.start + _PACKET_HEADER.size)
                 try:
-                    decoded = _guarded(lambda: next(decoder, None))
-                except _Fault as fault:
-                    raise BrokenRecording(self.path, f"byte {at}", f"this packet cannot be read: {fault}") from None
-                packet = decoded and _find(file, at, size, decoded["stream_id"])
-                if not decoded or not packet:  # only frames remain, of a kind that the decoder skips
-                    return
+                    content = decode(file.read(packet.stop - packet.start - _PACKET_HEADER.size))
+                except BadPacket as why:
+                    tally.add(Reason.DAMAGED, where, f"this packet cannot be read: {why}")
+                else:
+                    yield where, content
+
+    def _packets(self, file: BinaryIO, tally: Tally) -> Iterator[_Packet]:
+        """The place of each packet. Where the header of a packet is corrupt, the next packet is searched."""
+        streams, at, end = _read_header(self.path, file)
+        numbers = {stream.number for stream in streams}
+        size = file.seek(0, 2)
+        while at != end and not (end < 0 and at == size):  # the recorder stopped between two packets
+            packet = _packet(file, at, size)
+            if packet is not None and packet.stream in numbers:
+                yield packet
                 at = packet.stop
-                if packet.stream == wanted:
-                    yield packet.start, decoded
+                continue
+            after = _next_packet(file, at + 1, size, numbers)
+            if after is None:
+                raise BrokenRecording(self.path, f"byte {at}", f"the file ends at byte {size}, before its packets do")
+            tally.add(Reason.DAMAGED, f"byte {at}", f"no packet begins here; the next one begins at byte {after.start}")
+            at = after.start
 
 
-def _read_header(path: Path, file: BinaryIO) -> tuple[int, int]:
-    """The bytes where the packets begin and end. The end is -1 if the recorder did not write it.
+def _events_of(packet: bytes) -> Events:
+    rows = events_of(packet)
+    return as_recorded(rows["t"], rows["x"], rows["y"], rows["p"] > 0)
 
-    The text of the header is checked too, because the decoder ends the whole process on invalid UTF-8.
+
+def _imu_of(packet: bytes) -> Imu:
+    t, *numbers = tables_of(packet, b"IMUS", (_T, *_UNITS))
+    values = np.stack(numbers, -1).astype(np.float64)
+    return Imu(t, values[:, :3] * G_M_S2, np.radians(values[:, 3:]))
+
+
+def _triggers_of(packet: bytes) -> Triggers:
+    t, source = tables_of(packet, b"TRIG", (_T, (1, "<i1")))
+    order = np.argsort(t, kind="stable")
+    order = order[np.isin(source[order], list(_EDGES))]
+    edges = np.array([_EDGES[int(one)] for one in source[order]], np.uint8).reshape(-1, 2)
+    return Triggers(t[order], edges[:, 0].copy(), edges[:, 1].copy())
+
+
+def _read_header(path: Path, file: BinaryIO) -> _Header:
+    """The streams, and the bytes where the packets begin and end.
 
     Raises:
         BrokenRecording: the header is truncated or corrupt.
@@ -235,44 +233,63 @@ def _read_header(path: Path, file: BinaryIO) -> tuple[int, int]:
         text += table
         text += struct.unpack_from("<I", header, text)[0]
         (characters,) = struct.unpack_from("<I", header, text)
-        struct.unpack_from(f"{characters}s", header, text + 4)[0].decode()
-    except (struct.error, UnicodeDecodeError) as error:
+        xml = struct.unpack_from(f"{characters}s", header, text + 4)[0].decode()
+        return _Header(_streams(xml), start + length, end)
+    except (struct.error, UnicodeDecodeError, ElementTree.ParseError, OverflowError) as error:
         raise BrokenRecording(path, f"byte {start}", f"the header cannot be read: {error}") from None
-    return start + length, end
 
 
-def _guarded(call: Callable[[], T]) -> T:
-    """Result of a call of the decoder. Any error of the decoder becomes _Fault."""
-    try:
-        return call()
-    except BaseException as error:  # a Rust panic is not an Exception, and its class cannot be imported
-        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
-            raise
-        raise _Fault(str(error)) from None
+def _streams(xml: str) -> list[_Stream]:
+    """The streams that the text of the header describes, by number.
+
+    Raises:
+        ElementTree.ParseError: it is not XML.
+    """
+    found = []
+    for node in ElementTree.fromstring(xml).iterfind(".//node[@name='outInfo']/node"):
+        number, kind = node.get("name", ""), _KINDS.get(_attribute(node, "typeIdentifier"))
+        if kind is None or not number.isdecimal():
+            continue
+        info = node.find("node[@name='info']")
+        try:
+            sensor = Sensor(int(_attribute(info, "sizeX")), int(_attribute(info, "sizeY")))
+        except (ValueError, InvalidField):
+            sensor = None
+        found.append(_Stream(int(number), kind, _attribute(info, "source"), sensor))
+    return sorted(found)
+
+
+def _attribute(node: ElementTree.Element | None, name: str) -> str:
+    """The text of an attribute of a node; empty without one."""
+    found = None if node is None else node.find(f"attr[@key='{name}']")
+    return "" if found is None or found.text is None else found.text
 
 
 def _packet(file: BinaryIO, at: int, size: int) -> _Packet | None:
-    """The packet that begins at byte `at`, or None if the file of `size` bytes ends before it does."""
+    """The packet that begins at byte `at`, or None if no packet that fits into the file of `size` bytes does."""
     file.seek(at)
     header = file.read(_PACKET_HEADER.size)
     if len(header) < _PACKET_HEADER.size:
         return None
     stream, length = _PACKET_HEADER.unpack(header)
     stop = at + _PACKET_HEADER.size + length
-    return _Packet(at, stream, stop) if length >= 0 and stop <= size else None
+    return _Packet(at, stream, stop) if 0 <= length <= MAX_PACKET_BYTES and stop <= size else None
 
 
-def _find(file: BinaryIO, at: int, size: int, stream: int) -> _Packet | None:
-    """The next packet of this stream from byte `at`. The decoder skips frames of an unknown kind."""
-    packet = _packet(file, at, size)
-    while packet is not None and packet.stream != stream:
-        packet = _packet(file, packet.stop, size)
-    return packet
+def _next_packet(file: BinaryIO, at: int, size: int, streams: set[int]) -> _Packet | None:
+    """The first packet of a known stream from byte `at` on that begins as packets do; None without one."""
+    while at < size:
+        file.seek(at)
+        block = file.read(BLOCK_BYTES)
+        for match in _PACKET_START.finditer(block):
+            content = match.start() - (8 if match.group()[:1].isalpha() else 0)
+            packet = _packet(file, at + content - _PACKET_HEADER.size, size) if content >= _PACKET_HEADER.size else None
+            if packet is not None and packet.stream in streams:
+                return packet
+        if at + len(block) >= size:
+            return None
+        at += len(block) - 32  # the first bytes of a packet may lie across two blocks
+    return None
 
 
-def _open(path: Path, sensor: Sensor | None, topic: str | None) -> Aedat4Recording:
-    refuse_topic(path, topic)
-    return Aedat4Recording.open(path, sensor)
-
-
-FORMAT = Format("FILE.aedat4 (DV)", _open, (".aedat4",))
+FORMAT = Format("FILE.aedat4 (DV)", Aedat4Recording.open, (".aedat4",), signature=b"#!AER-DAT4")

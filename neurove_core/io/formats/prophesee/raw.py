@@ -177,4 +177,4 @@ def _open(path: Path, sensor: Sensor | None, topic: str | None) -> PropheseeReco
     return PropheseeRecording.open(path, sensor)
 
 
-FORMAT = Format("FILE.raw (Prophesee EVT2, EVT3)", _open, (".raw",))
+FORMAT = Format("FILE.raw (Prophesee EVT2, EVT3)", _open, (".raw",), signature=rb"(?:% [^\n]*\n)*?% (?i:evt|format) ")
