@@ -35,7 +35,9 @@ FORMATS: Final = (
     "neurove_core.io.formats.packet_log.reader",  # before ROS 2: both are .mcap
     "neurove_core.io.formats.ros.recording",
     "neurove_core.io.formats.evbench",
+    "neurove_core.io.formats.npy",  # before CARLA: both are .npz
     "neurove_core.io.formats.carla",
+    "neurove_core.io.formats.atis_bin",
     "neurove_core.io.formats.ecd",
     "neurove_core.io.formats.hdf5.datasets",
 )

@@ -139,9 +139,9 @@ def test_an_unreadable_camera_info_is_refused_and_the_stream_continues(slot):
 
     published = Published(broken)
     worker = StreamWorker(Stream("cam0", slot), published.open, Inbox(60, 1 << 26), PacketLimits())
-    worker.put_camera(b"garbage", 1)
+    worker.put_camera(b"garbage", time.monotonic_ns())
     good = CameraInfo(stream="cam0", width=64, height=48, lens="pinhole", fx=40, fy=40, cx=32, cy=24)
-    worker.put_camera(good.encode(), 1)
+    worker.put_camera(good.encode(), time.monotonic_ns())
     for packet in make_packets(30):
         worker.put_packet(encode_packet(packet), time.monotonic_ns())
     assert "uncalibrated" not in published.wait_for(2)[0].flags
@@ -229,7 +229,7 @@ def test_an_overloaded_worker_answers_whole_windows_of_the_newest_data(slot):
     published = Published()
     stream = Stream("cam0", slot, max_age_s=5)
     SlowModel(stream, 0.15)  # windows of 50 ms: three times the load
-    worker = StreamWorker(stream, published.open, Inbox(60, 1 << 26), PacketLimits())
+    worker = StreamWorker(stream, published.open, Inbox(1, 1 << 26), PacketLimits())
     began = time.monotonic()
     packets = make_packets(1200, n=20)  # 4.8 s
     for packet in packets:
@@ -250,7 +250,7 @@ def test_an_overloaded_worker_answers_whole_windows_of_the_newest_data(slot):
 
 
 def test_a_stall_that_is_shorter_than_the_patience_loses_nothing():
-    overload = Overload()
+    overload = Overload(patience_s=1)
     ms = 1_000_000
     assert not any(overload.must_shed(waited * ms, (1000 + waited) * ms) for waited in range(0, 900, 10))
     assert not overload.must_shed(50 * ms, 2000 * ms)
