@@ -21,7 +21,7 @@ from rich.live import Live
 from neurove_protocol import Flag
 from neurove_protocol.control import StreamStatus
 from neurove_protocol.errors import EXIT_FAILURE, NeuroVEError
-from neurove_service.cli.views import Board
+from neurove_service.cli.board import Board
 from neurove_service.clients import ask
 from neurove_service.config import ENVIRONMENT, ClientConfig
 from neurove_service.latency import latency

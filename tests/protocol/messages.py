@@ -152,6 +152,7 @@ EXAMPLES: dict[str, Fields] = {
         "ready": True,
         "change": "spire-7 is active",
         "rollbacks": 1,
+        "internal_errors": {"packet": 2},
     },
     "ModelsRequest": {"v": 1},
     "ModelsReply": {
@@ -383,6 +384,7 @@ ANY: dict[str, st.SearchStrategy[Fields]] = {
             "ready": st.booleans(),
             "change": sentences,
             "rollbacks": counts,
+            "internal_errors": st.dictionaries(sentences, counts, max_size=3),
         }
     ),
     "ModelsRequest": st.just({}),
