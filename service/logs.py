@@ -8,6 +8,7 @@ import logging
 import os
 import sys
 from collections.abc import MutableMapping
+from pathlib import Path
 from typing import Any, Final, TextIO
 
 import structlog
@@ -62,7 +63,7 @@ _handlers: list[_Handler] = []  # the present one, if any
 
 def configure(level: str = "info") -> None:
     """Send the logs of structlog and of the standard library, which include Zenoh's, to stderr."""
-    stream = unfiltered(sys.stderr) if sys.stderr is not None else open(os.devnull, "w")  # noqa: SIM115
+    stream = unfiltered(sys.stderr) if sys.stderr is not None else Path(os.devnull).open("w")  # noqa: SIM115
     human = stream.isatty()
     shared: list[structlog.typing.Processor] = [
         structlog.stdlib.add_log_level,
