@@ -45,7 +45,7 @@ class _Handler(logging.Handler):
             self.writer.add(f"a log line of {record.name} cannot be formatted")
 
     def _dropped(self, lines: int) -> str:
-        return self._line("log lines dropped: nobody reads them", lines=lines)
+        return self._line("log lines dropped: no process reads them", lines=lines)
 
     def _left_out(self) -> list[str]:
         return [
@@ -100,7 +100,7 @@ def get(name: str) -> structlog.stdlib.BoundLogger:
 
 
 def dropped() -> int:
-    """Number of lines that were dropped, because nobody read them in time."""
+    """Number of lines that were dropped, because they were not read in time."""
     return sum(handler.writer.dropped for handler in _handlers)
 
 

@@ -17,7 +17,7 @@ class Condition(NamedTuple):
     refused_streams: int = 0  # because max_streams is reached
     internal_errors: Mapping[str, int] = MappingProxyType({})  # place -> number since the start
     recent_errors: tuple[str, ...] = ()  # the places that had one within the last minute
-    dropped_log_lines: int = 0  # nobody read them in time
+    dropped_log_lines: int = 0  # not read in time
     stuck_streams: tuple[str, ...] = ()  # their worker has not turned for 10 s
 
     def reasons(self) -> list[str]:
