@@ -173,7 +173,13 @@ class Stream:
         self.lanes.leave_out_until(start_us)
 
     def set_camera(self, camera: CameraInfo) -> None:
-        """Use this CameraInfo from the next packet on."""
+        """Use this CameraInfo from the next packet on.
+
+        Raises:
+            InvalidField: it belongs to another stream.
+        """
+        if camera.stream != self.name:
+            raise InvalidField("camera info", "stream", camera.stream, f"received on the key of stream {self.name!r}")
         if camera == self.camera:
             return
         self.camera = camera
