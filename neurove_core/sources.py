@@ -18,6 +18,7 @@ from neurove_core.io.faults import Reason
 from neurove_core.io.format import Format, UrlFormat
 from neurove_core.io.recording import Recording
 from neurove_core.io.spool import HEAD_BYTES, Plain, compression_of, is_text, piped, plain_file
+from neurove_core.io.units import with_unit
 from neurove_protocol.events import Sensor
 
 log = logging.getLogger(__name__)
@@ -57,7 +58,9 @@ class _Table(NamedTuple):
     failed: tuple[str, ...]  # entry points that could not be loaded, with the reason
 
 
-def open_source(source: str, sensor: Sensor | None = None, topic: str | None = None) -> Recording:
+def open_source(
+    source: str, sensor: Sensor | None = None, topic: str | None = None, time_unit: str | None = None
+) -> Recording:
     """Open a recording.
 
     Args:
@@ -65,23 +68,25 @@ def open_source(source: str, sensor: Sensor | None = None, topic: str | None = N
             pipe is first copied into a temporary file; a file compressed with gzip, zstd, bz2 or lz4 is decompressed.
         sensor: size of the pixel array; overrides what the recording says.
         topic: one of several event streams, such as `davis/right` of MVSEC; by default the first.
+        time_unit: unit of the event times in the file, one of s, ms, us and ns; by default that of its layout.
 
     Raises:
         UnknownSource: the source does not exist, has no known format, or does not have this topic.
         MissingGeometry: neither the caller nor the recording gives the sensor size.
+        DoubtfulUnit: the times are implausible in the unit of the layout, and no `time_unit` is given.
         BrokenRecording: the header is damaged.
         MissingExtra: a library that reads this format is not installed.
-        InvalidField: a calibration file or a query of the URL is invalid.
+        InvalidField: a calibration file or a query of the URL is invalid, or the format allows no other unit of time.
     """
     scheme, separator, _ = source.partition("://")
     if separator:
         if scheme not in URLS:
             raise UnknownSource(source, f"unknown scheme {scheme}://", _known())
-        return _url_format(scheme).open(source, sensor, topic)
+        return with_unit(_url_format(scheme).open(source, sensor, topic), time_unit)
     if not source.strip():
         raise UnknownSource(source, "the name of the source is empty", _known())
     try:
-        return _open_path(Path(source), sensor, topic)
+        return with_unit(_open_path(Path(source), sensor, topic), time_unit)
     except OSError as error:
         where = f": {error.filename}" if error.filename not in (None, source) else ""
         raise UnknownSource(source, f"{error.strerror or error}{where}") from None

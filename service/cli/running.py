@@ -60,7 +60,7 @@ def drive(args: argparse.Namespace) -> int:
 
     stop = stop_on_signals(with_parent=args.with_parent)
     config = client_config(args)
-    recording = open_source(args.source, args.sensor, args.topic)
+    recording = open_source(args.source, args.sensor, args.topic, args.time_unit)
     wait = Wait(config, args.wait, stop)
     with wait.connect(config) as transport:
         player = _player(args, recording, transport, config.keys)
@@ -118,7 +118,7 @@ def demo(args: argparse.Namespace) -> int:
 
     stop = stop_on_signals()
     logs.configure("warning")
-    endless = open_source(args.source, args.sensor, args.topic).endless
+    endless = open_source(args.source, args.sensor, args.topic, args.time_unit).endless
     shown = console(stderr=args.json)
     duration_s = args.seconds
     if duration_s is None:
@@ -127,6 +127,7 @@ def demo(args: argparse.Namespace) -> int:
         args.source,
         sensor=str(args.sensor) if args.sensor else None,
         topic=args.topic,
+        time_unit=args.time_unit,
         speed="max" if math.isinf(args.speed) else str(args.speed),
         loop=args.loop,
         duration_s=duration_s,

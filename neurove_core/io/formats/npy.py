@@ -12,9 +12,10 @@
   opposite of the others'; it is given as recorded.
 """
 
+import re
 import zipfile
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Self
 
@@ -27,8 +28,9 @@ from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSour
 from neurove_core.io.faults import Faults, Tally
 from neurove_core.io.format import Format
 from neurove_core.io.formats.columns import Unclear, by_name, by_values, piece, unit_of
-from neurove_core.io.formats.npy_rows import Header, Series, blocks, read_header
+from neurove_core.io.formats.npy_rows import MAGIC, Header, Series, blocks, read_header
 from neurove_core.io.recording import EventsOnly, refuse_topic
+from neurove_core.io.units import SAMPLE, UNITS, TimeSample
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
 
@@ -38,7 +40,6 @@ MEMBERS: Final = ("events", "event_data", "arr_0")
 """Names of an array of events in a .npz; the first one is read."""
 
 _CARLA = {"fov_deg.npy", "width.npy"}  # members of the container of `carla.py`
-_SAMPLE_ROWS = 4096
 
 Pick = tuple[int, str | int | None]
 """Where a column is: the number of its series, and the field or the number in a row."""
@@ -89,7 +90,7 @@ class ArrayRecording(EventsOnly):
         if folder is not None:
             place, layout, unit_us, found = Place(folder), _evimo2(folder), 1e6, _image_size(folder)
         else:
-            archive = path.suffix.lower() == ".npz"
+            archive = _is_zip(path)
             place = Place(path, "") if archive else Place(path.parent)
             try:
                 layout = _in_archive(path, place) if archive else _of_array(path, path.name, place)
@@ -105,6 +106,25 @@ class ArrayRecording(EventsOnly):
         """All events from the beginning; see `Recording`."""
         tally = self.faults.begin("events")
         return cleaned(self._pieces(tally), self.sensor, tally)
+
+    def time_sample(self) -> TimeSample | None:
+        """Times of the first events, see `Timed`."""
+        columns = _first_columns(self.place, self.layout)
+        unit = next(name for name, us in UNITS.items() if us == self.unit_us)
+        return TimeSample(self.path, columns[0], unit, self._known_rows()) if columns else None
+
+    def in_unit(self, unit: str) -> Self:
+        """The same recording with the times of its events in another unit, see `Timed`."""
+        return replace(self, unit_us=UNITS[unit])
+
+    def _known_rows(self) -> int:
+        """The rows that a plain file has, whatever its header says; 0 for a packed one."""
+        one = self.layout.series[0]
+        return (
+            min(one.rows, (self.place.path / one.name).stat().st_size // one.row_bytes)
+            if self.place.inside is None
+            else 0
+        )
 
     def _pieces(self, tally: Tally) -> Iterator[Piece]:
         at = 0
@@ -168,11 +188,7 @@ def _guessed(place: Place, layout: Layout) -> tuple[Layout, float]:
         Unclear: the columns cannot be told apart.
     """
     names = [key if isinstance(key, str) else layout.series[number].name[:-4] for number, key in layout.picks]
-    try:
-        parts = next(blocks(place, layout.series, _SAMPLE_ROWS * sum(one.row_bytes for one in layout.series)), None)
-    except BrokenRecording:
-        parts = None  # the reading of the events reports it
-    columns = [] if parts is None else layout.columns(parts)
+    columns = _first_columns(place, layout)
     try:
         order = by_name(names)
     except Unclear:  # the columns have no names
@@ -184,6 +200,15 @@ def _guessed(place: Place, layout: Layout) -> tuple[Layout, float]:
         times = columns[order.t]
         unit_us = unit_of(times.astype(np.float64), floats=times.dtype.kind == "f")
     return layout._replace(picks=(t, x, y, p)), unit_us or 1.0
+
+
+def _first_columns(place: Place, layout: Layout) -> list[NDArray[Any]]:
+    """The columns t, x, y, p of the first rows; empty if there are none, or they cannot be read."""
+    try:
+        parts = next(blocks(place, layout.series, SAMPLE * sum(one.row_bytes for one in layout.series)), None)
+    except BrokenRecording:  # reading the events reports it
+        parts = None
+    return [] if parts is None else layout.columns(parts)
 
 
 def _is_number(dtype: np.dtype[Any]) -> bool:
@@ -232,10 +257,10 @@ def _size_of(path: Path, place: Place, name: str) -> Sensor | None:
 
 def _accepts(path: Path) -> bool:
     """Whether this is a .npy, a .npz with events that is not CARLA's, or a folder of EVIMO2v2."""
-    if path.is_dir() or path.suffix.lower() not in (".npy", ".npz"):
-        return path.is_dir() and _evimo2_folder(path) is not None
-    if path.suffix.lower() == ".npy" or _evimo2_folder(path) is not None:
-        return True
+    if _evimo2_folder(path) is not None or path.is_dir():
+        return _evimo2_folder(path) is not None
+    if not _is_zip(path):
+        return path.suffix.lower() == ".npy" or _head(path) == MAGIC
     try:
         names = _members(path)
         return not _CARLA & {f"{name}.npy" for name in names} and bool(set(MEMBERS) & set(names) or by_name(names))
@@ -243,9 +268,23 @@ def _accepts(path: Path) -> bool:
         return False
 
 
+def _is_zip(path: Path) -> bool:
+    return _head(path).startswith(b"PK")
+
+
+def _head(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(len(MAGIC))
+
+
 def _open(path: Path, sensor: Sensor | None, topic: str | None) -> ArrayRecording:
     refuse_topic(path, topic)
     return ArrayRecording.open(path, sensor)
 
 
-FORMAT = Format("FILE.npy, FILE.npz, or a folder of EVIMO2 (NumPy arrays of events)", _open, accepts=_accepts)
+FORMAT = Format(
+    "FILE.npy, FILE.npz, or a folder of EVIMO2 (NumPy arrays of events)",
+    _open,
+    accepts=_accepts,
+    signature=re.escape(MAGIC) + rb"|PK\x03\x04",
+)
