@@ -12,6 +12,7 @@
   opposite of the others'; it is given as recorded.
 """
 
+import re
 import zipfile
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -27,7 +28,7 @@ from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSour
 from neurove_core.io.faults import Faults, Tally
 from neurove_core.io.format import Format
 from neurove_core.io.formats.columns import Unclear, by_name, by_values, piece, unit_of
-from neurove_core.io.formats.npy_rows import Header, Series, blocks, read_header
+from neurove_core.io.formats.npy_rows import MAGIC, Header, Series, blocks, read_header
 from neurove_core.io.recording import EventsOnly, refuse_topic
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
@@ -89,7 +90,7 @@ class ArrayRecording(EventsOnly):
         if folder is not None:
             place, layout, unit_us, found = Place(folder), _evimo2(folder), 1e6, _image_size(folder)
         else:
-            archive = path.suffix.lower() == ".npz"
+            archive = _is_zip(path)
             place = Place(path, "") if archive else Place(path.parent)
             try:
                 layout = _in_archive(path, place) if archive else _of_array(path, path.name, place)
@@ -232,10 +233,10 @@ def _size_of(path: Path, place: Place, name: str) -> Sensor | None:
 
 def _accepts(path: Path) -> bool:
     """Whether this is a .npy, a .npz with events that is not CARLA's, or a folder of EVIMO2v2."""
-    if path.is_dir() or path.suffix.lower() not in (".npy", ".npz"):
-        return path.is_dir() and _evimo2_folder(path) is not None
-    if path.suffix.lower() == ".npy" or _evimo2_folder(path) is not None:
-        return True
+    if _evimo2_folder(path) is not None or path.is_dir():
+        return _evimo2_folder(path) is not None
+    if not _is_zip(path):
+        return path.suffix.lower() == ".npy" or _head(path) == MAGIC
     try:
         names = _members(path)
         return not _CARLA & {f"{name}.npy" for name in names} and bool(set(MEMBERS) & set(names) or by_name(names))
@@ -243,9 +244,23 @@ def _accepts(path: Path) -> bool:
         return False
 
 
+def _is_zip(path: Path) -> bool:
+    return _head(path).startswith(b"PK")
+
+
+def _head(path: Path) -> bytes:
+    with path.open("rb") as file:
+        return file.read(len(MAGIC))
+
+
 def _open(path: Path, sensor: Sensor | None, topic: str | None) -> ArrayRecording:
     refuse_topic(path, topic)
     return ArrayRecording.open(path, sensor)
 
 
-FORMAT = Format("FILE.npy, FILE.npz, or a folder of EVIMO2 (NumPy arrays of events)", _open, accepts=_accepts)
+FORMAT = Format(
+    "FILE.npy, FILE.npz, or a folder of EVIMO2 (NumPy arrays of events)",
+    _open,
+    accepts=_accepts,
+    signature=re.escape(MAGIC) + rb"|PK\x03\x04",
+)

@@ -17,7 +17,7 @@ from neurove_core.io.archive import Place
 from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.recording import BLOCK_BYTES
 
-_MAGIC: Final = b"\x93NUMPY"
+MAGIC: Final = b"\x93NUMPY"
 _MAX_HEADER_BYTES: Final = 10_000
 _MAX_ROW_BYTES: Final = 4096
 _BAD_HEADER = (ValueError, TypeError, SyntaxError, KeyError, IndexError, MemoryError, RecursionError, OverflowError)
@@ -58,7 +58,7 @@ def read_header(path: Path, name: str, file: IO[bytes]) -> Header:
         UnknownSource: it is not an array, or not one of numbers or records.
     """
     start = file.read(8)
-    if len(start) < 8 or not start.startswith(_MAGIC) or start[6] not in (1, 2, 3):
+    if len(start) < 8 or not start.startswith(MAGIC) or start[6] not in (1, 2, 3):
         raise UnknownSource(path, f"{name} is not a NumPy array")
     size = int.from_bytes(file.read(2 if start[6] == 1 else 4), "little")
     if size > _MAX_HEADER_BYTES:

@@ -1,5 +1,6 @@
 """Events in NumPy arrays (.npy, .npz, EVIMO, EVIMO2), and the .bin files of N-MNIST. The tests write the files."""
 
+import gzip
 import io
 import os
 import tracemalloc
@@ -67,6 +68,19 @@ def test_each_array_gives_the_same_events_from_a_file_and_from_an_archive(name, 
         open_source(str(tmp_path / "a.npy"))
     with pytest.raises(UnknownSource, match="no topic 'left'"):
         open_source(str(tmp_path / "a.npy"), topic="left")
+
+
+def test_the_content_decides_before_the_suffix(tmp_path):
+    np.save(tmp_path / "a.npy", ARRAYS["t x y p"])
+    np.savez(tmp_path / "b.npz", events=ARRAYS["t x y p"])
+    (tmp_path / "a.npy").rename(tmp_path / "a.data")
+    (tmp_path / "b.npz").rename(tmp_path / "b")
+    with gzip.open(tmp_path / "c.npy.gz", "wb") as file:
+        np.save(file, ARRAYS["t x y p"])  # type: ignore[arg-type]
+    for name in ("a.data", "b", "c.npy.gz"):
+        assert_same(read(open_source(str(tmp_path / name), SENSOR)), EVENTS)
+    with pytest.raises(UnknownSource, match=r"d\.npy is not a NumPy array"):
+        open_source(put(tmp_path, "d.npy", b"no array"))
 
 
 def test_an_archive_with_one_array_for_each_column_is_read(tmp_path):
