@@ -72,7 +72,9 @@ def read_calibration(file: str, sensor: Sensor) -> CameraInfo:
     path, name = _place(file)
     cameras = dict(_cameras(_tree(path)))
     if not cameras:
-        raise InvalidField(str(path), "camera_matrix", None, "it has no camera_matrix (ROS, OpenCV), intrinsics (Kalibr)")
+        raise InvalidField(
+            str(path), "camera_matrix", None, "it has no camera_matrix (ROS, OpenCV), intrinsics (Kalibr)"
+        )
     if name is not None:
         if name not in cameras:
             raise InvalidField(str(path), "camera", name, f"its cameras are {', '.join(cameras)}")
@@ -210,7 +212,7 @@ def _xml(path: Path, text: str) -> Any:
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise InvalidField(str(path), "XML", None, "a calibration file has no document type and no entities")
     try:
-        return _of_element(ET.fromstring(text))  # noqa: S314  # no entities, see above
+        return _of_element(ET.fromstring(text))
     except (ET.ParseError, RecursionError) as error:
         raise InvalidField(str(path), "XML", None, f"it cannot be parsed: {error}") from None
 
@@ -313,7 +315,9 @@ def _intrinsics(fields: _Fields) -> _Intrinsics:
     if fields.get(("intrinsics",)) is not None:
         model = _plain(fields.text(("cameramodel",)))
         if model not in ("", "pinhole"):
-            raise InvalidField(str(fields.path), "camera_model", model, "pinhole is supported, with any distortion below")
+            raise InvalidField(
+                str(fields.path), "camera_model", model, "pinhole is supported, with any distortion below"
+            )
         found = _Intrinsics(*fields.numbers(("intrinsics",), (4,), "fx, fy, cx, cy in px, four finite numbers"))
     else:
         matrix = fields.numbers(_MATRIX, (9,), "a 3x3 matrix of finite numbers")

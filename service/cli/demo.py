@@ -46,6 +46,8 @@ def run(
     *,
     sensor: str | None,
     topic: str | None,
+    calibration: str | None = None,
+    height_m: float | None = None,
     speed: str,
     loop: bool,
     duration_s: float,
@@ -60,6 +62,8 @@ def run(
         source: as sources.open_source.
         sensor: WIDTHxHEIGHT, if the source lacks it.
         topic: as sources.open_source.
+        calibration: as `neurove drive --calibration`.
+        height_m: height of the camera above the ground [m], if the source lacks it.
         speed: as `neurove drive --speed`.
         loop: start again at the end.
         duration_s: sensor time to play [s]; infinity: until the source ends or the stop event.
@@ -81,6 +85,8 @@ def run(
     drive = ["drive", source, "--connect", endpoint, "--stream", STREAM, "--speed", speed, "--wait", "10", "--json"]
     drive += ["--sensor", sensor] if sensor else []
     drive += ["--topic", topic] if topic else []
+    drive += ["--calibration", calibration] if calibration else []
+    drive += ["--height", str(height_m)] if height_m else []
     drive += ["--loop"] if loop else []
     drive += ["--seconds", str(duration_s)] if math.isfinite(duration_s) else []
     with _process(*serve) as service, _session(config, service, stop, console) as transport:

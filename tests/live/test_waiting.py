@@ -5,6 +5,9 @@ import signal
 
 import pytest
 
+from neurove_core.io.formats.packet_log.writer import PacketWriter
+from neurove_protocol.events import encode_packet
+from tests.builders import make_packets
 from tests.live.conftest import free_endpoint, running, service
 
 pytestmark = pytest.mark.live
@@ -50,3 +53,30 @@ def test_watch_says_since_when_a_stopped_service_is_silent_and_when_it_answers_a
         line_with(watch.child.stderr, "cam1: no estimate since ")
         node.child.send_signal(signal.SIGCONT)
         line_with(watch.child.stderr, "cam1: estimates again")
+
+
+LENS = """cam0:
+  camera_model: pinhole
+  intrinsics: [32, 24, 31.5, 23.5]
+  distortion_model: none
+  distortion_coeffs: []
+  resolution: [64, 48]
+"""
+
+
+def test_a_driver_publishes_the_lens_and_the_height_that_the_user_gives(run, tmp_path):
+    (tmp_path / "lens.yaml").write_text(LENS)
+    with PacketWriter(tmp_path / "log.mcap") as log:
+        for packet in make_packets(1500, stream="left"):
+            log.write("left", encode_packet(packet), packet.t0_us * 1000)
+    endpoint = free_endpoint()
+    given = ("--calibration", str(tmp_path / "lens.yaml"), "--height", "0.4")
+    with (
+        service(endpoint),
+        running("drive", str(tmp_path / "log.mcap"), "--connect", endpoint, *given),
+        running("drive", "pattern://", "--connect", endpoint, "--stream", "right", "--height", "0.4"),
+        running("watch", "--connect", endpoint, "--json") as watch,
+    ):
+        for name in ("left", "right"):
+            flags = json.loads(line_with(watch.child.stdout, f'"stream": "{name}"'))["flags"]
+            assert not {"uncalibrated", "unscaled"} & set(flags), name
