@@ -51,7 +51,8 @@ MAY_IMPORT = {
     "neurove_core": "spiking models estimator sources",
     # neurove_service
     "neurove_service.output": "",
-    "neurove_service.logs": "output",
+    "neurove_service.log_writer": "",
+    "neurove_service.logs": "output log_writer",
     "neurove_service.lifecycle": "",
     "neurove_service.latency": "",
     "neurove_service.endpoints": "",

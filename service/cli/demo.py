@@ -48,6 +48,7 @@ def run(
     topic: str | None,
     calibration: str | None = None,
     height_m: float | None = None,
+    time_unit: str | None = None,
     speed: str,
     loop: bool,
     duration_s: float,
@@ -64,6 +65,7 @@ def run(
         topic: as sources.open_source.
         calibration: as `neurove drive --calibration`.
         height_m: height of the camera above the ground [m], if the source lacks it.
+        time_unit: as sources.open_source.
         speed: as `neurove drive --speed`.
         loop: start again at the end.
         duration_s: sensor time to play [s]; infinity: until the source ends or the stop event.
@@ -87,6 +89,7 @@ def run(
     drive += ["--topic", topic] if topic else []
     drive += ["--calibration", calibration] if calibration else []
     drive += ["--height", str(height_m)] if height_m else []
+    drive += ["--time-unit", time_unit] if time_unit else []
     drive += ["--loop"] if loop else []
     drive += ["--seconds", str(duration_s)] if math.isfinite(duration_s) else []
     with _process(*serve) as service, _session(config, service, stop, console) as transport:

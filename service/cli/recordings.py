@@ -124,7 +124,7 @@ def convert(args: argparse.Namespace) -> int:
     path: Path = args.out
     if path.suffix not in WRITERS:
         raise InvalidField("convert", "OUT", str(path), f"its name must end in {' or '.join(WRITERS)}")
-    recording = open_source(args.source, args.sensor, args.topic)
+    recording = open_source(args.source, args.sensor, args.topic, args.time_unit)
     refuse_existing("convert", "OUT", path, args.source, force=args.force)
     return _write(recording, path, as_json=args.json)
 
@@ -161,7 +161,8 @@ def info(args: argparse.Namespace) -> int:
     from neurove_service.cli.console import console
     from neurove_service.cli.views import survey_table
 
-    recording = with_lens(open_source(args.source, args.sensor, args.topic), args.calibration, args.height)
+    opened = open_source(args.source, args.sensor, args.topic, args.time_unit)
+    recording = with_lens(opened, args.calibration, args.height)
     duration_s = args.seconds if args.seconds is not None else (_ENDLESS_S if recording.endless else None)
     surveyed = summary.survey(recording, duration_s)
     if args.plot:

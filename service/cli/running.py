@@ -62,7 +62,7 @@ def drive(args: argparse.Namespace) -> int:
 
     stop = stop_on_signals(with_parent=args.with_parent)
     config = client_config(args)
-    recording = open_source(args.source, args.sensor, args.topic)
+    recording = open_source(args.source, args.sensor, args.topic, args.time_unit)
     lens = lens_of(recording, args.calibration, args.height)
     wait = Wait(config, args.wait, stop)
     with wait.connect(config) as transport:
@@ -126,7 +126,8 @@ def demo(args: argparse.Namespace) -> int:
 
     stop = stop_on_signals()
     logs.configure("warning")
-    recording = with_lens(open_source(args.source, args.sensor, args.topic), args.calibration, args.height)
+    opened = open_source(args.source, args.sensor, args.topic, args.time_unit)
+    recording = with_lens(opened, args.calibration, args.height)
     endless = recording.endless
     shown = console(stderr=args.json)
     duration_s = args.seconds
@@ -138,6 +139,7 @@ def demo(args: argparse.Namespace) -> int:
         topic=args.topic,
         calibration=args.calibration,
         height_m=args.height,
+        time_unit=args.time_unit,
         speed="max" if math.isinf(args.speed) else str(args.speed),
         loop=args.loop,
         duration_s=duration_s,

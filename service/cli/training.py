@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurove_service.cli.arguments import add_lens_flags, add_recording_flags, check_folder, command
+from neurove_service.cli.arguments import add_lens_flags, add_recording_flags, check_folder, command, tell_faults
 from neurove_service.cli.bars import event_count, progress
 
 if TYPE_CHECKING:
@@ -89,8 +89,8 @@ def evaluate(args: argparse.Namespace) -> int:
     given = motion.twists(read_truth(args.truth)) if args.truth else None
     if args.plot:
         check_folder("evaluate", "--plot", args.plot)
-    lens = (args.calibration, args.height)
-    sources = [(one, with_lens(open_source(one, args.sensor, args.topic), *lens)) for one in args.recordings]
+    opened = [(source, open_source(source, args.sensor, args.topic, args.time_unit)) for source in args.recordings]
+    sources = [(source, with_lens(one, args.calibration, args.height)) for source, one in opened]
     truths = [given or _truth(source, recording) for source, recording in sources]
     estimator.warm_up()
     evaluated = []
@@ -98,6 +98,7 @@ def evaluate(args: argparse.Namespace) -> int:
         with event_count(recording.name) as show:
             estimates = evaluation.estimate_recording(estimator, recording, on_events=show)
         evaluated.append(evaluation.evaluate(estimates, truth))
+        tell_faults(recording)
     report = {"model": estimator.bundle.info.model_dump(), **evaluation.report(evaluated)}
     print(json.dumps(report) if args.json else "\n".join(_table(report)))
     if args.plot:

@@ -5,6 +5,7 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from neurove_protocol.control import StreamStatus
+from neurove_service import logs
 from neurove_service.guard import Guard
 from neurove_service.node.health import stream_status
 from neurove_service.streams.registry import StreamRegistry
@@ -16,6 +17,7 @@ class Condition(NamedTuple):
     refused_streams: int = 0  # because max_streams is reached
     internal_errors: Mapping[str, int] = MappingProxyType({})  # place -> number since the start
     recent_errors: tuple[str, ...] = ()  # the places that had one within the last minute
+    dropped_log_lines: int = 0  # not read in time
     stuck_streams: tuple[str, ...] = ()  # their worker has not turned for 10 s
 
     def reasons(self) -> list[str]:
@@ -55,5 +57,6 @@ class Watch:
             refused_streams=self._registry.refused,
             internal_errors=self._guard.counts,
             recent_errors=tuple(self._guard.recent),
+            dropped_log_lines=logs.dropped(),
             stuck_streams=tuple(self._registry.stuck()),
         )

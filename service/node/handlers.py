@@ -86,6 +86,7 @@ class Handlers:
             epoch=active.epoch,
             refused_streams=condition.refused_streams,
             internal_errors=dict(condition.internal_errors),
+            dropped_log_lines=condition.dropped_log_lines,
             streams=tuple(streams),
             ready=self._ready(),
             change=self._slot.last_change,

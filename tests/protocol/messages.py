@@ -153,6 +153,7 @@ EXAMPLES: dict[str, Fields] = {
         "change": "spire-7 is active",
         "rollbacks": 1,
         "internal_errors": {"packet": 2},
+        "dropped_log_lines": 3,
     },
     "ModelsRequest": {"v": 1},
     "ModelsReply": {
@@ -385,6 +386,7 @@ ANY: dict[str, st.SearchStrategy[Fields]] = {
             "change": sentences,
             "rollbacks": counts,
             "internal_errors": st.dictionaries(sentences, counts, max_size=3),
+            "dropped_log_lines": counts,
         }
     ),
     "ModelsRequest": st.just({}),

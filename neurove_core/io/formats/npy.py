@@ -15,7 +15,7 @@
 import re
 import zipfile
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Self
 
@@ -30,6 +30,7 @@ from neurove_core.io.format import Format
 from neurove_core.io.formats.columns import Unclear, by_name, by_values, piece, unit_of
 from neurove_core.io.formats.npy_rows import MAGIC, Header, Series, blocks, read_header
 from neurove_core.io.recording import EventsOnly, refuse_topic
+from neurove_core.io.units import SAMPLE, UNITS, TimeSample
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
 
@@ -39,7 +40,6 @@ MEMBERS: Final = ("events", "event_data", "arr_0")
 """Names of an array of events in a .npz; the first one is read."""
 
 _CARLA = {"fov_deg.npy", "width.npy"}  # members of the container of `carla.py`
-_SAMPLE_ROWS = 4096
 
 Pick = tuple[int, str | int | None]
 """Where a column is: the number of its series, and the field or the number in a row."""
@@ -107,6 +107,25 @@ class ArrayRecording(EventsOnly):
         tally = self.faults.begin("events")
         return cleaned(self._pieces(tally), self.sensor, tally)
 
+    def time_sample(self) -> TimeSample | None:
+        """Times of the first events, see `Timed`."""
+        columns = _first_columns(self.place, self.layout)
+        unit = next(name for name, us in UNITS.items() if us == self.unit_us)
+        return TimeSample(self.path, columns[0], unit, self._known_rows()) if columns else None
+
+    def in_unit(self, unit: str) -> Self:
+        """The same recording with the times of its events in another unit, see `Timed`."""
+        return replace(self, unit_us=UNITS[unit])
+
+    def _known_rows(self) -> int:
+        """The rows that a plain file has, whatever its header says; 0 for a packed one."""
+        one = self.layout.series[0]
+        return (
+            min(one.rows, (self.place.path / one.name).stat().st_size // one.row_bytes)
+            if self.place.inside is None
+            else 0
+        )
+
     def _pieces(self, tally: Tally) -> Iterator[Piece]:
         at = 0
         for parts in blocks(self.place, self.layout.series):
@@ -169,11 +188,7 @@ def _guessed(place: Place, layout: Layout) -> tuple[Layout, float]:
         Unclear: the columns cannot be told apart.
     """
     names = [key if isinstance(key, str) else layout.series[number].name[:-4] for number, key in layout.picks]
-    try:
-        parts = next(blocks(place, layout.series, _SAMPLE_ROWS * sum(one.row_bytes for one in layout.series)), None)
-    except BrokenRecording:
-        parts = None  # the reading of the events reports it
-    columns = [] if parts is None else layout.columns(parts)
+    columns = _first_columns(place, layout)
     try:
         order = by_name(names)
     except Unclear:  # the columns have no names
@@ -185,6 +200,15 @@ def _guessed(place: Place, layout: Layout) -> tuple[Layout, float]:
         times = columns[order.t]
         unit_us = unit_of(times.astype(np.float64), floats=times.dtype.kind == "f")
     return layout._replace(picks=(t, x, y, p)), unit_us or 1.0
+
+
+def _first_columns(place: Place, layout: Layout) -> list[NDArray[Any]]:
+    """The columns t, x, y, p of the first rows; empty if there are none, or they cannot be read."""
+    try:
+        parts = next(blocks(place, layout.series, SAMPLE * sum(one.row_bytes for one in layout.series)), None)
+    except BrokenRecording:  # reading the events reports it
+        parts = None
+    return [] if parts is None else layout.columns(parts)
 
 
 def _is_number(dtype: np.dtype[Any]) -> bool:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from neurove_core.io import MissingGeometry, RecordingError, UnknownSource
+from neurove_core.io import DoubtfulUnit, MissingGeometry, RecordingError, UnknownSource
 from neurove_core.io.recording import CHUNK_EVENTS
 from neurove_core.sources import open_source
 from neurove_protocol import Events, Sensor
@@ -81,6 +81,17 @@ def test_the_content_decides_before_the_suffix(tmp_path):
         assert_same(read(open_source(str(tmp_path / name), SENSOR)), EVENTS)
     with pytest.raises(UnknownSource, match=r"d\.npy is not a NumPy array"):
         open_source(put(tmp_path, "d.npy", b"no array"))
+
+
+def test_an_implausible_unit_of_time_is_refused_with_a_guess_and_the_caller_can_give_it(tmp_path):
+    np.save(tmp_path / "a.npy", np.stack([T * 1000 + 10**18, X, Y, P], axis=1))
+    with pytest.raises(DoubtfulUnit, match="probably they are in ns: give --time-unit ns"):
+        open_source(str(tmp_path / "a.npy"), SENSOR)
+    got = read(open_source(str(tmp_path / "a.npy"), SENSOR, time_unit="ns"))
+    assert_same(got, EVENTS._replace(t=T + 10**15))
+    np.save(tmp_path / "b.npy", np.stack([T // 1000, X, Y, P], axis=1))
+    got = read(open_source(str(tmp_path / "b.npy"), SENSOR, time_unit="ms"))
+    assert_same(got, EVENTS._replace(t=T // 1000 * 1000))
 
 
 def test_an_archive_with_one_array_for_each_column_is_read(tmp_path):
