@@ -18,6 +18,7 @@ from neurove_core.io.faults import Reason
 from neurove_core.io.format import Format, UrlFormat
 from neurove_core.io.recording import Recording
 from neurove_core.io.spool import HEAD_BYTES, Plain, compression_of, is_text, piped, plain_file
+from neurove_core.io.units import with_unit
 from neurove_protocol.events import Sensor
 
 log = logging.getLogger(__name__)
@@ -28,13 +29,16 @@ GROUP: Final = "neurove.recordings"
 FORMATS: Final = (
     "neurove_core.io.formats.aedat.aedat4",
     "neurove_core.io.formats.aedat.aedat2",
+    "neurove_core.io.formats.aedat.aedat3",
     "neurove_core.io.formats.prophesee.raw",
     "neurove_core.io.formats.prophesee.dat",
     "neurove_core.io.formats.eventstream",
     "neurove_core.io.formats.packet_log.reader",  # before ROS 2: both are .mcap
     "neurove_core.io.formats.ros.recording",
     "neurove_core.io.formats.evbench",
+    "neurove_core.io.formats.npy",  # before CARLA: both are .npz
     "neurove_core.io.formats.carla",
+    "neurove_core.io.formats.atis_bin",
     "neurove_core.io.formats.ecd",
     "neurove_core.io.formats.hdf5.datasets",
 )
@@ -54,7 +58,9 @@ class _Table(NamedTuple):
     failed: tuple[str, ...]  # entry points that could not be loaded, with the reason
 
 
-def open_source(source: str, sensor: Sensor | None = None, topic: str | None = None) -> Recording:
+def open_source(
+    source: str, sensor: Sensor | None = None, topic: str | None = None, time_unit: str | None = None
+) -> Recording:
     """Open a recording.
 
     Args:
@@ -62,23 +68,25 @@ def open_source(source: str, sensor: Sensor | None = None, topic: str | None = N
             pipe is first copied into a temporary file; a file compressed with gzip, zstd, bz2 or lz4 is decompressed.
         sensor: size of the pixel array; overrides what the recording says.
         topic: one of several event streams, such as `davis/right` of MVSEC; by default the first.
+        time_unit: unit of the event times in the file, one of s, ms, us and ns; by default that of its layout.
 
     Raises:
         UnknownSource: the source does not exist, has no known format, or does not have this topic.
         MissingGeometry: neither the caller nor the recording gives the sensor size.
+        DoubtfulUnit: the times are implausible in the unit of the layout, and no `time_unit` is given.
         BrokenRecording: the header is damaged.
         MissingExtra: a library that reads this format is not installed.
-        InvalidField: a calibration file or a query of the URL is invalid.
+        InvalidField: a calibration file or a query of the URL is invalid, or the format allows no other unit of time.
     """
     scheme, separator, _ = source.partition("://")
     if separator:
         if scheme not in URLS:
-            raise UnknownSource(source, f"unknown scheme {scheme}://", supported())
-        return _url_format(scheme).open(source, sensor, topic)
+            raise UnknownSource(source, f"unknown scheme {scheme}://", _known())
+        return with_unit(_url_format(scheme).open(source, sensor, topic), time_unit)
     if not source.strip():
-        raise UnknownSource(source, "the name of the source is empty", supported())
+        raise UnknownSource(source, "the name of the source is empty", _known())
     try:
-        return _open_path(Path(source), sensor, topic)
+        return with_unit(_open_path(Path(source), sensor, topic), time_unit)
     except OSError as error:
         where = f": {error.filename}" if error.filename not in (None, source) else ""
         raise UnknownSource(source, f"{error.strerror or error}{where}") from None
@@ -91,6 +99,12 @@ def supported() -> tuple[str, ...]:
     return (*dict.fromkeys(one.about for one in table.formats), *urls, *table.failed)
 
 
+def _known() -> tuple[str, ...]:
+    """What `supported` lists, for an error: without what stands in brackets, and what is not loaded first."""
+    failed = _table().failed
+    return (*failed, *dict.fromkeys(re.sub(r" \([^)]*\)", "", line) for line in supported() if line not in failed))
+
+
 def _open_path(path: Path, sensor: Sensor | None, topic: str | None) -> Recording:
     if not path.exists():
         raise UnknownSource(path, "no such file or folder")
@@ -98,7 +112,7 @@ def _open_path(path: Path, sensor: Sensor | None, topic: str | None) -> Recordin
         for one in _table().formats:
             if one.fits(path):
                 return one.open(path, sensor, topic)
-        raise UnknownSource(path, "the folder has no events.txt", supported())
+        raise UnknownSource(path, "the folder has no events.txt", _known())
     if path.is_symlink() and path.is_file() and not path.suffix:  # /dev/stdin of a redirected file
         path = path.resolve()
     plain = _plain(path)
@@ -127,7 +141,7 @@ def _plain(path: Path) -> Plain:
             suffix = suffix or (".txt" if is_text(head) else "")
             if not suffix and not compression_of(head) and not any(one.recognises(head) for one in _table().formats):
                 why = "its first bytes are of no known format" if head else "it gives nothing"
-                raise UnknownSource(path, f"{why}; a pipe needs content that identifies its format", supported())
+                raise UnknownSource(path, f"{why}; a pipe needs content that identifies its format", _known())
             path = piped(path, stream, head, path.name.removesuffix(path.suffix) + (suffix or path.suffix))
     if not path.is_file():
         raise UnknownSource(path, "it is no plain file, pipe or folder")
@@ -155,7 +169,7 @@ def _format_of(path: Path) -> Format:
     if found is None:
         suffix = path.suffix.lower()
         why = f"unknown suffix {suffix!r}" if suffix else "the file has no suffix"
-        raise UnknownSource(path, f"{why}, and its first bytes are of no known format", supported())
+        raise UnknownSource(path, f"{why}, and its first bytes are of no known format", _known())
     return found
 
 

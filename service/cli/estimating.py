@@ -126,7 +126,7 @@ def estimate(args: argparse.Namespace) -> int:
     path: Path = args.out
     if path.suffix not in WRITERS:
         raise InvalidField("estimate", "--out", str(path), f"its name must end in {', '.join(WRITERS)}")
-    recording = open_source(args.source, args.sensor, args.topic)
+    recording = open_source(args.source, args.sensor, args.topic, args.time_unit)
     if recording.endless and args.seconds is None:
         raise InvalidField("estimate", "RECORDING", args.source, "it never ends: give --seconds S")
     refuse_existing("estimate", "--out", path, args.source, force=args.force)

@@ -5,6 +5,7 @@ import gc
 import json
 import math
 import sys
+import threading
 from typing import Any
 
 from neurove_protocol.errors import EXIT_FAILURE, InvalidField
@@ -17,17 +18,18 @@ from neurove_service.cli.arguments import (
     client_config,
     command,
     flags,
-    seconds,
     subcommand,
     tell_faults,
 )
 from neurove_service.cli.parser import Parser
+from neurove_service.cli.waiting import Wait, add_wait
 from neurove_service.config import ServiceConfig, load
 from neurove_service.lifecycle import stop_on_signals
 
 DEFAULT_SOURCE = "sim://"
 _DEFAULT_DEMO_S = 20.0
 _STREAM = "cam0"
+_AT_ONCE_S = 1.0  # a service that runs subscribes to a new session within this time
 
 
 def serve(args: argparse.Namespace) -> int:
@@ -58,10 +60,11 @@ def drive(args: argparse.Namespace) -> int:
 
     stop = stop_on_signals(with_parent=args.with_parent)
     config = client_config(args)
-    recording = open_source(args.source, args.sensor, args.topic)
-    with ask.connect(config, patience_s=max(ask.CONNECT_S, args.wait), stop=stop) as transport:
+    recording = open_source(args.source, args.sensor, args.topic, args.time_unit)
+    wait = Wait(config, args.wait, stop)
+    with wait.connect(config) as transport:
         player = _player(args, recording, transport, config.keys)
-        if args.wait and not player.wait_for_listener(args.wait, stop) and not stop.is_set():
+        if args.wait and not _listened_to(player, wait, stop):
             hint = "; if one runs, does it accept this certificate?" if config.zenoh_config else ""
             raise ask.NoService(f"no service subscribed to stream {player.label} within {args.wait:g} s{hint}")
         duration_s = math.inf if args.seconds is None else args.seconds
@@ -80,6 +83,15 @@ def drive(args: argparse.Namespace) -> int:
         print(f"neurove: {broken}", file=sys.stderr)
     tell_faults(recording)
     return EXIT_FAILURE if broken else 0
+
+
+def _listened_to(player: Any, wait: Wait, stop: threading.Event) -> bool:
+    """Wait for a service that subscribes; return whether one did, or the user ended the wait."""
+    if player.wait_for_listener(min(_AT_ONCE_S, wait.left_s), stop):
+        return True
+    if not stop.is_set():
+        wait.say()
+    return player.wait_for_listener(wait.left_s, stop) or stop.is_set()
 
 
 def _player(args: argparse.Namespace, recording: Any, transport: Any, keys: Any) -> Any:
@@ -106,7 +118,7 @@ def demo(args: argparse.Namespace) -> int:
 
     stop = stop_on_signals()
     logs.configure("warning")
-    endless = open_source(args.source, args.sensor, args.topic).endless
+    endless = open_source(args.source, args.sensor, args.topic, args.time_unit).endless
     shown = console(stderr=args.json)
     duration_s = args.seconds
     if duration_s is None:
@@ -115,6 +127,7 @@ def demo(args: argparse.Namespace) -> int:
         args.source,
         sensor=str(args.sensor) if args.sensor else None,
         topic=args.topic,
+        time_unit=args.time_unit,
         speed="max" if math.isinf(args.speed) else str(args.speed),
         loop=args.loop,
         duration_s=duration_s,
@@ -184,8 +197,7 @@ def add_drive(parser: argparse.ArgumentParser) -> None:
     about = f"name of the stream, one key chunk; default {_STREAM}, and for a packet log the names in it"
     parser.add_argument("--stream", metavar="NAME", help=about)
     add_playback_flags(parser, "seconds of the source to play; default: until its end")
-    about = "longest wait for a service that subscribes; default: no wait"
-    parser.add_argument("--wait", type=seconds, default=0.0, metavar="S", help=about)
+    add_wait(parser)
     _add_with_parent(parser)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurove_service.cli.arguments import add_recording_flags, check_folder, command
+from neurove_service.cli.arguments import add_recording_flags, check_folder, command, tell_faults
 from neurove_service.cli.bars import event_count, progress
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ def evaluate(args: argparse.Namespace) -> int:
     given = motion.twists(read_truth(args.truth)) if args.truth else None
     if args.plot:
         check_folder("evaluate", "--plot", args.plot)
-    sources = [(source, open_source(source, args.sensor, args.topic)) for source in args.recordings]
+    sources = [(source, open_source(source, args.sensor, args.topic, args.time_unit)) for source in args.recordings]
     truths = [given or _truth(source, recording) for source, recording in sources]
     estimator.warm_up()
     evaluated = []
@@ -96,6 +96,7 @@ def evaluate(args: argparse.Namespace) -> int:
         with event_count(recording.name) as show:
             estimates = evaluation.estimate_recording(estimator, recording, on_events=show)
         evaluated.append(evaluation.evaluate(estimates, truth))
+        tell_faults(recording)
     report = {"model": estimator.bundle.info.model_dump(), **evaluation.report(evaluated)}
     print(json.dumps(report) if args.json else "\n".join(_table(report)))
     if args.plot:

@@ -1,5 +1,6 @@
 """Replay of packet logs: publish the recorded packets bit for bit, paced by their sensor clock."""
 
+import logging
 import math
 import threading
 import time
@@ -7,6 +8,7 @@ from dataclasses import dataclass, field
 
 from neurove_core.io import BrokenRecording
 from neurove_core.io.formats.packet_log.reader import LIMITS, McapRecording, RecordedPacket
+from neurove_core.io.order import MAX_GAP_US
 from neurove_protocol.camera import SCHEMA as CAMERA_SCHEMA
 from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.events import SCHEMA as EVENTS_SCHEMA
@@ -15,9 +17,11 @@ from neurove_protocol.keys import Keys
 from neurove_service.clients.driver import POLL_S, PlaySummary
 from neurove_service.transport import Publisher, Transport
 
+log = logging.getLogger(__name__)
+
 
 @dataclass
-class _Pace:
+class Pace:
     """When the packets of each stream are due; each stream has its own clock, and clocks are not compared."""
 
     speed: float
@@ -36,6 +40,9 @@ class _Pace:
         origin, first_us, newest_us = self.clocks[recorded.stream]
         if packet.t0_us < first_us or t_us < newest_us - 1_000_000:  # the driver was restarted
             origin, first_us = time.monotonic(), packet.t0_us
+        elif packet.t0_us - newest_us > MAX_GAP_US:
+            log.warning("gap skipped: stream=%s seconds=%.1f", recorded.stream, (packet.t0_us - newest_us) / 1e6)
+            first_us += packet.t0_us - newest_us
         self.clocks[recorded.stream] = (origin, first_us, t_us)
         elapsed_s = (t_us - first_us) / 1e6
         return origin + elapsed_s / self.speed, elapsed_s
@@ -102,7 +109,7 @@ class Replay:
         if loop:
             raise ValueError("a replay cannot loop")
         sent = PlaySummary(0, 0, None, None, None)
-        pace = _Pace(speed)
+        pace = Pace(speed)
         try:
             for recorded in self._recording.packets(self._only):
                 packet = _read(recorded)

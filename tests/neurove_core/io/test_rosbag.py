@@ -382,7 +382,7 @@ def test_corrupt_bytes_raise_only_recording_errors(tmp_path, container):
 @pytest.mark.parametrize(
     ("change", "why"),
     [
-        ({"encoding": "evt9"}, "unknown encoding 'evt9'; supported: evt3, libcaer, libcaer_cmp, mono"),
+        ({"encoding": "evt9"}, "unknown encoding 'evt9'; supported: evt2, evt21, evt3, evt4, libcaer"),
         ({"data": b"\0" * 9}, "9 bytes are not a multiple of 8"),
         ({"data": mono(Events.from_columns([1], [64], [0], [1]))}, "lies outside the sensor 64x48"),
         ({"data": mono(Events.from_columns([1], [0], [0], [1]))}, "time"),

@@ -80,6 +80,20 @@ def test_a_bad_line_costs_itself_and_is_told(run, tmp_path):
     assert len(list(open_source(str(tmp_path / "c.mcap")).chunks())) == 1
 
 
+@pytest.mark.parametrize("name", ["c.mcap", "c.h5"])
+def test_a_gap_of_years_is_converted_and_told(run, tmp_path, name):
+    lines = "0.0 1 1 1\n" + "".join(f"{1564587893 + i / 1000:.6f} {i % 64} {i % 48} 1\n" for i in range(500))
+    (tmp_path / "a.txt").write_text(lines)
+    code, found, err = run("convert", tmp_path / "a.txt", tmp_path / name, "--sensor", "64x48", "--json")
+    if name == "c.h5":  # its index has an entry for each millisecond
+        assert (code, "span_s" in err) == (2, True)
+        return
+    assert (code, json.loads(found)["events"], "long gap in time" in err) == (0, 501, True)
+    again = open_source(str(tmp_path / name))
+    assert sum(chunk.n for chunk in again.chunks()) == 501
+    assert (tmp_path / name).stat().st_size < 50_000
+
+
 def test_what_can_be_read_of_a_truncated_recording_is_converted_and_the_exit_code_is_1(run, tmp_path):
     (tmp_path / "a.dat").write_bytes(dat(make_events(200))[:-3])
     code, found, err = run("convert", tmp_path / "a.dat", tmp_path / "c.h5", "--json")

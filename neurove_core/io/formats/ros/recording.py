@@ -29,7 +29,7 @@ from neurove_core.io.formats.containers.mcap_records import MAGIC as MCAP_MAGIC
 from neurove_core.io.formats.containers.ros1 import MAGIC as ROS1_MAGIC
 from neurove_core.io.formats.containers.ros1 import Ros1Bag
 from neurove_core.io.formats.ros import messages
-from neurove_core.io.formats.ros.events import UNIX_TIME, Anchor, Decoder
+from neurove_core.io.formats.ros.events import PROPHESEE, UNIX_TIME, Anchor, Decoder
 from neurove_core.io.formats.ros.messages import BadMessage, EventMessage
 from neurove_core.io.order import Where
 from neurove_core.io.recording import EventsOnly, Imu, Triggers, later
@@ -79,8 +79,9 @@ def open_bag(path: Path) -> BagFile:
 class RosbagRecording(EventsOnly):
     """One camera of a ROS bag; see `Recording`.
 
-    Event times of `evt3` and `mono` messages are on the unwrapped sensor clock. Event times of `libcaer`, `libcaer_cmp`
-    and dvs_msgs are unix time. All other data have the stamp of their header minus `ros_offset_us`.
+    Event times of Prophesee words and of `mono` messages are on the unwrapped sensor clock. Event times of `libcaer`,
+    `libcaer_cmp`, dvs_msgs and prophesee_event_msgs are unix time. All other data have the stamp of their header minus
+    `ros_offset_us`.
     """
 
     path: Path
@@ -129,7 +130,7 @@ class RosbagRecording(EventsOnly):
         """Names of the data that the bag holds for this camera; the first is `events`."""
         present = {
             "imu": self._nearest_topic(IMU_TYPE) is not None,
-            "triggers": self.first.encoding == "evt3",
+            "triggers": self.first.encoding in PROPHESEE,
             "poses": self._nearest_topic(*POSE_TYPES) is not None,
             "twists": self._nearest_topic(*POSE_TYPES) is not None,
         }
@@ -225,8 +226,8 @@ class RosbagRecording(EventsOnly):
                 tally.add(Reason.DAMAGED, message.where, str(why))
 
     def triggers(self) -> Iterator[Triggers]:
-        """Yield the edges of the trigger input. `evt3` messages hold them among the events."""
-        if self.first.encoding == "evt3":
+        """Yield the edges of the trigger input. Messages of Prophesee words hold them among the events."""
+        if self.first.encoding in PROPHESEE:
             tally = self.faults.begin("triggers")
             yield from ordered(self._edges(tally), tally)
 
