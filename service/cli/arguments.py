@@ -54,6 +54,13 @@ def add_recording_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--time-unit", choices=("s", "ms", "us", "ns"), metavar="U", help=about)
 
 
+def add_lens_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the lens and the height of the camera, if the recording lacks them."""
+    about = "lens of the camera: YAML of ROS, Kalibr or OpenCV, or XML of OpenCV; FILE#NAME for one of several cameras"
+    parser.add_argument("--calibration", metavar="FILE", help=about)
+    parser.add_argument("--height", type=metres, metavar="M", help="height of the camera above the ground [m]")
+
+
 def add_playback_flags(parser: argparse.ArgumentParser, seconds_help: str) -> None:
     """Add how fast and how long a source is played."""
     parser.add_argument(

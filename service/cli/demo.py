@@ -46,6 +46,8 @@ def run(
     *,
     sensor: str | None,
     topic: str | None,
+    calibration: str | None = None,
+    height_m: float | None = None,
     time_unit: str | None = None,
     speed: str,
     loop: bool,
@@ -61,6 +63,8 @@ def run(
         source: as sources.open_source.
         sensor: WIDTHxHEIGHT, if the source lacks it.
         topic: as sources.open_source.
+        calibration: as `neurove drive --calibration`.
+        height_m: height of the camera above the ground [m], if the source lacks it.
         time_unit: as sources.open_source.
         speed: as `neurove drive --speed`.
         loop: start again at the end.
@@ -83,6 +87,8 @@ def run(
     drive = ["drive", source, "--connect", endpoint, "--stream", STREAM, "--speed", speed, "--wait", "10", "--json"]
     drive += ["--sensor", sensor] if sensor else []
     drive += ["--topic", topic] if topic else []
+    drive += ["--calibration", calibration] if calibration else []
+    drive += ["--height", str(height_m)] if height_m else []
     drive += ["--time-unit", time_unit] if time_unit else []
     drive += ["--loop"] if loop else []
     drive += ["--seconds", str(duration_s)] if math.isfinite(duration_s) else []
