@@ -47,9 +47,18 @@ def add_source(parser: argparse.ArgumentParser, **source: Any) -> None:
 
 
 def add_recording_flags(parser: argparse.ArgumentParser) -> None:
-    """Add what a recording may not say itself: the sensor's size, and which of its event streams to read."""
+    """Add what a recording may not say itself: the sensor's size, the event stream to read, and the unit of time."""
     parser.add_argument("--sensor", type=sensor_size, metavar="WxH", help="sensor size, if the recording lacks it")
     parser.add_argument("--topic", metavar="T", help="event stream to read; default: the recording's first")
+    about = "unit of the times in the recording: s, ms, us or ns; default: that of its layout"
+    parser.add_argument("--time-unit", choices=("s", "ms", "us", "ns"), metavar="U", help=about)
+
+
+def add_lens_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the lens and the height of the camera, if the recording lacks them."""
+    about = "lens of the camera: YAML of ROS, Kalibr or OpenCV, or XML of OpenCV; FILE#NAME for one of several cameras"
+    parser.add_argument("--calibration", metavar="FILE", help=about)
+    parser.add_argument("--height", type=metres, metavar="M", help="height of the camera above the ground [m]")
 
 
 def add_playback_flags(parser: argparse.ArgumentParser, seconds_help: str) -> None:

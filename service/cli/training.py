@@ -7,7 +7,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurove_service.cli.arguments import add_recording_flags, check_folder, command, count
+from neurove_service.cli.arguments import (
+    add_lens_flags,
+    add_recording_flags,
+    check_folder,
+    command,
+    count,
+    tell_faults,
+)
 from neurove_service.cli.bars import event_count, progress
 
 if TYPE_CHECKING:
@@ -80,6 +87,7 @@ def evaluate(args: argparse.Namespace) -> int:
     from neurove_core.estimator import Estimator
     from neurove_core.evaluation import evaluate as evaluation
     from neurove_core.geometry import motion
+    from neurove_core.io.calibration import with_lens
     from neurove_core.io.formats.pose_files import read_truth
     from neurove_core.sources import open_source
 
@@ -88,7 +96,8 @@ def evaluate(args: argparse.Namespace) -> int:
     given = motion.twists(read_truth(args.truth)) if args.truth else None
     if args.plot:
         check_folder("evaluate", "--plot", args.plot)
-    sources = [(source, open_source(source, args.sensor, args.topic)) for source in args.recordings]
+    opened = [(source, open_source(source, args.sensor, args.topic, args.time_unit)) for source in args.recordings]
+    sources = [(source, with_lens(one, args.calibration, args.height)) for source, one in opened]
     truths = [given or _truth(source, recording) for source, recording in sources]
     estimator.warm_up()
     evaluated = []
@@ -96,6 +105,7 @@ def evaluate(args: argparse.Namespace) -> int:
         with event_count(recording.name) as show:
             estimates = evaluation.estimate_recording(estimator, recording, on_events=show)
         evaluated.append(evaluation.evaluate(estimates, truth))
+        tell_faults(recording)
     report = {"model": estimator.bundle.info.model_dump(), **evaluation.report(evaluated)}
     print(json.dumps(report) if args.json else "\n".join(_table(report)))
     if args.plot:
@@ -208,6 +218,7 @@ def add_evaluate(parser: argparse.ArgumentParser) -> None:
     about = "poses of the camera, on the recording's clock; default: the truth in the recording"
     parser.add_argument("--truth", type=Path, metavar="FILE", help=about)
     add_recording_flags(parser)
+    add_lens_flags(parser)
     parser.add_argument("--plot", type=Path, metavar="DIR", help="draw truth and estimate over time into this folder")
 
 
