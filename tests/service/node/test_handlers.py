@@ -32,6 +32,7 @@ from neurove_service.models.change import Rules
 from neurove_service.models.signatures import Signed
 from neurove_service.models.slot import ModelSlot
 from neurove_service.models.store import ModelStore
+from neurove_service.node.condition import Condition
 from neurove_service.node.handlers import Handlers
 from neurove_service.node.health import stream_status
 from neurove_service.streams.intake import Arrival
@@ -54,7 +55,7 @@ def stream(slot, clock):
 
 @pytest.fixture
 def handlers(slot, stream, clock):
-    return Handlers("edge", slot, lambda: [stream_status("edge", stream, clock[0])], lambda: 0)
+    return Handlers("edge", slot, lambda: [stream_status("edge", stream, clock[0])])
 
 
 def feed(stream, clock, packets):
@@ -119,7 +120,7 @@ def test_health_reports_the_newest_model_change_and_whether_the_node_is_ready(sl
         slot.activate("three")
     assert ask_health(handlers).change.startswith("three was refused: ")
     assert not HealthReply.decode(
-        Handlers("edge", slot, list, lambda: 0, ready=lambda: False).health(HealthRequest().encode())
+        Handlers("edge", slot, list, ready=lambda: False).health(HealthRequest().encode())
     ).ready
 
 
@@ -177,7 +178,7 @@ def storing(models_dir, tmp_path):
         active_file = ActiveFile(None)
         active_file.keep(Active(digest="0" * 64, previous=None, configured="one", highest_release=highest_release))
         slot = ModelSlot("one", models_dir, Rules(probation_s=0.2), pushed=store.files)
-        return Handlers("edge", slot, list, lambda: 0, store, active_file)
+        return Handlers("edge", slot, list, Condition, store, active_file)
 
     return make
 
@@ -274,7 +275,7 @@ def test_a_model_whose_signature_is_refused_is_listed_as_untrusted(models_dir):
         raise NeuroVEError("untrusted")
 
     slot = ModelSlot("one", models_dir)
-    handlers = Handlers("edge", slot, list, lambda: 0, ModelStore(None, models_dir, verify=refuses))
+    handlers = Handlers("edge", slot, list, Condition, ModelStore(None, models_dir, verify=refuses))
     models = ModelsReply.decode(handlers.models(ModelsRequest().encode()))
     states = {info.name: info.signature for info in models.available}
     assert states == {"default": "unsigned", "untrained": "unsigned", "one": "untrusted", "two": "untrusted"}
