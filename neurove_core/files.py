@@ -175,3 +175,14 @@ def move_folder(source: Path, target: Path) -> None:
     source.rename(target)
     sync(target.parent)
     sync(source.parent)
+
+
+def make_writable(folder: Path) -> None:
+    """Create a folder, unless it exists, and check that a file can be written into it.
+
+    Raises:
+        OSError: it cannot.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=folder) as file:
+        file.write(b"\0")

@@ -183,6 +183,8 @@ class HealthReply(Message):
     ready: bool = True  # the node answers the next packet of a stream; false while it shuts down
     change: str = ""  # one sentence about the newest model change: its progress or its result
     rollbacks: Count = 0  # automatic rollbacks since the start
+    internal_errors: dict[str, Count] = Field(default_factory=dict)  # place in the node -> number since the start
+    dropped_log_lines: Count = 0  # not read in time
 
 
 class ModelsReply(Message):

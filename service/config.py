@@ -126,7 +126,10 @@ class ServiceConfig(_Settings):
     )
     store_mib: int = Field(2048, ge=1, le=1 << 20, description="Maximum disk space of pushed models [MiB].")
     queue_s: float = Field(
-        1.0, gt=0, le=60, description="Packets that wait longer in the queue are dropped, oldest first [s]."
+        1.0,
+        gt=0,
+        le=60,
+        description="A worker that is behind for this time leaves out whole windows; older packets are dropped [s].",
     )
     max_age_s: float = Field(
         1.0,

@@ -20,6 +20,7 @@ import zenoh
 from neurove_protocol.control import CONTROL_SCHEMA, PROGRESS_SCHEMA, ErrorReply, PeerError
 from neurove_protocol.errors import Busy, InternalError, NeuroVEError
 from neurove_service import logs
+from neurove_service.guard import Guard
 
 log = logs.get(__name__)
 
@@ -91,10 +92,15 @@ class Publisher:
 
 
 class Transport:
-    """One Zenoh session. Use it in a `with` block or close it: an open session keeps the process alive."""
+    """One Zenoh session. Use it in a `with` block or close it: an open session keeps the process alive.
 
-    def __init__(self, session: zenoh.Session) -> None:
-        self._session = session
+    Args:
+        session: opened.
+        guard: counts internal errors of what is called for a message or a query.
+    """
+
+    def __init__(self, session: zenoh.Session, guard: Guard | None = None) -> None:
+        self._session, self._guard = session, guard or Guard()
         self._answering: list[tuple[Any, threading.Thread]] = []
         self._kept: list[Any] = []  # Zenoh undeclares what is garbage collected
 
@@ -140,7 +146,8 @@ class Transport:
         """Receive every message of a key expression until the session is closed."""
 
         def receive(sample: zenoh.Sample) -> None:
-            on_sample(str(sample.key_expr), sample.payload.to_bytes(), time.monotonic_ns())
+            with self._guard.at("message"):
+                on_sample(str(sample.key_expr), sample.payload.to_bytes(), time.monotonic_ns())
 
         self._kept.append(self._session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
 
@@ -149,9 +156,10 @@ class Transport:
 
         def receive(sample: zenoh.Sample) -> None:
             received_ns = time.monotonic_ns()
-            attached = sample.attachment.to_bytes() if sample.attachment is not None else b""
-            sent_us = _SENT.unpack(attached)[0] if len(attached) == _SENT.size else None
-            on_sample(str(sample.key_expr), sample.payload.to_bytes(), received_ns, sent_us)
+            with self._guard.at("message"):
+                attached = sample.attachment.to_bytes() if sample.attachment is not None else b""
+                sent_us = _SENT.unpack(attached)[0] if len(attached) == _SENT.size else None
+                on_sample(str(sample.key_expr), sample.payload.to_bytes(), received_ns, sent_us)
 
         self._kept.append(self._session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
 
@@ -166,7 +174,7 @@ class Transport:
 
         def work(query: zenoh.Query) -> None:
             with query:
-                _reply(query, key, handle, schema)
+                _reply(query, key, handle, schema, self._guard)
 
         self._answer(key, work)
 
@@ -203,10 +211,11 @@ class Transport:
 
             with query:
                 try:
-                    _reply(query, key, lambda request: handle(request, report), CONTROL_SCHEMA)
+                    _reply(query, key, lambda request: handle(request, report), CONTROL_SCHEMA, self._guard)
                 finally:
                     free.release()
-            after()
+            with self._guard.at("after a query", key=key):
+                after()
 
         self._answer(key, work)
 
@@ -215,7 +224,8 @@ class Transport:
 
         def serve() -> None:
             for query in queryable:
-                work(query)
+                with self._guard.at("query", key=key):
+                    work(query)
 
         thread = threading.Thread(target=serve, name=f"answer {key}", daemon=True)
         thread.start()
@@ -289,13 +299,13 @@ def _query(
             raise PeerError(ErrorReply.decode(reply.err.payload.to_bytes()))
 
 
-def _reply(query: zenoh.Query, key: str, handle: Callable[[bytes], bytes], schema: str) -> None:
+def _reply(query: zenoh.Query, key: str, handle: Callable[[bytes], bytes], schema: str, guard: Guard) -> None:
     try:
         answer = handle(query.payload.to_bytes() if query.payload else b"")
     except NeuroVEError as error:
         return _refuse(query, error)
-    except Exception:  # a bug must not end the loop; the caller still gets a reply
-        log.exception("handler failed", key=key)
+    except Exception as error:  # noqa: BLE001  # a bug must not end the loop; the caller still gets a reply
+        guard.caught("query", error, key=key)
         return _refuse(query, InternalError())
     return _send(query, key, answer, schema)
 
@@ -318,6 +328,7 @@ def open_transport(
     config_file: Path | None = None,
     patience_s: float = 0.0,
     stop: threading.Event | None = None,
+    guard: Guard | None = None,
 ) -> Transport:
     """Open a session.
 
@@ -328,6 +339,7 @@ def open_transport(
         config_file: Zenoh configuration (JSON5) that these settings are added to.
         patience_s: how long a client retries while no process listens [s].
         stop: ends the retries early.
+        guard: counts internal errors of what is called for a message or a query.
 
     Raises:
         Unreachable: no process listened for that time.
@@ -339,7 +351,7 @@ def open_transport(
     waiting = False
     while True:
         try:
-            return Transport(zenoh.open(config))
+            return Transport(zenoh.open(config), guard)
         except zenoh.ZError as error:
             if not str(error).startswith("Unable to connect"):  # Zenoh has one error class and no codes
                 raise EndpointError(

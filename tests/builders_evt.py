@@ -1,4 +1,4 @@
-"""A tiny writer of Prophesee words: events -> EVT2 or EVT3, and after how many words each event is complete."""
+"""A tiny writer of EVT2, EVT2.1, EVT3 and EVT4: events -> words, and after how many words each event is complete."""
 
 from itertools import pairwise
 from typing import NamedTuple
@@ -12,6 +12,8 @@ ADDR_Y, ADDR_X, BASE_X, VECT_12, VECT_8, TIME_LOW, TIME_HIGH = 0, 2, 3, 4, 5, 6,
 TRIGGER, OTHERS = 0xA, 0xE
 
 HEADER_EVT2 = b"% date 2020-09-25 07:48:31\n% evt 2.0\n% geometry 64x48\n"
+HEADER_EVT21 = b"% camera_integrator_name Prophesee\n% format EVT21;height=48;width=64\n"
+HEADER_EVT4 = b"% format EVT4;height=48;width=64\n% geometry 64x48\n% end\n"
 HEADER_EVT3 = b"% evt 3.0\n% format EVT3;height=48;width=64\n% end\n"
 
 
@@ -95,3 +97,53 @@ def write_evt2(events: Events) -> Written:
         words.append((p, cd(t & 0x3F, x, y)))
         ends.append(len(words))
     return Written(evt2(*words), np.array(ends, np.intp))
+
+
+def _vectors(events: Events) -> list[tuple[int, int, int, int, int]]:
+    """Time, first column, row, polarity and mask of up to 32 neighbours that follow each other."""
+    found: list[tuple[int, int, int, int, int]] = []
+    before = None
+    for t, x, y, p in zip(*(column.tolist() for column in events), strict=True):
+        same = before is not None and _continues(before, (t, x, y, p)) and x - found[-1][1] < 32
+        if same:
+            t0, x0, *others, mask = found.pop()
+            found.append((t0, x0, *others, mask | 1 << x - x0))
+        else:
+            found.append((t, x, y, p, 1))
+        before = (t, x, y, p)
+    return found
+
+
+def write_evt21(events: Events) -> Written:
+    """Words with the upper half in the upper 32 bits."""
+    words: list[int] = []
+    ends: list[int] = []
+    high = None
+    for t, x, y, p, mask in _vectors(events):
+        if t >> 6 != high:
+            words += [(TIME_HIGH << 28 | value) << 32 for value in highs(high, t >> 6, 1 << 28)]
+            words.append((OTHERS << 28 | 7) << 32 | 0xFFFF_FFFF)
+            high = t >> 6
+        words.append((p << 28 | cd(t & 0x3F, x, y)) << 32 | mask)
+        ends += [len(words)] * mask.bit_count()
+    return Written(np.array(words, np.uint64), np.array(ends, np.intp))
+
+
+def legacy(words: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """EVT2.1 words as an IMX636 sends them."""
+    return words.view(np.uint32).reshape(-1, 2)[:, ::-1].copy().view(np.uint64).ravel()
+
+
+def write_evt4(events: Events) -> Written:
+    """Single events as one word, the others as a vector of two words."""
+    words: list[int] = []
+    ends: list[int] = []
+    high = None
+    for t, x, y, p, mask in _vectors(events):
+        if t >> 6 != high:
+            words += [0xE << 28 | value for value in highs(high, t >> 6, 1 << 28)]
+            words += [0xFFFF_FFFF, 0x6 << 28 | 0x14, 0x7 << 28 | 3]  # PADDING, OTHERS, CONTINUED
+            high = t >> 6
+        words += [(0xA | p) << 28 | cd(t & 0x3F, x, y)] if mask == 1 else [(0xC | p) << 28 | cd(t & 0x3F, x, y), mask]
+        ends += [len(words)] * mask.bit_count()
+    return Written(np.array(words, np.uint32), np.array(ends, np.intp))

@@ -14,6 +14,7 @@ from neurove_protocol import Events, Sensor
 from tests.builders import SENSOR
 
 PACKET, DVS, IMU = "event_camera_msgs/msg/EventPacket", "dvs_msgs/msg/EventArray", "sensor_msgs/msg/Imu"
+PROPHESEE = "prophesee_event_msgs/msg/EventArray"
 POSE, ODOMETRY, CAMERA = "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry", "sensor_msgs/msg/CameraInfo"
 
 _OWN = {
@@ -21,6 +22,10 @@ _OWN = {
     "bool is_bigendian\nuint8[] events\n",
     "dvs_msgs/msg/Event": "uint16 x\nuint16 y\ntime ts\nbool polarity\n",
     DVS: "std_msgs/Header header\nuint32 height\nuint32 width\ndvs_msgs/Event[] events\n",
+}
+_OWN |= {
+    name.replace("dvs_msgs", "prophesee_event_msgs"): _OWN[name].replace("dvs_msgs", "prophesee_event_msgs")
+    for name in ("dvs_msgs/msg/Event", DVS)
 }
 
 
@@ -58,13 +63,13 @@ def packet(
     return store.of(PACKET, store.header(ns), sensor.height, sensor.width, seq, base_ns, encoding, False, blob)
 
 
-def dvs(store: Store, events: Events, sensor: Sensor = SENSOR) -> Any:
-    """A dvs_msgs/EventArray of events with unix times [us]."""
+def dvs(store: Store, events: Events, sensor: Sensor = SENSOR, *, kind: str = DVS) -> Any:
+    """A dvs_msgs/EventArray, or another type of its layout, of events with unix times [us]."""
     rows = [
-        store.of("dvs_msgs/msg/Event", x, y, store.time(t * 1000), bool(p))
+        store.of(kind.removesuffix("Array"), x, y, store.time(t * 1000), bool(p))
         for t, x, y, p in zip(*(column.tolist() for column in events), strict=True)
     ]
-    return store.of(DVS, store.header(int(events.t[0]) * 1000 if events.n else 0), sensor.height, sensor.width, rows)
+    return store.of(kind, store.header(int(events.t[0]) * 1000 if events.n else 0), sensor.height, sensor.width, rows)
 
 
 def write_bag(

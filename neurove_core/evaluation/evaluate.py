@@ -1,6 +1,7 @@
 """Run a model on a recording as the service does, packet by packet, and compare its estimates with the truth."""
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.estimator import Estimator, WindowEstimate
+from neurove_core.evaluation.judgement import judgement
 from neurove_core.evaluation.metrics import ANGULAR_FLOOR_RAD_S, LINEAR_FLOOR_M_S, SKIP_S, figures
 from neurove_core.geometry.motion import Twists
 from neurove_core.io.packets import slices
@@ -61,13 +63,19 @@ class Evaluation:
     uncertain: NDArray[np.bool_] | None = None  # (N,), or None
 
 
-def estimate_recording(estimator: Estimator, recording: Recording, camera: CameraInfo | None = None) -> Estimates:
+def estimate_recording(
+    estimator: Estimator,
+    recording: Recording,
+    camera: CameraInfo | None = None,
+    on_events: Callable[[int], None] = lambda _: None,
+) -> Estimates:
     """Run a model on a recording, packet by packet as a driver sends it.
 
     Args:
         estimator: the model.
         recording: its input.
         camera: lens of the recording; by default the one that the recording gives.
+        on_events: called after each packet with the number of events so far.
 
     Raises:
         BrokenRecording: the recording cannot be read to its end. InvalidField: the lens belongs to another sensor.
@@ -77,6 +85,7 @@ def estimate_recording(estimator: Estimator, recording: Recording, camera: Camer
     found: list[WindowEstimate] = []
     latencies_ms: list[float] = []
     firing_rate = _FiringRate()
+    events = 0
     for piece in slices(recording.chunks()):
         began = time.perf_counter()
         pushed = estimator.push(piece.events, state, piece.t0_us)
@@ -86,6 +95,8 @@ def estimate_recording(estimator: Estimator, recording: Recording, camera: Camer
         latencies_ms += [took_ms / max(1, len(pushed.estimates))] * len(pushed.estimates)
         if pushed.estimates and state.age:
             firing_rate.add(state.network)
+        events += piece.events.n
+        on_events(events)
     bins = estimator.config.window.bins
     return Estimates(
         name=recording.name,
@@ -140,7 +151,8 @@ def evaluate(estimates: Estimates, truth: Twists) -> Evaluation:
     settled = estimates.start_us >= (estimates.start_us[0] if windows else 0) + SKIP_S * 1e6
     kept = settled & np.isfinite(true).all(axis=(1, 2))
     if not kept.any():
-        why = f"none of its {windows} windows lies after the first {SKIP_S:g} s and within the truth"
+        spans = f"windows {_span(estimates.start_us)}, truth {_span(truth.t)} on the sensor clock"
+        why = f"none of its {windows} windows lies after the first {SKIP_S:g} s and within the truth ({spans})"
         raise NoTruth(f"{estimates.name}: {why}", windows=windows)
     ends = (estimates.start_us[:, None] + estimates.bin_us * (np.arange(bins) + 1))[kept].ravel()
     sigma = None if estimates.sigma is None else np.repeat(estimates.sigma[kept], bins, axis=0)
@@ -150,11 +162,15 @@ def evaluate(estimates: Estimates, truth: Twists) -> Evaluation:
     )
 
 
+def _span(t_us: NDArray[np.int64]) -> str:
+    return f"{t_us[0] / 1e6:.3f} to {t_us[-1] / 1e6:.3f} s" if t_us.size else "none"
+
+
 def report(evaluations: list[Evaluation]) -> dict[str, Any]:
     """Compute all figures over all recordings and over each one, and those of two constant predictors.
 
     The predictor `zero` always gives 0. The predictor `mean` gives the mean of the truth of these recordings, which is
-    the best constant.
+    the best constant. `judgement` compares the model with both in one sentence.
     """
     bins = evaluations[0].estimates.twists.shape[1]
     truth, estimate = (
@@ -163,7 +179,7 @@ def report(evaluations: list[Evaluation]) -> dict[str, Any]:
     latency_ms = np.concatenate([one.estimates.latency_ms for one in evaluations])
     rates = [one.estimates.firing_rate for one in evaluations]
     every = {layer: float(np.mean([rate[layer] for rate in rates])) for layer in rates[0]}
-    return figures(truth, estimate, bins) | {
+    found = figures(truth, estimate, bins) | {
         "firing_rate": every.pop("all", None),
         "firing_rate_by_layer": every,
         "latency_ms": {f"p{q}": float(np.percentile(latency_ms, q)) for q in (50, 99)},
@@ -178,6 +194,7 @@ def report(evaluations: list[Evaluation]) -> dict[str, Any]:
             for one in evaluations
         ],
     }
+    return found | {"judgement": judgement(found)}
 
 
 def reliability(evaluations: list[Evaluation]) -> dict[str, Any] | None:
@@ -200,9 +217,15 @@ def reliability(evaluations: list[Evaluation]) -> dict[str, Any] | None:
         "per_axis": {
             axis: {
                 "coverage": float(measured[LEVEL][i]),
-                "median_sigma_rad_s" if i >= 3 else "median_sigma_m_s": float(middle[i]),
+                **_sigma(float(middle[i]), angular=i >= 3),
                 "error_over_sigma_rms": float(ratio[i]),
             }
             for i, axis in enumerate(AXES)
         },
     }
+
+
+def _sigma(sigma: float, *, angular: bool) -> dict[str, float]:
+    if angular:
+        return {"median_sigma_rad_s": sigma, "median_sigma_deg_s": float(np.degrees(sigma))}
+    return {"median_sigma_m_s": sigma}

@@ -19,6 +19,9 @@ ANGULAR_FLOOR_RAD_S: Final = 0.02
 SKIP_S: Final = 0.5
 """Time at the beginning of a recording that is left out, because the state settles."""
 
+_CONSTANT: Final = 1e-6  # [m/s] or [rad/s]
+_CONSTANT_SHARE: Final = 1e-3  # of the length of the truth
+
 Array = NDArray[np.float64]
 Figures = dict[str, float | None]
 
@@ -92,8 +95,18 @@ def figures(truth: Array, estimate: Array, bins: int) -> dict[str, Any]:
 
 def r2(truth: Array, estimate: Array) -> float | None:
     """Share of the variance of the truth that the estimates explain; None if the truth is constant."""
-    variance = ((truth - truth.mean(0)) ** 2).sum()
-    return float(1 - ((estimate - truth) ** 2).sum() / variance) if variance > 0 else None
+    if is_constant(truth):
+        return None
+    return float(1 - ((estimate - truth) ** 2).sum() / ((truth - truth.mean(0)) ** 2).sum())
+
+
+def is_constant(truth: Array) -> bool:
+    """Whether a truth (N, 3) or (N, 1) varies by no more than rounding and interpolation do.
+
+    >>> is_constant(np.full((4, 1), 0.3) + 1e-9 * np.arange(4)[:, None])
+    True
+    """
+    return rmse(truth - truth.mean(0)) <= max(_CONSTANT, _CONSTANT_SHARE * rmse(truth))
 
 
 def direction_error_deg(truth: Array, estimate: Array, floor: float) -> float | None:
@@ -109,7 +122,7 @@ def direction_error_deg(truth: Array, estimate: Array, floor: float) -> float | 
 def _axis(truth: Array, estimate: Array, *, angular: bool) -> Figures:
     error = estimate - truth
     unit = "rad_s" if angular else "m_s"
-    correlated = truth.std() > 0 and estimate.std() > 0
+    correlated = not is_constant(truth[:, None]) and estimate.std() > 0
     found: Figures = {
         f"rmse_{unit}": rmse(error[:, None]),
         f"median_error_{unit}": float(np.median(np.abs(error))),

@@ -8,9 +8,11 @@ from neurove_core.io.errors import BrokenRecording, MissingFilter, MissingGeomet
 from neurove_core.io.faults import Fault, Faults, Reason, Tally
 from neurove_core.io.format import Format, UrlFormat
 from neurove_core.io.recording import EventsOnly, Frame, Imu, Recording, Triggers, refuse_topic
+from neurove_core.io.units import DoubtfulUnit, Timed, TimeSample
 
 __all__ = [
     "BrokenRecording",
+    "DoubtfulUnit",
     "EventsOnly",
     "Fault",
     "Faults",
@@ -23,6 +25,8 @@ __all__ = [
     "Recording",
     "RecordingError",
     "Tally",
+    "TimeSample",
+    "Timed",
     "Triggers",
     "UnknownSource",
     "UrlFormat",

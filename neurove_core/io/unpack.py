@@ -7,6 +7,7 @@ memory nor run for minutes.
 import io
 import lzma
 import zlib
+from collections.abc import Iterator
 from typing import IO, Any, Final
 
 from neurove_core.extras import MissingExtra
@@ -86,22 +87,58 @@ def unpacked(compression: str, data: bytes, size: int) -> tuple[bytes, str]:
     Raises:
         MissingExtra: the library for this compression is not installed.
     """
-    parts: list[bytes] = []
+    found: list[bytes] = []
+    try:
+        found.extend(parts(compression, io.BytesIO(data), len(data), size))
+    except Unpackable as error:
+        return b"".join(found), str(error)
+    return b"".join(found), ""
+
+
+def parts(compression: str, stream: IO[bytes], packed: int, size: int) -> Iterator[bytes]:
+    """The decompressed data of a stream in parts of up to 64 KiB.
+
+    Args:
+        compression: as for `unpacked`, or `gzip`.
+        stream: gives the compressed bytes; it can seek.
+        packed: number of compressed bytes.
+        size: largest number of bytes to give.
+
+    Raises:
+        Unpackable: the data after these parts cannot be decompressed, or becomes larger than its bound.
+        MissingExtra: the library for this compression is not installed.
+    """
     left = size
     try:
-        stream = bounded(_decompressor(compression, io.BytesIO(data)), len(data))
-        while left and (part := stream.read(min(left, 1 << 16))):
-            parts.append(part)
+        declared = _declared_size(stream) if compression == "zstd" else 0
+        plain = bounded(_decompressor(compression, stream), packed)
+        while left and (part := plain.read(min(left, 1 << 16))):
+            yield part
             left -= len(part)
+        if left and size - left < declared:  # the library does not report a truncated frame
+            raise Unpackable(f"the data end after {size - left} of {declared} bytes")
     except ModuleNotFoundError as error:
         raise MissingExtra(str(error.name).partition(".")[0], "recordings") from None
     except ERRORS as error:
-        return b"".join(parts), str(error) or type(error).__name__
+        raise Unpackable(str(error) or type(error).__name__) from None
     except Exception as error:  # ZstdError has no other base class
         if type(error).__name__ != "ZstdError":
             raise
-        return b"".join(parts), str(error)
-    return b"".join(parts), ""
+        raise Unpackable(str(error)) from None
+
+
+def _declared_size(stream: IO[bytes]) -> int:
+    """The size of the content that the header of the first zstd frame declares [bytes]; 0 if it declares none."""
+    import zstandard
+
+    at = stream.tell()
+    try:
+        size = zstandard.get_frame_parameters(stream.read(32)).content_size
+    except zstandard.ZstdError:
+        return 0  # the decompressor reports it
+    finally:
+        stream.seek(at)
+    return 0 if size == zstandard.CONTENTSIZE_UNKNOWN else int(size)
 
 
 def _decompressor(compression: str, stream: IO[bytes]) -> Any:
@@ -110,7 +147,8 @@ def _decompressor(compression: str, stream: IO[bytes]) -> Any:
         case "zstd":
             import zstandard
 
-            return zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW_BYTES).stream_reader(stream)
+            decompressor = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW_BYTES)
+            return decompressor.stream_reader(stream, read_across_frames=True)
         case "lz4":
             import lz4.frame
 
@@ -119,5 +157,9 @@ def _decompressor(compression: str, stream: IO[bytes]) -> Any:
             import bz2
 
             return bz2.BZ2File(stream)
+        case "gzip":
+            import gzip
+
+            return gzip.GzipFile(fileobj=stream)
         case _:
-            raise Unpackable(f"unknown compression {compression!r}; supported: zstd, lz4, bz2")
+            raise Unpackable(f"unknown compression {compression!r}; supported: zstd, lz4, bz2, gzip")

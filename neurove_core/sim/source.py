@@ -53,7 +53,8 @@ def simulation_of(url: str, sensor: Sensor | None = None) -> Simulation:
     query = dict(parse_qsl(parts.query, keep_blank_values=True))
     unknown = sorted(query.keys() - set(_FIELDS))
     if parts.scheme != "sim" or parts.path.strip("/") or unknown:
-        why = f"unknown parameter {unknown[0]!r}" if unknown else "sim://SCENE?trajectory=...&seed=... is expected"
+        known = f"unknown parameter {next(iter(unknown), '')!r}; known parameters: {', '.join(_FIELDS)}"
+        why = known if unknown else "sim://SCENE?trajectory=...&seed=... is expected"
         raise UnknownSource(url, why)
     scene = parts.netloc or DEFAULT_SCENE
     make_scene = named_scene(scene)

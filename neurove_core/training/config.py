@@ -1,7 +1,7 @@
 """Configuration of a training run: the model, the training sequences, and the recipe."""
 
 from pathlib import Path
-from typing import Annotated, Final, Self
+from typing import Annotated, Final, Literal, Self
 
 from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
@@ -32,6 +32,9 @@ class RecordedConfig(Config):
         None, gt=0, le=1000, description="Height of the camera [m]; by default that of the recording."
     )
     topic: str | None = Field(None, description="Event stream, if the recording has several.")
+    time_unit: Literal["s", "ms", "us", "ns"] | None = Field(
+        None, description="Unit of the event times in the file; by default that of its layout."
+    )
     truth: str | None = Field(None, description="File with poses of the camera; by default the truth in the recording.")
 
 

@@ -7,6 +7,7 @@ configuration stay the same.
 import functools
 import hashlib
 import json
+import logging
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -20,11 +21,13 @@ from neurove_core.geometry.motion import Twists, twists
 from neurove_core.ingest import windows
 from neurove_core.ingest.windows import Window, WindowsState
 from neurove_core.io import Recording, UnknownSource
-from neurove_core.io.formats.pose_files import read_poses
+from neurove_core.io.formats.pose_files import read_truth
 from neurove_core.sources import open_source
 from neurove_core.training.config import RecordedConfig, TrainingConfig
 from neurove_core.training.data import FORMAT, Sequence, save
 from neurove_protocol.errors import InvalidField
+
+log = logging.getLogger(__name__)
 
 INDEX: Final = "index.json"
 """File with the number of windows of each sequence of a recording; it is written last."""
@@ -71,6 +74,8 @@ class RecordedSequences:
                 for sequence in split_recording(found.recording, found.truth, found.height_m, self._config):
                     save(sequence, folder / f"{len(lengths):06d}.safetensors")
                     lengths.append(len(sequence.twists))
+                for fault in found.recording.faults.found:
+                    log.warning("recording has a fault: recording=%s %s", found.source, fault)
                 write_atomically(folder / INDEX, json.dumps({"source": found.source, "windows": lengths}).encode())
                 yield found.recording.name
             self._paths_of(found)
@@ -173,7 +178,7 @@ def _sources(one: RecordedConfig) -> list[str]:
     path = Path(one.source)
     if "://" in one.source or not path.is_dir() or _is_recording(path):
         return [one.source]
-    inside = [child for child in sorted(path.iterdir()) if _may_be_recording(child) and _opens(child, one.topic)]
+    inside = [child for child in sorted(path.iterdir()) if _may_be_recording(child) and _opens(child, one)]
     if not inside:
         raise UnknownSource(path, "neither a recording nor a folder with recordings")
     if one.truth is not None and len(inside) > 1:
@@ -193,19 +198,19 @@ def _may_be_recording(child: Path) -> bool:
     return not child.name.startswith(".") and child.suffix.lower() != ".txt"  # text files hold truth or calibration
 
 
-def _opens(path: Path, topic: str | None) -> bool:
+def _opens(path: Path, one: RecordedConfig) -> bool:
     try:
-        open_source(str(path), topic=topic)
+        open_source(str(path), topic=one.topic, time_unit=one.time_unit)
     except UnknownSource:
         return False
     return True
 
 
 def _open(field: str, source: str, one: RecordedConfig) -> _OpenRecording:
-    recording = open_source(source, topic=one.topic)
+    recording = open_source(source, topic=one.topic, time_unit=one.time_unit)
     if recording.endless:
         raise InvalidField("training", f"{field}.source", source, "it never ends: add ?seconds=S")
-    truth = twists(read_poses(Path(one.truth))) if one.truth else recording.twists()
+    truth = twists(read_truth(Path(one.truth))) if one.truth else recording.twists()
     if truth is None:
         raise InvalidField("training", f"{field}.truth", None, f"{source} has no truth: give a file of poses")
     camera = recording.camera(_STREAM)
@@ -214,6 +219,7 @@ def _open(field: str, source: str, one: RecordedConfig) -> _OpenRecording:
         why = f"{source} does not give the height of its camera, and linear velocity is trained per metre of height"
         raise InvalidField("training", f"{field}.height_m", None, why)
     parts: list[Any] = [camera.model_dump() if camera else None, str(recording.sensor), one.topic]
+    parts += [one.time_unit] if one.time_unit else []
     parts += [hashlib.sha256(column.tobytes()).hexdigest() for column in truth]
     parts += [source] if "://" in source else [_digest(file, *_version(file)) for file in _files(Path(source))]
     digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()

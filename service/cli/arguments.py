@@ -47,9 +47,18 @@ def add_source(parser: argparse.ArgumentParser, **source: Any) -> None:
 
 
 def add_recording_flags(parser: argparse.ArgumentParser) -> None:
-    """Add what a recording may not say itself: the sensor's size, and which of its event streams to read."""
+    """Add what a recording may not say itself: the sensor's size, the event stream to read, and the unit of time."""
     parser.add_argument("--sensor", type=sensor_size, metavar="WxH", help="sensor size, if the recording lacks it")
     parser.add_argument("--topic", metavar="T", help="event stream to read; default: the recording's first")
+    about = "unit of the times in the recording: s, ms, us or ns; default: that of its layout"
+    parser.add_argument("--time-unit", choices=("s", "ms", "us", "ns"), metavar="U", help=about)
+
+
+def add_lens_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the lens and the height of the camera, if the recording lacks them."""
+    about = "lens of the camera: YAML of ROS, Kalibr or OpenCV, or XML of OpenCV; FILE#NAME for one of several cameras"
+    parser.add_argument("--calibration", metavar="FILE", help=about)
+    parser.add_argument("--height", type=metres, metavar="M", help="height of the camera above the ground [m]")
 
 
 def add_playback_flags(parser: argparse.ArgumentParser, seconds_help: str) -> None:
@@ -172,6 +181,25 @@ def refuse_existing(what: str, field: str, path: Path, source: str | None, *, fo
         raise InvalidField(what, field, str(path), "it is the input recording")
     if not force:
         raise InvalidField(what, field, str(path), "the file exists; --force replaces it")
+
+
+def check_folder(what: str, field: str, path: Path) -> None:
+    """Create a folder for results, and refuse one that cannot be written, before the work begins.
+
+    Args:
+        what: the command.
+        field: name of the argument.
+        path: the folder.
+
+    Raises:
+        InvalidField: it cannot be created or written.
+    """
+    from neurove_core.files import make_writable
+
+    try:
+        make_writable(path)
+    except OSError as error:
+        raise InvalidField(what, field, str(path), f"files cannot be written: {error.strerror or error}") from None
 
 
 def commit() -> str:

@@ -14,6 +14,7 @@ from typing import Any, Literal, NamedTuple
 from neurove_protocol.control import CHUNK_SCHEMA, ActivateReply, ModelInfo, ProgressReply, PushReply
 from neurove_protocol.errors import EXIT_FAILURE, EXIT_PARTIAL, NeuroVEError
 from neurove_service.cli.arguments import add_client_flags, client_config, command, seconds
+from neurove_service.cli.waiting import Wait, add_wait
 from neurove_service.config import ClientConfig
 
 
@@ -75,7 +76,9 @@ def _each(args: argparse.Namespace, change: Change, prepare: Callable[[Any, Any]
     from neurove_service.clients import ask
 
     config = client_config(args)
-    with ask.connect(config) as transport:
+    wait = Wait(config, args.wait)
+    with wait.connect(config) as transport:
+        wait.until(lambda: ask.need_service(transport, config, args.node or "*"))
         nodes = ask.nodes(transport, config, args.node, args.all)
         prepare(transport, config.keys)
         if len(nodes) == 1:
@@ -193,6 +196,7 @@ def add_rollback(parser: argparse.ArgumentParser) -> None:
 
 def _add_nodes(parser: argparse.ArgumentParser) -> None:
     add_client_flags(parser)
+    add_wait(parser)
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--node", help="name of one node; default: the only node that is alive")
     where.add_argument("--all", action="store_true", help="change every node, one after the other")

@@ -22,7 +22,7 @@ from neurove_core.files import write_atomically
 from neurove_protocol import Flag
 from neurove_protocol.control import StreamStatus
 from neurove_protocol.errors import EXIT_FAILURE, NeuroVEError
-from neurove_service.cli.views import Board
+from neurove_service.cli.board import Board
 from neurove_service.clients import ask
 from neurove_service.config import ENVIRONMENT, ClientConfig
 from neurove_service.latency import latency
@@ -47,6 +47,9 @@ def run(
     *,
     sensor: str | None,
     topic: str | None,
+    calibration: str | None = None,
+    height_m: float | None = None,
+    time_unit: str | None = None,
     speed: str,
     loop: bool,
     duration_s: float,
@@ -61,6 +64,9 @@ def run(
         source: as sources.open_source.
         sensor: WIDTHxHEIGHT, if the source lacks it.
         topic: as sources.open_source.
+        calibration: as `neurove drive --calibration`.
+        height_m: height of the camera above the ground [m], if the source lacks it.
+        time_unit: as sources.open_source.
         speed: as `neurove drive --speed`.
         loop: start again at the end.
         duration_s: sensor time to play [s]; infinity: until the source ends or the stop event.
@@ -82,6 +88,9 @@ def run(
     drive = ["drive", source, "--connect", endpoint, "--stream", STREAM, "--speed", speed, "--wait", "10", "--json"]
     drive += ["--sensor", sensor] if sensor else []
     drive += ["--topic", topic] if topic else []
+    drive += ["--calibration", calibration] if calibration else []
+    drive += ["--height", str(height_m)] if height_m else []
+    drive += ["--time-unit", time_unit] if time_unit else []
     drive += ["--loop"] if loop else []
     drive += ["--seconds", str(duration_s)] if math.isfinite(duration_s) else []
     with _process(*serve) as service, _session(config, service, stop, console) as transport:

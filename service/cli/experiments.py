@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from neurove_protocol.errors import EXIT_FAILURE
+from neurove_protocol.errors import EXIT_FAILURE, InvalidField
 from neurove_service.cli.arguments import commit, subcommand
 from neurove_service.cli.bars import progress
 from neurove_service.cli.parser import Parser
@@ -84,7 +84,11 @@ def reproduce_real(args: argparse.Namespace) -> int:
 
     rows, about = _real_rows(args.model, args.recordings, args.out)
     print(json.dumps(about | {"checks": rows}) if args.json else real.markdown(rows, real.title(about)), end="")
-    return 0
+    if any(row["skipped"] is None for row in rows):
+        return 0
+    why = "has none of the recordings that can be read" if args.recordings.is_dir() else "is not a folder"
+    print(f"neurove: every check was skipped: {args.recordings} {why}", file=sys.stderr)
+    return EXIT_FAILURE
 
 
 def _real_rows(model: str, recordings: Path, out: Path | None) -> tuple[list[dict[str, Any]], dict[str, Any]]:
@@ -117,6 +121,8 @@ def reproduce_velocity(args: argparse.Namespace) -> int:
 
     from neurove_core.experiments.velocity import figures, report, run
 
+    if args.recordings and not args.recordings.is_dir():
+        raise InvalidField("reproduce", "--recordings", str(args.recordings), "it is not a folder")
     torch.set_num_threads(args.threads)
     config = run.base_config(args.config, args.steps, quick=args.quick)
     seeds = range(args.seed, args.seed + args.seeds)

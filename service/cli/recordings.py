@@ -15,6 +15,7 @@ from neurove_protocol.errors import EXIT_FAILURE, InvalidField, NeuroVEError
 from neurove_protocol.keys import check_name
 from neurove_service.cli.arguments import (
     add_client_flags,
+    add_lens_flags,
     add_recording_flags,
     client_config,
     command,
@@ -24,6 +25,7 @@ from neurove_service.cli.arguments import (
     tell_faults,
 )
 from neurove_service.cli.bars import event_count
+from neurove_service.cli.waiting import Wait, add_wait
 from neurove_service.lifecycle import stop_on_signals
 
 Progress = Callable[[int], None]
@@ -40,7 +42,6 @@ class NothingRecorded(NeuroVEError):
 def record(args: argparse.Namespace) -> int:
     """Record the packets that drivers publish, until Ctrl-C."""
     from neurove_core.io.formats.packet_log.writer import PacketWriter
-    from neurove_service.clients import ask
     from neurove_service.clients.recorder import Recorder, as_json
 
     stop = stop_on_signals(with_parent=args.with_parent)
@@ -50,7 +51,7 @@ def record(args: argparse.Namespace) -> int:
     if path.exists():
         raise InvalidField("record", "--out", str(path), "the file exists, and a recording is never overwritten")
     began = time.time()
-    with ask.connect(config, stop=stop) as transport, PacketWriter(path) as writer:
+    with Wait(config, args.wait, stop).connect(config) as transport, PacketWriter(path) as writer:
         recorder = Recorder(writer, transport, config.keys, streams)
         with _status_line(path) as show:
             duration_s = math.inf if args.seconds is None else args.seconds
@@ -120,7 +121,7 @@ def convert(args: argparse.Namespace) -> int:
     path: Path = args.out
     if path.suffix not in WRITERS:
         raise InvalidField("convert", "OUT", str(path), f"its name must end in {' or '.join(WRITERS)}")
-    recording = open_source(args.source, args.sensor, args.topic)
+    recording = open_source(args.source, args.sensor, args.topic, args.time_unit)
     refuse_existing("convert", "OUT", path, args.source, force=args.force)
     return _write(recording, path, as_json=args.json)
 
@@ -152,11 +153,13 @@ def _write(recording: Any, path: Path, *, as_json: bool) -> int:
 def info(args: argparse.Namespace) -> int:
     """Show what a recording holds: sensor, counts, rates, IMU and truth."""
     from neurove_core.io import summary
+    from neurove_core.io.calibration import with_lens
     from neurove_core.sources import open_source
     from neurove_service.cli.console import console
     from neurove_service.cli.views import survey_table
 
-    recording = open_source(args.source, args.sensor, args.topic)
+    opened = open_source(args.source, args.sensor, args.topic, args.time_unit)
+    recording = with_lens(opened, args.calibration, args.height)
     duration_s = args.seconds if args.seconds is not None else (_ENDLESS_S if recording.endless else None)
     surveyed = summary.survey(recording, duration_s)
     if args.plot:
@@ -214,6 +217,7 @@ def add_record(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=duration, metavar="S", help="length of the recording; default: until Ctrl-C")
     parser.add_argument("--with-parent", action="store_true", help="end when the parent process ends")
     add_client_flags(parser)
+    add_wait(parser)
 
 
 def add_convert(parser: argparse.ArgumentParser) -> None:
@@ -232,6 +236,7 @@ def add_info(parser: argparse.ArgumentParser) -> None:
     command(parser, info)
     parser.add_argument("source", metavar="SOURCE", help="recording of any format, pattern:// or sim://")
     add_recording_flags(parser)
+    add_lens_flags(parser)
     most = f"default: all, of an endless source {_ENDLESS_S:.0f} s"
     parser.add_argument("--seconds", type=duration, metavar="S", help=f"seconds of the source to read; {most}")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw events, rate and truth (.png or .svg)")

@@ -5,10 +5,14 @@ import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from neurove_service.cli.arguments import add_recording_flags, command
-from neurove_service.cli.bars import progress
+from neurove_service.cli.arguments import add_lens_flags, add_recording_flags, check_folder, command, tell_faults
+from neurove_service.cli.bars import event_count, progress
+
+if TYPE_CHECKING:
+    from neurove_core.geometry.motion import Twists
+    from neurove_core.io import Recording
 
 _CALIBRATION_SEQUENCES = 96
 
@@ -76,21 +80,25 @@ def evaluate(args: argparse.Namespace) -> int:
     from neurove_core.estimator import Estimator
     from neurove_core.evaluation import evaluate as evaluation
     from neurove_core.geometry import motion
-    from neurove_core.io.formats.pose_files import read_poses
+    from neurove_core.io.calibration import with_lens
+    from neurove_core.io.formats.pose_files import read_truth
     from neurove_core.sources import open_source
 
     torch.set_num_threads(1)
     estimator = Estimator(models.find(args.model))
+    given = motion.twists(read_truth(args.truth)) if args.truth else None
+    if args.plot:
+        check_folder("evaluate", "--plot", args.plot)
+    opened = [(source, open_source(source, args.sensor, args.topic, args.time_unit)) for source in args.recordings]
+    sources = [(source, with_lens(one, args.calibration, args.height)) for source, one in opened]
+    truths = [given or _truth(source, recording) for source, recording in sources]
     estimator.warm_up()
-    given = motion.twists(read_poses(args.truth)) if args.truth else None
     evaluated = []
-    for source in args.recordings:
-        recording = open_source(source, args.sensor, args.topic)
-        truth = given or (None if recording.endless else recording.twists())
-        if truth is None:
-            why = "it never ends: add ?seconds=S" if recording.endless else "it holds no truth: give --truth FILE"
-            raise evaluation.NoTruth(f"{source}: {why}", source=source)
-        evaluated.append(evaluation.evaluate(evaluation.estimate_recording(estimator, recording), truth))
+    for (_, recording), truth in zip(sources, truths, strict=True):
+        with event_count(recording.name) as show:
+            estimates = evaluation.estimate_recording(estimator, recording, on_events=show)
+        evaluated.append(evaluation.evaluate(estimates, truth))
+        tell_faults(recording)
     report = {"model": estimator.bundle.info.model_dump(), **evaluation.report(evaluated)}
     print(json.dumps(report) if args.json else "\n".join(_table(report)))
     if args.plot:
@@ -104,6 +112,16 @@ def evaluate(args: argparse.Namespace) -> int:
     return 0
 
 
+def _truth(source: str, recording: "Recording") -> "Twists":
+    from neurove_core.evaluation.evaluate import NoTruth
+
+    truth = None if recording.endless else recording.twists()
+    if truth is None:
+        why = "it never ends: add ?seconds=S" if recording.endless else "it holds no truth: give --truth FILE"
+        raise NoTruth(f"{source}: {why}", source=source)
+    return truth
+
+
 def _table(report: dict[str, Any]) -> Iterator[str]:
     """The lines of the report for people."""
     yield f"{report['model']['name']} ({report['model']['digest'][:12]}), {report['windows']} windows"
@@ -112,8 +130,10 @@ def _table(report: dict[str, Any]) -> Iterator[str]:
     each = [(one["name"], one) for one in report["recordings"]] if len(report["recordings"]) > 1 else []
     for name, row in [*rows, *each]:
         errors = f"{_number(row['re_v_l'], 7)} {row['rmse_v_l_m_s']:9.3f} {_number(row['re_v_a'], 7)}"
-        explained = f"{_number(row['r2_v_l'], 6)} {_number(row['r2_v_a'], 6)}"
+        explained = ", ".join("constant truth" if row[r2] is None else f"{row[r2]:.3f}" for r2 in ("r2_v_l", "r2_v_a"))
         yield f"{name[:24]:24} {errors} {row['rmse_v_a_deg_s']:10.2f}  {explained}"
+    yield report["judgement"]
+    yield ""
     floors, without = report["re_floors"], (report["re_v_l_unfloored"], report["re_v_a_unfloored"])
     yield f"RE counts truths above {floors['v_l_m_s']} m/s and {floors['v_a_rad_s']} rad/s"
     yield f"without these floors it is {_number(without[0], 0)} and {_number(without[1], 0)}"
@@ -140,8 +160,8 @@ def _uncertainty_table(report: dict[str, Any] | None) -> Iterator[str]:
     inside = f"in {report['level']:.0%}"
     yield f"{'axis':6} {'sigma':>8} {inside:>8}  median sigma; share of the truth in its interval"
     for axis, row in report["per_axis"].items():
-        name, unit = ("median_sigma_rad_s", "rad/s") if axis[0] == "w" else ("median_sigma_m_s", "m/s")
-        yield f"{axis:6} {row[name]:8.3f} {row['coverage']:8.1%}   {unit}"
+        unit = "deg_s" if axis[0] == "w" else "m_s"
+        yield f"{axis:6} {row[f'median_sigma_{unit}']:8.3f} {row['coverage']:8.1%}   {unit.replace('_s', '/s')}"
     yield f"{report['uncertain_share']:.1%} of the estimates are flagged uncertain"
 
 
@@ -191,6 +211,7 @@ def add_evaluate(parser: argparse.ArgumentParser) -> None:
     about = "poses of the camera, on the recording's clock; default: the truth in the recording"
     parser.add_argument("--truth", type=Path, metavar="FILE", help=about)
     add_recording_flags(parser)
+    add_lens_flags(parser)
     parser.add_argument("--plot", type=Path, metavar="DIR", help="draw truth and estimate over time into this folder")
 
 

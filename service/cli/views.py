@@ -1,9 +1,6 @@
-"""Tables for people: live estimates, health, models, recordings; drawn with rich."""
+"""Tables for people: health, models, recordings; drawn with rich. The live table is in `board`."""
 
-import threading
-import time
-from collections import deque
-from dataclasses import dataclass, field
+import math
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Group, RenderableType
@@ -11,161 +8,15 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from neurove_protocol import Flag, Twist, TwistEstimate
+from neurove_protocol import CameraInfo
 from neurove_protocol.control import HealthReply, ModelsReply, StreamStatus
-from neurove_protocol.velocity import AXES
-from neurove_service.latency import latency
+from neurove_service.cli.board import OLD, VERDICT_STYLE, WIDTH, age_text
 
 if TYPE_CHECKING:
     from neurove_core.io.summary import Summary
 
-_VERDICT_STYLE = {
-    "ok": "green",
-    "lossy": "yellow",
-    "stalled": "bold red",
-    "idle": "dim",
-    "unstable": "bold red",
-    "uncertain": "yellow",
-}
-_RATE_ESTIMATES = 40
-_BLOCKS = "▁▂▃▄▅▆▇█"
 _PLAIN: dict[str, Any] = {"box": None, "padding": (0, 2, 0, 0), "header_style": "dim"}
-_HISTORY = 26
-_HISTORY_WITH_SIGMA = 19
-_WIDTH = 98
-
-
-@dataclass
-class Received:
-    """The estimates and the status that a consumer has received of one stream."""
-
-    count: int = 0
-    missed: int = 0
-    last: TwistEstimate | None = None
-    status: StreamStatus | None = None
-    arrivals: deque[float] = field(default_factory=lambda: deque(maxlen=_RATE_ESTIMATES))
-    twists: deque[Twist] = field(default_factory=lambda: deque(maxlen=_HISTORY))
-    latencies_ms: list[float] = field(default_factory=list)
-    first_at: float = 0.0
-    last_at: float = 0.0
-
-    @property
-    def rate_hz(self) -> float:
-        """Estimates per second, over the newest estimates."""
-        span_s = self.arrivals[-1] - self.arrivals[0] if len(self.arrivals) > 1 else 0.0
-        return (len(self.arrivals) - 1) / span_s if span_s > 0 else 0.0
-
-    @property
-    def mean_rate_hz(self) -> float:
-        """Estimates per second, from the first to the last."""
-        span_s = self.last_at - self.first_at
-        return (self.count - 1) / span_s if self.count > 1 and span_s > 0 else 0.0
-
-
-class Board:
-    """All streams that a consumer receives; filled on Zenoh's thread, drawn on another."""
-
-    def __init__(self, keep_latencies: int = 100_000) -> None:
-        self._lock = threading.Lock()
-        self._streams: dict[str, Received] = {}
-        self._keep = keep_latencies
-
-    def on_estimate(self, estimate: TwistEstimate) -> None:
-        """Add an estimate."""
-        now = time.monotonic()
-        with self._lock:
-            received = self._streams.setdefault(estimate.stream, Received())
-            if received.last is not None and estimate.seq > received.last.seq + 1:
-                received.missed += estimate.seq - received.last.seq - 1
-            received.first_at = received.first_at or now
-            received.last_at = now
-            received.count += 1
-            received.last = estimate
-            received.twists.append(estimate.twist)
-            received.arrivals.append(now)
-            if len(received.latencies_ms) < self._keep:
-                received.latencies_ms.append(estimate.trace.latency_ms)
-
-    def on_status(self, status: StreamStatus) -> None:
-        """Replace the status of a stream."""
-        with self._lock:
-            self._streams.setdefault(status.stream, Received()).status = status
-
-    def of(self, stream: str) -> Received:
-        """What was received of one stream; empty if nothing was."""
-        with self._lock:
-            return self._streams.get(stream, Received())
-
-    def streams(self) -> dict[str, Received]:
-        """What was received of every stream."""
-        with self._lock:
-            return dict(sorted(self._streams.items()))
-
-    def __rich__(self) -> RenderableType:
-        streams = self.streams()
-        if not streams:
-            return Text("waiting for estimates ...", style="dim")
-        return Group(*(_stream_panel(name, received) for name, received in streams.items()))
-
-
-def _stream_panel(name: str, received: Received) -> RenderableType:
-    grid = Table.grid(padding=(0, 2))
-    for left, right in zip(range(3), range(3, 6), strict=True):
-        grid.add_row(*_axis(received, left), *_axis(received, right))
-    return Panel(
-        Group(grid, _footer(received, received.status)), title=_title(name, received), title_align="left", width=_WIDTH
-    )
-
-
-def _axis(received: Received, axis: int) -> tuple[Text, Text, Text]:
-    """Name, newest value with its unit, and the newest estimates as a line of blocks."""
-    unit = "m/s" if axis < 3 else "rad/s"
-    values = [twist[axis] for twist in received.twists]
-    sigma = received.last.sigma if received.last is not None else None
-    spread = f" ±{_short(sigma[axis])}" if sigma is not None else ""
-    newest = f"{values[-1]:+7.3f}{spread} {unit:5}" if values else ""
-    shown = values if sigma is None else values[-_HISTORY_WITH_SIGMA:]
-    return Text(AXES[axis], style="bold"), Text(newest), Text(_line(shown), style="cyan")
-
-
-def _short(sigma: float) -> str:
-    """A standard deviation in five characters."""
-    return f"{sigma:5.3f}" if sigma < 9.9995 else f"{min(sigma, 99999):5.0f}"
-
-
-def _line(values: list[float]) -> str:
-    """Values as a row of blocks, scaled between their minimum and maximum."""
-    low, high = min(values, default=0.0), max(values, default=0.0)
-    scale = (len(_BLOCKS) - 1) / (high - low) if high > low else 0.0
-    return "".join(_BLOCKS[round((value - low) * scale)] for value in values)
-
-
-def _title(name: str, received: Received) -> Text:
-    status, last = received.status, received.last
-    title = Text(f"{name}  ", style="bold")
-    if status is not None:
-        title.append(f"{status.verdict}  ", style=_VERDICT_STYLE[status.verdict])
-        title.append(f"{status.width}x{status.height}  ", style="default")
-    if last is not None:
-        title.append(f"model {last.model}  ", style="default")
-        if Flag.UNTRAINED in last.flags:
-            title.append("UNTRAINED: the estimates have no meaning", style="bold magenta")
-    return title
-
-
-def _footer(received: Received, status: StreamStatus | None) -> Text:
-    text = Text(style="dim")
-    numbers = latency(received.latencies_ms[-_RATE_ESTIMATES:])
-    if numbers is not None:
-        text.append(f"{received.rate_hz:.1f} estimates/s, latency p50 {numbers.p50:.1f} ms p99 {numbers.p99:.1f} ms")
-    if status is not None:
-        text.append(f", {status.packets_received:,} packets, {status.events_received:,} events")
-        lost = status.lost.nonzero()
-        causes = ", ".join(f"{key} {value}" for key, value in lost.items()) or "nothing"
-        text.append(f"\nlost: {causes}", style="yellow" if lost else "dim")
-    if received.last is not None:
-        text.append(f"\nflags: {', '.join(received.last.flags) or 'none'}")
-    return text
+_OLD_S = 0.1  # two windows: a stream whose newest packet is older is grey
 
 
 def health_table(replies: list[HealthReply]) -> RenderableType:
@@ -182,23 +33,32 @@ def health_table(replies: list[HealthReply]) -> RenderableType:
             parts.append(Text(f"model change: {reply.change}. Automatic rollbacks: {reply.rollbacks}", style="dim"))
         if reply.streams:
             parts.append(_streams_table(reply.streams))
+            parts.extend(
+                Text(f"{status.stream}: refused: {status.refusal}", style="yellow")
+                for status in reply.streams
+                if status.refusal
+            )
     return Group(*parts)
 
 
 def _streams_table(streams: tuple[StreamStatus, ...]) -> Table:
-    table = Table("stream", "verdict", "sensor", "packets", "events", "estimates", "p50/p99 ms", "lost", **_PLAIN)
-    for status in streams:
-        numbers = status.latency_ms
+    """The streams of a node, live ones first; those without a packet in the last two windows are grey."""
+    columns = ("stream", "verdict", "sensor", "packets", "events", "estimates", "p50/p99 ms", "newest packet", "lost")
+    table = Table(*columns, **_PLAIN)
+    for status in sorted(streams, key=lambda one: (one.last_packet_age_s > _OLD_S, one.stream)):
+        numbers, old = status.latency_ms, status.last_packet_age_s > _OLD_S
         lost = ", ".join(f"{name} {count}" for name, count in status.lost.nonzero().items())
         table.add_row(
             status.stream,
-            Text(status.verdict, style=_VERDICT_STYLE[status.verdict]),
+            Text(status.verdict, style=OLD if old and status.verdict == "ok" else VERDICT_STYLE[status.verdict]),
             f"{status.width}x{status.height}{'' if status.calibrated else ' *'}",
             f"{status.packets_received:,}",
             f"{status.events_received:,}",
             f"{status.estimates:,}",
             f"{numbers.p50:.1f}/{numbers.p99:.1f}" if numbers else "-",
+            age_text(status.last_packet_age_s),
             lost or "nothing",
+            style=OLD if old else None,
         )
     if not all(status.calibrated for status in streams):
         table.caption = "* uncalibrated: no CameraInfo of this sensor"
@@ -210,6 +70,7 @@ def survey_table(summary: "Summary") -> RenderableType:
     """The contents of a recording."""
     table = Table(show_header=False, **_PLAIN)
     table.add_row("sensor", str(summary.sensor))
+    table.add_row("lens", _lens_text(summary.lens))
     on = "" if summary.on_fraction is None else f", {100 * summary.on_fraction:.1f} % ON"
     table.add_row("events", f"{summary.events:,}{on}")
     if summary.first_us is not None and summary.last_us is not None:
@@ -237,7 +98,21 @@ def survey_table(summary: "Summary") -> RenderableType:
         ):
             if mean is not None and peak is not None:
                 table.add_row(f"  {what}", f"mean {mean:.3f}, peak {peak:.3f} {unit}")
-    return Panel(table, title=summary.name, title_align="left", width=_WIDTH)
+    return Panel(table, title=summary.name, title_align="left", width=WIDTH)
+
+
+def _lens_text(lens: CameraInfo | None) -> str:
+    from neurove_core.geometry.camera import field_of_view_deg
+
+    if lens is None:
+        return "unknown: --calibration FILE gives it"
+    text = f"{lens.lens}, fx {lens.fx:.2f} fy {lens.fy:.2f} cx {lens.cx:.2f} cy {lens.cy:.2f} px"
+    bent = any(lens.distortion)
+    text += f", distortion {' '.join(f'{one:.4g}' for one in lens.distortion)}" if bent else ", no distortion"
+    x, y = field_of_view_deg(lens)
+    text += "" if math.isnan(x + y) else f"\nfield of view {x:.0f} x {y:.0f} deg"
+    height = f"{lens.height_m:g} m above the ground" if lens.height_m else "height unknown: --height M gives it"
+    return f"{text}\n{height}"
 
 
 def _spread(mean: tuple[float, ...], std: tuple[float, ...], unit: str) -> str:

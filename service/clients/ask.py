@@ -227,14 +227,20 @@ def _no_node(config: ClientConfig) -> NoService:
     )
 
 
-def need_service(transport: Transport, config: ClientConfig) -> None:
-    """Check that at least one node is alive.
+def silent(transport: Transport, config: ClientConfig, answered: set[str], node: str = "*") -> list[str]:
+    """Names of the nodes that are alive by their token and are not among those that answered."""
+    alive = {config.keys.node_of(key) for key in transport.tokens(config.keys.alive(node), ANSWER_S)}
+    return sorted(alive - answered)
+
+
+def need_service(transport: Transport, config: ClientConfig, node: str = "*") -> None:
+    """Check that one node, or at least any node, is alive.
 
     Raises:
-        NoService: no node is alive.
+        NoService: it is not alive.
     """
-    if not transport.tokens(config.keys.alive(), ANSWER_S):
-        raise _no_node(config)
+    if not transport.tokens(config.keys.alive(node), ANSWER_S):
+        raise _no_node(config) if node == "*" else _no_answer(config.keys.alive(node))
 
 
 def listen(

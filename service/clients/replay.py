@@ -1,5 +1,6 @@
 """Replay of packet logs: publish the recorded packets bit for bit, paced by their sensor clock."""
 
+import logging
 import math
 import threading
 import time
@@ -7,7 +8,9 @@ from dataclasses import dataclass, field
 
 from neurove_core.io import BrokenRecording
 from neurove_core.io.formats.packet_log.reader import LIMITS, McapRecording, RecordedPacket
+from neurove_core.io.order import MAX_GAP_US
 from neurove_protocol.camera import SCHEMA as CAMERA_SCHEMA
+from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.events import SCHEMA as EVENTS_SCHEMA
 from neurove_protocol.events import EventPacket, decode_packet
@@ -15,9 +18,11 @@ from neurove_protocol.keys import Keys
 from neurove_service.clients.driver import POLL_S, PlaySummary
 from neurove_service.transport import Publisher, Transport
 
+log = logging.getLogger(__name__)
+
 
 @dataclass
-class _Pace:
+class Pace:
     """When the packets of each stream are due; each stream has its own clock, and clocks are not compared."""
 
     speed: float
@@ -36,6 +41,9 @@ class _Pace:
         origin, first_us, newest_us = self.clocks[recorded.stream]
         if packet.t0_us < first_us or t_us < newest_us - 1_000_000:  # the driver was restarted
             origin, first_us = time.monotonic(), packet.t0_us
+        elif packet.t0_us - newest_us > MAX_GAP_US:
+            log.warning("gap skipped: stream=%s seconds=%.1f", recorded.stream, (packet.t0_us - newest_us) / 1e6)
+            first_us += packet.t0_us - newest_us
         self.clocks[recorded.stream] = (origin, first_us, t_us)
         elapsed_s = (t_us - first_us) / 1e6
         return origin + elapsed_s / self.speed, elapsed_s
@@ -49,16 +57,25 @@ class Replay:
         only: name of the stream to publish; None for all streams.
         transport: an open session.
         keys: keys of the deployment.
+        lens: announced for every stream instead of the recorded ones.
     """
 
-    def __init__(self, recording: McapRecording, only: str | None, transport: Transport, keys: Keys) -> None:
+    def __init__(
+        self,
+        recording: McapRecording,
+        only: str | None,
+        transport: Transport,
+        keys: Keys,
+        lens: CameraInfo | None = None,
+    ) -> None:
         self._recording, self._only = recording, only
         self._transport, self._keys = transport, keys
         names = [only] if only else recording.all_streams
         self._publishers: dict[str, Publisher] = {
             name: transport.publisher(keys.events(name), EVENTS_SCHEMA) for name in names
         }
-        for name, payload in recording.cameras().items():
+        cameras = recording.cameras() if lens is None else {name: _named(lens, name) for name in names}
+        for name, payload in cameras.items():
             if name in self._publishers:
                 self._announce(keys.camera(name), payload)
 
@@ -102,7 +119,7 @@ class Replay:
         if loop:
             raise ValueError("a replay cannot loop")
         sent = PlaySummary(0, 0, None, None, None)
-        pace = _Pace(speed)
+        pace = Pace(speed)
         try:
             for recorded in self._recording.packets(self._only):
                 packet = _read(recorded)
@@ -118,6 +135,10 @@ class Replay:
         except BrokenRecording as error:
             return sent._replace(broken=error)
         return sent
+
+
+def _named(lens: CameraInfo, stream: str) -> bytes:
+    return CameraInfo(**(lens.model_dump() | {"stream": stream})).encode()
 
 
 def _read(recorded: RecordedPacket) -> EventPacket | None:

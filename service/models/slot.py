@@ -59,8 +59,11 @@ class ModelSlot:
         library = Library(models_dir, pushed)
         active, previous = (restart.kept(library, digest, trained_only) if digest else None for digest in kept)
         estimator = Estimator(restart.first(library, model, active, trained_only))
+        name, takes = estimator.bundle.name, "up to 30 s at the first start on a machine"
+        log.info("compiling the kernels of the model; `ready` follows", model=name, takes=takes)
         estimator.warm_up()
         self._shared = SharedPlan(Serving(estimator, 0), previous)
+        self._shared.shapes.add(estimator.config)
         self._golden_fault = golden_fault(estimator)
         if self._golden_fault:
             log.error("golden test of the first model fails", why=self._golden_fault)

@@ -1,16 +1,14 @@
 """Composition root of the node: build, start, stop."""
 
-import functools
 import threading
 from collections.abc import Callable
 
 from neurove_core.models.bundle import Bundle
-from neurove_protocol import CameraInfo
-from neurove_protocol.control import STATUS_SCHEMA, ChunkRequest, StreamStatus
+from neurove_protocol.control import STATUS_SCHEMA, ChunkRequest
 from neurove_protocol.errors import NeuroVEError
-from neurove_protocol.velocity import SCHEMA as VELOCITY_SCHEMA
 from neurove_service import logs
 from neurove_service.config import ServiceConfig
+from neurove_service.guard import Guard
 from neurove_service.lifecycle import notify
 from neurove_service.models.active_file import Active, ActiveFile
 from neurove_service.models.change import Rules
@@ -18,19 +16,18 @@ from neurove_service.models.signatures import verifier
 from neurove_service.models.slot import ModelSlot
 from neurove_service.models.store import ModelStore
 from neurove_service.node import memory
+from neurove_service.node.condition import Watch
 from neurove_service.node.handlers import Handlers
-from neurove_service.node.health import stream_status
 from neurove_service.node.housekeeping import Housekeeping
+from neurove_service.node.outlets import open_outlet, route
+from neurove_service.node.watchdog import Watchdog
 from neurove_service.streams.comparison import TrialLimits
 from neurove_service.streams.history import RingSize
 from neurove_service.streams.registry import StreamRegistry, StreamSettings
-from neurove_service.streams.worker import Outlet
-from neurove_service.transport import EndpointError, OnTimedSample, Report, Transport, open_transport
+from neurove_service.transport import EndpointError, Report, Transport, open_transport
 
 log = logs.get(__name__)
 
-_ASK_CAMERA_S = 1.0
-_KNOWN_KEYS = 2048
 _CHUNK_S = 10.0
 _ROUTER_PATIENCE_S = 365 * 86_400.0
 
@@ -70,6 +67,7 @@ class Service:
 
     def __init__(self, config: ServiceConfig, stop: threading.Event) -> None:
         self._config, self._stop = config, stop
+        self._guard = Guard()
         self._keys = config.keys
         self._active_file = ActiveFile(config.state_folder)
         self._store = ModelStore(
@@ -102,13 +100,20 @@ class Service:
                 return
             raise
         with opened as transport:
+            settings = _stream_settings(self._config)
             registry = StreamRegistry(
-                self._slot, _stream_settings(self._config), lambda name: self._open_outlet(name, transport)
+                self._slot,
+                settings,
+                lambda name: open_outlet(transport, self._keys, self._config.node, name),
+                self._guard,
             )
-            self._declare(transport, registry)
+            watch = Watch(self._config.node, registry, self._guard)
+            self._declare(transport, registry, watch)
             self._log_ready()
+            housekeeping = self._housekeeping(transport, registry, watch)
+            Watchdog(lambda: housekeeping.beat_s, self._guard).start(self._stop)
             try:
-                self._housekeeping(transport, registry).run(self._stop)
+                housekeeping.run(self._stop)
             finally:
                 notify("STOPPING=1")
                 self._slot.close()
@@ -125,22 +130,23 @@ class Service:
             config_file=config.zenoh_config,
             patience_s=_ROUTER_PATIENCE_S,
             stop=self._stop,
+            guard=self._guard,
         )
 
-    def _declare(self, transport: Transport, registry: StreamRegistry) -> None:
+    def _declare(self, transport: Transport, registry: StreamRegistry, watch: Watch) -> None:
         """Declare everything: first what receives packets, last the token that says that the node is ready."""
         keys, node = self._keys, self._config.node
         handlers = Handlers(
             node,
             self._slot,
-            lambda: self._statuses(registry),
-            lambda: registry.refused,
+            watch.statuses,
+            watch.condition,
             self._store,
             self._active_file,
             lambda: not self._stop.is_set() and registry.alive(),
         )
-        transport.subscribe_timed(keys.camera(), self._route(registry, registry.put_camera))
-        transport.subscribe_timed(keys.events(), self._route(registry, registry.put_packet))
+        transport.subscribe_timed(keys.camera(), route(keys, registry, registry.put_camera))
+        transport.subscribe_timed(keys.events(), route(keys, registry, registry.put_packet))
         transport.answer(keys.health(node), handlers.health)
         transport.answer(keys.models(node), handlers.models)
         for key, handle in (
@@ -151,20 +157,6 @@ class Service:
             transport.answer_streaming(key, handle, after=memory.release_memory)
         transport.token(keys.alive(node))
 
-    def _route(self, registry: StreamRegistry, put: Callable[[str, bytes, int, int | None], None]) -> OnTimedSample:
-        """A subscriber's callback: queue each message in the worker of its stream."""
-        stream_of = functools.lru_cache(_KNOWN_KEYS)(self._keys.stream_of)
-
-        def on_sample(key: str, payload: bytes, received_ns: int, sent_us: int | None) -> None:
-            try:
-                name = stream_of(key)
-            except NeuroVEError:  # not a valid name
-                registry.refuse(key)
-                return
-            put(name, payload, received_ns, sent_us)
-
-        return on_sample
-
     def _push_handler(self, handlers: Handlers, transport: Transport) -> Callable[[bytes, Report], bytes]:
         """Answers pushes by pulling the bundle from the client that pushes it."""
 
@@ -174,32 +166,14 @@ class Service:
 
         return lambda request, report: handlers.push(request, report, pull, self._stop)
 
-    def _open_outlet(self, stream: str, transport: Transport) -> Outlet:
-        """What the worker of a stream needs from the network."""
-        publisher = transport.publisher(self._keys.velocity(stream), VELOCITY_SCHEMA, urgent=True)
-        undeclare_token = transport.token(self._keys.serves(self._config.node, stream))
-        log.info("stream started", stream=stream)
-
-        def ask_camera() -> CameraInfo | None:
-            answers = transport.ask(self._keys.camera(stream), b"", _ASK_CAMERA_S)
-            return CameraInfo.decode(answers[0].payload) if answers else None
-
-        def close() -> None:
-            undeclare_token()
-            publisher.close()
-
-        return Outlet(ask_camera, publisher.put, close)
-
-    def _housekeeping(self, transport: Transport, registry: StreamRegistry) -> Housekeeping:
+    def _housekeeping(self, transport: Transport, registry: StreamRegistry, watch: Watch) -> Housekeeping:
         return Housekeeping(
             registry,
-            lambda: self._statuses(registry),
+            watch.statuses,
             lambda stream: transport.publisher(self._keys.status(stream), STATUS_SCHEMA),
             self._config.status_period_s,
+            self._guard,
         )
-
-    def _statuses(self, registry: StreamRegistry) -> list[StreamStatus]:
-        return [stream_status(self._config.node, stream) for stream in registry.streams()]
 
     def _log_ready(self) -> None:
         config, model = self._config, self._slot.active.estimator.bundle

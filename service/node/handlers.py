@@ -32,6 +32,7 @@ from neurove_service.models.pull import Pull
 from neurove_service.models.signatures import Signed
 from neurove_service.models.slot import ModelSlot
 from neurove_service.models.store import ModelStore
+from neurove_service.node.condition import Condition
 from neurove_service.node.health import node_verdict
 from neurove_service.streams.roles import Serving
 
@@ -47,7 +48,7 @@ class Handlers:
         node: its name.
         slot: its models.
         streams: status of every stream that is served now.
-        refused_streams: number of refused streams.
+        condition: of the node as a whole.
         store: the models that were pushed to it.
         active_file: what it saves for a restart.
         ready: whether the next packet gets its estimate: the model is warm, and no worker is stuck.
@@ -58,13 +59,13 @@ class Handlers:
         node: str,
         slot: ModelSlot,
         streams: Callable[[], list[StreamStatus]],
-        refused_streams: Callable[[], int],
+        condition: Callable[[], Condition] = Condition,
         store: ModelStore | None = None,
         active_file: ActiveFile | None = None,
         ready: Callable[[], bool] = lambda: True,
     ) -> None:
         self._node, self._slot = node, slot
-        self._streams, self._refused_streams, self._ready = streams, refused_streams, ready
+        self._streams, self._condition, self._ready = streams, condition, ready
         self._store, self._active_file = store or ModelStore(None), active_file or ActiveFile(None)
         self._began = time.monotonic()
 
@@ -72,8 +73,8 @@ class Handlers:
         """Health of this node and its streams."""
         HealthRequest.decode(request)
         streams = self._streams()
-        refused = self._refused_streams()
-        ok, why = node_verdict(streams, refused, self._slot.faults)
+        condition = self._condition()
+        ok, why = node_verdict(streams, (*self._slot.faults, *condition.reasons()))
         active = self._slot.active
         reply = HealthReply(
             node=self._node,
@@ -83,7 +84,9 @@ class Handlers:
             version=VERSION,
             model=self._info(active.estimator.bundle.info),
             epoch=active.epoch,
-            refused_streams=refused,
+            refused_streams=condition.refused_streams,
+            internal_errors=dict(condition.internal_errors),
+            dropped_log_lines=condition.dropped_log_lines,
             streams=tuple(streams),
             ready=self._ready(),
             change=self._slot.last_change,

@@ -38,13 +38,15 @@ def stream_status(node: str, stream: Stream, now_ns: int | None = None) -> Strea
     )
 
 
-def node_verdict(
-    streams: list[StreamStatus], refused_streams: int = 0, model_faults: Sequence[str] = ()
-) -> tuple[bool, str]:
-    """Whether a node is healthy, and a sentence with the reason."""
-    bad = list(model_faults)
+def node_verdict(streams: list[StreamStatus], faults: Sequence[str] = ()) -> tuple[bool, str]:
+    """Whether a node is healthy, and a sentence with the reason.
+
+    Args:
+        streams: status of every stream.
+        faults: what else is wrong with the node, each as the part of a sentence.
+    """
+    bad = list(faults)
     bad += [f"{status.stream} is {status.verdict}: {status.why}" for status in streams if status.verdict in _BAD]
-    bad += [f"{refused_streams} streams refused: max_streams reached"] if refused_streams else []
     if bad:
         return False, "; ".join(bad)
     count = len(streams)

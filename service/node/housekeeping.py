@@ -1,4 +1,4 @@
-"""Housekeeping: status messages, eviction of idle streams, and the watchdog of the supervisor."""
+"""Housekeeping: status messages and eviction of idle streams."""
 
 import threading
 import time
@@ -6,24 +6,26 @@ from collections.abc import Callable
 
 from neurove_protocol.control import StreamStatus
 from neurove_service import logs
-from neurove_service.lifecycle import notify
+from neurove_service.guard import Guard
 from neurove_service.streams.registry import StreamRegistry
 from neurove_service.transport import Publisher
 
 log = logs.get(__name__)
 
 _TICK_S = 0.1
-_WATCHDOG_S = 1.0
 
 
 class Housekeeping:
     """Publishes the status of every stream on a change of its verdict and once per period; evicts idle streams.
+
+    An internal error costs one stream one message.
 
     Args:
         registry: the streams.
         statuses: status of every stream.
         open_publisher: opens the publisher of a stream's status.
         period_s: of status messages and evictions [s].
+        guard: counts internal errors.
     """
 
     def __init__(
@@ -32,27 +34,33 @@ class Housekeeping:
         statuses: Callable[[], list[StreamStatus]],
         open_publisher: Callable[[str], Publisher],
         period_s: float,
+        guard: Guard,
     ) -> None:
         self._registry, self._statuses = registry, statuses
         self._open_publisher, self._period_s = open_publisher, period_s
+        self._guard = guard
         self._publishers: dict[str, Publisher] = {}
         self._reported: dict[str, str] = {}  # stream -> verdict of its newest status message
+        self._next_status_s = self.beat_s = time.monotonic()  # beat_s: when the loop turned last
 
     def run(self, stop: threading.Event) -> None:
         """Run until the event is set."""
-        next_status = next_watchdog = time.monotonic()
         while not stop.wait(_TICK_S):
-            now = time.monotonic()
-            due = now >= next_status
-            for status in self._statuses():
-                if due or self._reported.get(status.stream) != status.verdict:
+            with self._guard.at("housekeeping"):
+                self.turn(time.monotonic())
+            self.beat_s = time.monotonic()
+
+    def turn(self, now_s: float) -> None:
+        """Publish what is due, and evict."""
+        due = now_s >= self._next_status_s
+        if due:
+            self._next_status_s = now_s + self._period_s
+        for status in self._statuses():
+            if due or self._reported.get(status.stream) != status.verdict:
+                with self._guard.at("status message", stream=status.stream):
                     self._report(status)
-            if due:
-                next_status = now + self._period_s
-                self._evict()
-            if now >= next_watchdog and self._registry.alive():
-                next_watchdog = now + _WATCHDOG_S
-                notify("WATCHDOG=1")
+        if due:
+            self._evict()
 
     def _report(self, status: StreamStatus) -> None:
         name, before = status.stream, self._reported.get(status.stream)
@@ -66,5 +74,7 @@ class Housekeeping:
     def _evict(self) -> None:
         for name in self._registry.evict_idle():
             self._reported.pop(name, None)
-            if name in self._publishers:
-                self._publishers.pop(name).close()
+            publisher = self._publishers.pop(name, None)
+            if publisher is not None:
+                with self._guard.at("end of a status publisher", stream=name):
+                    publisher.close()

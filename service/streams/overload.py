@@ -11,9 +11,6 @@ from neurove_service.streams.lane import OpenWindow
 BEHIND_NS, FAR_BEHIND_NS = 100_000_000, 200_000_000
 """A packet that waits longer is behind; far behind is needed to begin."""
 
-PATIENCE_NS = 1_000_000_000
-"""A worker that is behind for a shorter time catches up: a stall loses nothing."""
-
 RELIEF_NS = 2_000_000_000
 """The overload has ended when the worker was not behind for this time."""
 
@@ -23,9 +20,14 @@ MAX_SHED_US = 60_000_000
 
 
 class Overload:
-    """Decides when a worker leaves out windows."""
+    """Decides when a worker leaves out windows.
 
-    def __init__(self) -> None:
+    Args:
+        patience_s: a worker that is behind for a shorter time catches up, so a stall loses nothing [s].
+    """
+
+    def __init__(self, patience_s: float) -> None:
+        self._patience_ns = patience_s * 1e9
         self._behind_since_ns: int | None = None
         self._until_ns = 0
 
@@ -41,7 +43,7 @@ class Overload:
             return False
         if self._behind_since_ns is None:
             self._behind_since_ns = now_ns
-        if waited_ns > FAR_BEHIND_NS and now_ns - self._behind_since_ns > PATIENCE_NS:
+        if waited_ns > FAR_BEHIND_NS and now_ns - self._behind_since_ns > self._patience_ns:
             self._until_ns = now_ns + RELIEF_NS
         if now_ns > self._until_ns:
             return False

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from neurove_protocol.events import PacketLimits
 from neurove_service import logs
+from neurove_service.guard import Guard
 from neurove_service.streams.history import RingSize
 from neurove_service.streams.model_source import ModelSource
 from neurove_service.streams.stream import Stream
@@ -44,10 +45,18 @@ class StreamRegistry:
         models: gives streams their models.
         settings: bounds of every stream.
         open_outlet: opens the outlet of a stream, by its name; called on the thread of the worker.
+        guard: counts internal errors.
     """
 
-    def __init__(self, models: ModelSource, settings: StreamSettings, open_outlet: Callable[[str], Outlet]) -> None:
+    def __init__(
+        self,
+        models: ModelSource,
+        settings: StreamSettings,
+        open_outlet: Callable[[str], Outlet],
+        guard: Guard | None = None,
+    ) -> None:
         self._models, self._settings, self._open_outlet = models, settings, open_outlet
+        self._guard = guard or Guard()
         self._workers: dict[str, StreamWorker] = {}
         self._standby_slots = threading.Semaphore(max(1, (os.cpu_count() or 1) // 2))  # the rest is for serving models
         self._refused: dict[str, float] = {}  # stream -> time of its newest message
@@ -109,9 +118,14 @@ class StreamRegistry:
 
     def alive(self) -> bool:
         """Whether the loop of every worker has turned recently."""
+        return not self.stuck()
+
+    def stuck(self) -> list[str]:
+        """The streams whose worker is stuck."""
+        now_ns = time.monotonic_ns()
         with self._lock:
-            beats = [worker.beat_ns for worker in self._workers.values()]
-        return all((time.monotonic_ns() - beat) / 1e9 < STALLED_LOOP_S for beat in beats)
+            workers = list(self._workers.items())
+        return [name for name, worker in workers if (now_ns - worker.beat_ns) / 1e9 >= STALLED_LOOP_S]
 
     def _worker_of(self, name: str) -> StreamWorker | None:
         worker = self._workers.get(name)
@@ -127,6 +141,7 @@ class StreamRegistry:
             Inbox(settings.queue_s, settings.queue_bytes),
             settings.limits,
             self._standby_slots,
+            self._guard,
         )
         self._workers[name] = worker
         return worker
@@ -144,5 +159,6 @@ class StreamRegistry:
             ending = [self._workers.pop(name) for name in names]
         for worker in ending:
             worker.stop()
+        deadline = time.monotonic() + _JOIN_S  # for all together
         for worker in ending:
-            worker.join(timeout_s=_JOIN_S)
+            worker.join(timeout_s=max(0.0, deadline - time.monotonic()))

@@ -13,6 +13,7 @@ from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.events import PacketLimits
 from neurove_protocol.velocity import TwistEstimate
 from neurove_service import logs
+from neurove_service.guard import Guard
 from neurove_service.streams.intake import Arrival
 from neurove_service.streams.overload import Overload, newest_whole_window
 from neurove_service.streams.runs import MAX_RUN, SMALL_BYTES
@@ -21,6 +22,8 @@ from neurove_service.streams.stream import Stream
 log = logs.get(__name__)
 
 _IDLE_BEAT_S = 0.5
+_REOPEN_S = 0.5  # pause before the outlet is opened again after a failure
+_REST_S = 0.01  # pause of the loop after an error in it
 _RETRY_STANDBY_S = 0.002
 _MAX_PAUSE_S = 0.02
 _SAMPLE_BYTES = 256
@@ -53,7 +56,7 @@ class Inbox:
 
     def __init__(self, max_age_s: float, max_bytes: int) -> None:
         self._samples: deque[Sample] = deque()
-        self._max_age_ns, self._max_bytes = max_age_s * 1e9, max_bytes
+        self.max_age_s, self._max_age_ns, self._max_bytes = max_age_s, max_age_s * 1e9, max_bytes
         self._bytes = self._dropped = 0
         self._changed = threading.Condition()
 
@@ -105,6 +108,7 @@ class StreamWorker:
         inbox: the queue.
         limits: limits of packets.
         standby_slots: limits how many workers of the node run a standby model at once; None: no limit.
+        guard: counts internal errors.
     """
 
     def __init__(
@@ -114,14 +118,17 @@ class StreamWorker:
         inbox: Inbox,
         limits: PacketLimits,
         standby_slots: threading.Semaphore | None = None,
+        guard: Guard | None = None,
     ) -> None:
         self.stream = stream
         self.beat_ns = time.monotonic_ns()
         self._inbox = inbox
         self._open_outlet, self._limits = open_outlet, limits
         self._standby_slots = standby_slots or threading.Semaphore()
+        self._guard = guard or Guard()
+        self._pause_until = 0.0  # a time, not a duration: packets that arrive in a pause must not extend it
         self._pending: deque[Sample] = deque()  # taken out of the queue, not yet processed
-        self._overload = Overload()
+        self._overload = Overload(inbox.max_age_s)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"stream {stream.name}", daemon=True)
         self._thread.start()
@@ -144,21 +151,41 @@ class StreamWorker:
         self._thread.join(timeout_s)
 
     def _run(self) -> None:
-        outlet = self._open_outlet()
-        try:
+        outlet = self._opened()
+        if outlet is None:
+            return
+        with self._guard.at("camera query", stream=self.stream.name):
             self._set_camera(outlet.ask_camera)
-            pause_until = 0.0  # a time, not a duration: packets that arrive in a pause must not extend it
-            while not self._stopping.is_set():
-                self.beat_ns = time.monotonic_ns()
-                if not self._pending:
-                    pause_s = max(0.0, pause_until - time.monotonic())
-                    self._take(pause_s if self.stream.lanes.has_backlog else _IDLE_BEAT_S)
-                if self._pending:
-                    self._work_next(outlet)
-                elif self.stream.lanes.has_backlog:
-                    pause_until = time.monotonic() + self._run_standby()
-        finally:
+        while not self._stopping.is_set():
+            self.beat_ns = time.monotonic_ns()
+            first = self._pending[0] if self._pending else None
+            with self._guard.at("stream loop", stream=self.stream.name):
+                self._turn(outlet)
+                continue
+            if first is not None and self._pending and self._pending[0] is first:
+                self._pending.popleft()  # it would fail again
+            self._stopping.wait(_REST_S)
+        with self._guard.at("end of a stream", stream=self.stream.name):
             outlet.close()
+
+    def _opened(self) -> Outlet | None:
+        """The outlet; after a failure it is opened again until the worker stops."""
+        while not self._stopping.is_set():
+            with self._guard.at("start of a stream", stream=self.stream.name):
+                return self._open_outlet()
+            self.beat_ns = time.monotonic_ns()
+            self._stopping.wait(_REOPEN_S)
+        return None
+
+    def _turn(self, outlet: Outlet) -> None:
+        """Process the oldest samples, or else a step of the standby model."""
+        if not self._pending:
+            pause_s = max(0.0, self._pause_until - time.monotonic())
+            self._take(pause_s if self.stream.lanes.has_backlog else _IDLE_BEAT_S)
+        if self._pending:
+            self._work_next(outlet)
+        elif self.stream.lanes.has_backlog:
+            self._pause_until = time.monotonic() + self._run_standby()
 
     def _take(self, timeout_s: float) -> None:
         samples, dropped = self._inbox.take_all(timeout_s)
@@ -190,9 +217,9 @@ class StreamWorker:
         try:
             for estimate in self.stream.accept_run(run, arrival):
                 self._publish(estimate, outlet)
-        except Exception:  # as for a single packet
+        except Exception as error:  # noqa: BLE001  # as for a single packet
+            self._guard.caught("packet", error, stream=self.stream.name, packets=len(packets))
             self.stream.failed(len(packets))
-            log.exception("packets failed", stream=self.stream.name, packets=len(packets))
         return True
 
     def _shed(self) -> None:
@@ -230,9 +257,9 @@ class StreamWorker:
             total = self.stream.refused(sample.received_ns, error.message)
             if total & (total - 1) == 0:  # log the 1st, 2nd, 4th, 8th, ...: packets are only counted
                 log.warning("packet refused", stream=self.stream.name, why=error.message, total=total)
-        except Exception:  # an internal error on one packet must not end the stream
+        except Exception as error:  # noqa: BLE001  # an internal error on one packet must not end the stream
+            self._guard.caught("packet", error, stream=self.stream.name)
             self.stream.failed()
-            log.exception("packet failed", stream=self.stream.name)
 
     def _publish(self, estimate: TwistEstimate, outlet: Outlet) -> None:
         trace = estimate.trace.model_copy(update={"published_ns": time.monotonic_ns()})

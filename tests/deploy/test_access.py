@@ -160,7 +160,7 @@ class TestWhoMayNot:
         assert anywhere.epoch() == before
 
     def test_the_command_names_missing_permission_as_a_possible_reason(self, place):
-        result = neurove("activate", "untrained", *place.flags("consumer-planner"))
+        result = neurove("activate", "untrained", *place.flags("consumer-planner"), "--wait", "0")
         assert (result.returncode, result.stdout) == (1, "")
         assert "does its access list admit you?" in result.stderr
         assert result.stderr.count("\n") == 1
@@ -293,7 +293,8 @@ class TestWhoDoesNotGetIn:
             bare(anywhere.endpoint.replace("tls/", "tcp/"))
 
     def test_the_command_names_certificates_as_a_possible_reason(self, place, foreign):
-        result = neurove("health", "--connect", place.endpoint, "--zenoh-config", str(foreign / "operator-alice.json5"))
+        config = str(foreign / "operator-alice.json5")
+        result = neurove("health", "--connect", place.endpoint, "--zenoh-config", config, "--wait", "0")
         assert result.returncode == 1
         assert "or one side refuses the other's certificate (zenoh_config)" in result.stderr
         assert result.stderr.count("\n") == 1

@@ -73,7 +73,7 @@ def test_a_port_in_use_is_reported_in_one_line(node):
 
 @pytest.mark.parametrize("command", [("health",), ("watch",), ("models",), ("activate", "other")])
 def test_a_client_reports_a_missing_service(command, run):
-    ran = run(*command, "--connect", free_endpoint())
+    ran = run(*command, "--connect", free_endpoint(), "--wait", "0")
     assert ran.code == 1
     assert ran.err.startswith("neurove: no service")
     assert ran.err.count("\n") == 1
@@ -85,8 +85,8 @@ def test_a_router_without_a_node_counts_as_no_service(run):
     try:
         with client(endpoint):
             pass
-        assert run("watch", "--connect", endpoint).code == 1
-        assert "is `neurove serve` running there" in run("health", "--connect", endpoint).err
+        assert run("watch", "--connect", endpoint, "--wait", "0").code == 1
+        assert "is `neurove serve` running there" in run("health", "--connect", endpoint, "--wait", "0").err
         undriven = run("drive", "pattern://", "--connect", endpoint, "--wait", "0.5")
         assert (undriven.code, "no service subscribed to stream cam0" in undriven.err) == (1, True)
     finally:

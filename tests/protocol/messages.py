@@ -152,6 +152,8 @@ EXAMPLES: dict[str, Fields] = {
         "ready": True,
         "change": "spire-7 is active",
         "rollbacks": 1,
+        "internal_errors": {"packet": 2},
+        "dropped_log_lines": 3,
     },
     "ModelsRequest": {"v": 1},
     "ModelsReply": {
@@ -383,6 +385,8 @@ ANY: dict[str, st.SearchStrategy[Fields]] = {
             "ready": st.booleans(),
             "change": sentences,
             "rollbacks": counts,
+            "internal_errors": st.dictionaries(sentences, counts, max_size=3),
+            "dropped_log_lines": counts,
         }
     ),
     "ModelsRequest": st.just({}),

@@ -50,7 +50,7 @@ NULLABLE = {
     ("ActivateRequest", "force"),
     ("RollbackRequest", "expect"),
 }
-FREE_MAPS = ("details", "unreadable", "figures", "partial")
+FREE_MAPS = ("details", "unreadable", "figures", "partial", "internal_errors")
 DEFAULTED = {"release", "figures", "signature"}  # of a ModelInfo
 DEFAULTED |= {"recovered_packets", "uncounted_packets", "refused_cameras", "refusal"}  # of a StreamStatus
 OUT_OF_BOUND: dict[str, dict[str, tuple[Any, ...]]] = {

@@ -67,6 +67,8 @@ def detect(head: bytes) -> Dialect:
     """
     if head.startswith((b"\xff\xfe", b"\xfe\xff")):
         raise Unclear("the text is UTF-16: save it as UTF-8")
+    if b"\r" in head and b"\n" not in head:
+        raise Unclear("its lines end with CR: save it with LF or CR LF")
     lines = head.removeprefix(_MARK).split(b"\n")
     if len(head) >= HEAD_BYTES:
         lines.pop()
@@ -97,7 +99,7 @@ def pieces(blocks: Iterator[tuple[int, list[bytes]]], dialect: Dialect, tally: T
         dialect: of the file.
         tally: of this pass.
     """
-    line_of_event = re.compile(rb"\s*" + rb"\s+".join([_NUMBER] * dialect.numbers) + rb"\s*")
+    line_of_event = re.compile(rb"[ \t]*" + rb"[ \t]+".join([_NUMBER] * dialect.numbers) + rb"[ \t]*\r?")
     for first, lines in blocks:
         if first == 1:
             lines[0] = lines[0].removeprefix(_MARK)

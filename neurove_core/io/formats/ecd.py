@@ -7,7 +7,7 @@ images.txt with images.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple, Self
 
@@ -24,6 +24,7 @@ from neurove_core.io.formats.columns import Unclear
 from neurove_core.io.formats.dialect import ECD, HEAD_BYTES, Dialect, count_lines, detect, is_blank, line_of, pieces
 from neurove_core.io.order import Where
 from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Frame, Imu, refuse_topic
+from neurove_core.io.units import SAMPLE, UNITS, TimeSample
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
@@ -94,6 +95,27 @@ class EcdRecording(EventsOnly):
             others.remove("frames")
         streams = ("events", *others)
         return cls(path, name, sensor, lens, place, events_file, streams, dialect, known is None)
+
+    def time_sample(self) -> TimeSample | None:
+        """Times of the first events, see `Timed`."""
+        columns = self.dialect.columns
+        unit = next((name for name, us in UNITS.items() if us == columns.unit_us), "s")
+        try:
+            with self.place.open(self.events_file) as file:
+                lines = file.read(HEAD_BYTES).split(b"\n")[self.dialect.skip : -1]
+        except BrokenRecording:  # reading the events reports it
+            return None
+        rows = [self.dialect.plain(line).split() for line in lines if not is_blank(line)]
+        try:
+            times = np.array([row[columns.t] for row in rows if len(row) == self.dialect.numbers][:SAMPLE], np.float64)
+        except ValueError:
+            return None
+        return TimeSample(self.path, times, unit, 0)
+
+    def in_unit(self, unit: str) -> Self:
+        """The same recording with the times of its events in another unit, see `Timed`."""
+        columns = self.dialect.columns._replace(unit_us=UNITS[unit])
+        return replace(self, dialect=self.dialect._replace(columns=columns))
 
     def camera(self, stream: str) -> CameraInfo | None:
         """The lens of calib.txt, or None without one."""

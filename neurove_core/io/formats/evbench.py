@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -16,6 +16,7 @@ from neurove_core.io.faults import Faults, Reason, Tally
 from neurove_core.io.format import Format
 from neurove_core.io.formats.mat5 import MatFault, read_columns
 from neurove_core.io.recording import EventsOnly, refuse_topic
+from neurove_core.io.units import SAMPLE, TimeSample, scaled
 from neurove_protocol.events import Events, Sensor
 
 DAVIS240B = Sensor(240, 180)
@@ -43,6 +44,7 @@ class EvbenchRecording(EventsOnly):
     streams: tuple[str, ...]
     endless: bool = False
     faults: Faults = field(default_factory=Faults, compare=False, repr=False)
+    time_unit: str = "us"
 
     @classmethod
     def open(cls, path: Path, sensor: Sensor | None = None) -> Self:
@@ -72,6 +74,15 @@ class EvbenchRecording(EventsOnly):
         pieces: Iterator[Piece] = iter([(numbered(0), self._events(tally))])
         return cleaned(pieces, self.sensor, tally)
 
+    def time_sample(self) -> TimeSample | None:
+        """Times of the first events, see `Timed`."""
+        t = _columns(self.path)["ts"]
+        return TimeSample(self.path, t[:SAMPLE], "us", t.size)
+
+    def in_unit(self, unit: str) -> Self:
+        """The same recording with times in another unit, see `Timed`."""
+        return replace(self, time_unit=unit)
+
     def twists(self) -> Twists | None:
         """The truth in ground-truth_3Dcam.txt of the same folder, at the first and the last event; None without it.
 
@@ -88,7 +99,8 @@ class EvbenchRecording(EventsOnly):
 
     def _events(self, tally: Tally) -> Events:
         columns = _columns(self.path)
-        t, x, y, p = (columns[name].astype(np.int64) for name in COLUMNS)
+        t = np.rint(scaled(columns["ts"], self.time_unit)).astype(np.int64)
+        x, y, p = (columns[name].astype(np.int64) for name in COLUMNS[1:])
         valid = (p == 0) | (p == 1)
         if not valid.all():
             first = int(valid.argmin())

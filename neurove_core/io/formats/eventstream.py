@@ -166,4 +166,4 @@ def _open(path: Path, sensor: Sensor | None, topic: str | None) -> EventStreamRe
     return EventStreamRecording.open(path, sensor)
 
 
-FORMAT = Format("FILE.es (Event Stream)", _open, (".es",))
+FORMAT = Format("FILE.es (Event Stream)", _open, (".es",), signature=b"Event Stream")

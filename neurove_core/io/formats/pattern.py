@@ -48,7 +48,7 @@ class Pattern(EventsOnly):
         parts = urlsplit(url)
         query = dict(parse_qsl(parts.query, keep_blank_values=True))
         if parts.netloc or parts.path or query.keys() - {"seed"}:
-            raise UnknownSource(url, "a pattern URL accepts a seed and nothing else")
+            raise UnknownSource(url, "its only parameter is seed, as in pattern://?seed=3")
         seed = query.get("seed", "0")
         if not (seed.isascii() and seed.isdecimal() and len(seed) < 10):
             raise InvalidField(url, "seed", seed, "expected a whole number of at most 9 digits")

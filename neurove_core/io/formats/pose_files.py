@@ -50,6 +50,20 @@ def read_poses(path: Path) -> Poses:
         raise UnknownSource(path, error.strerror or str(error)) from None
 
 
+def read_truth(path: Path) -> Poses:
+    """Read the poses of a file that the user gives as the truth of a recording; see `read_poses`.
+
+    Raises:
+        InvalidField: the file does not exist or has no poses; the error says what a truth file holds. Also as
+            `read_poses`, like BrokenRecording and MissingExtra.
+    """
+    try:
+        return read_poses(path)
+    except UnknownSource as error:
+        why = f"{error.details['why']}; a truth file has poses of the camera: lines `{' '.join(_COLUMNS)}`, or HDF5"
+        raise InvalidField("truth", "FILE", str(path), why) from None
+
+
 def _text_poses(path: Path, text: TextIO) -> Poses:
     """The poses of a text file; see the module."""
     times: list[NDArray[Any]] = []

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from neurove_core.evaluation.judgement import judgement
 from neurove_core.evaluation.metrics import direction_error_deg, figures, r2, relative_error, rmse
 
 
@@ -85,3 +86,38 @@ def test_a_stationary_truth_has_no_relative_error_and_no_r2():
     found = figures(np.zeros((10, 6)), np.ones((10, 6)), 5)
     assert found["re_v_l"] is found["r2_v_a"] is found["median_direction_error_v_a_deg"] is None
     assert r2(np.zeros((3, 1)), np.ones((3, 1))) is None
+
+
+@pytest.mark.parametrize("noise", [0, 1e-15, 1e-8])
+def test_a_constant_truth_has_no_r2_and_no_correlation(noise):
+    rng = np.random.default_rng(1)
+    truth = np.tile([0.3, 0, 2, 0, 0, 0.1], (40, 1)) + noise * rng.normal(size=(40, 6))
+    found = figures(truth, truth + 0.1 * rng.normal(size=truth.shape), 5)
+    assert found["r2_v_l"] is found["r2_v_a"] is found["per_axis"]["vx"]["r2"] is None
+    assert found["per_axis"]["vx"]["correlation"] is None
+
+
+def report_of(truth, estimate):
+    found = figures(truth, estimate, 5)
+    mean, zero = np.broadcast_to(truth.mean(0), truth.shape), np.zeros_like(truth)
+    return found | {"mean": figures(truth, mean, 5), "zero": figures(truth, zero, 5)}
+
+
+def test_the_judgement_compares_with_both_constants():
+    truth, estimate = made()
+    assert judgement(report_of(truth, estimate)).count("is better than any constant") == 2
+    worse = judgement(report_of(truth, truth * -1.0))
+    assert worse.count("is worse than zero velocity") == 2
+    mean = truth + (truth.mean(0) - truth) * 1.0
+    assert "linear velocity is no better than the mean of the truth" in judgement(report_of(truth, mean))
+    drive = truth * [0.01, 0.01, 0.1, 1, 1, 1] + [0, 0, 5, 0, 0, 0]
+    between = drive + np.array([0.0, 0.0, 2.0, 0.0, 0.0, 0.0])
+    assert "linear velocity is worse than the mean of the truth (2 m/s; mean" in judgement(report_of(drive, between))
+
+
+def test_the_judgement_of_a_constant_truth_does_not_count_its_mean_as_a_rival():
+    truth = np.tile([0, 0, 2.0, 0, 0, 0], (40, 1))
+    told = judgement(report_of(truth, truth + 0.1))
+    assert "linear velocity has a constant truth, and is better than zero velocity (0.173 m/s; zero 2)" in told
+    assert "angular velocity has a constant truth of zero, and is off by 9.92 deg/s" in told
+    assert "is worse than zero velocity" in judgement(report_of(truth, truth * -2))

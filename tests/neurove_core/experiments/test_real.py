@@ -49,6 +49,19 @@ def test_without_recordings_every_check_is_skipped_with_the_reason(estimator, tm
     assert real.markdown(rows, "no model").count("skipped") == len(rows)
 
 
+@pytest.mark.parametrize(("folder", "why"), [("", "has none of the recordings"), ("nowhere", "is not a folder")])
+def test_the_command_fails_if_every_check_is_skipped(run, tmp_path, folder, why):
+    code, out, err = run("reproduce", "real", "untrained", "--recordings", tmp_path / folder)
+    assert (code, out.count("skipped")) == (1, len(real.CHECKS))
+    assert f"every check was skipped: {tmp_path / folder} {why}" in err
+
+
+def test_reproduce_velocity_refuses_a_wrong_folder_of_recordings_before_it_trains(run, tmp_path):
+    code, _, err = run("reproduce", "velocity", "--recordings", tmp_path / "nowhere", "--out", tmp_path / "out")
+    assert (code, err.count("\n"), "it is not a folder" in err) == (2, 1, True)
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_rotating_camera_is_compared_with_contrast_maximisation_over_complete_windows(estimator, tmp_path):
     folder = tmp_path / "ecd" / "shapes_rotation"
     folder.mkdir(parents=True)
@@ -117,9 +130,9 @@ def test_no_check_is_skipped_if_all_recordings_exist(tmp_path):
 
 def test_the_command_prints_the_same_results_as_table_and_json_and_writes_both(tmp_path, capsys):
     arguments = ["reproduce", "real", "untrained", "--recordings", str(tmp_path / "none"), "--out", str(tmp_path)]
-    assert main.main(arguments) == 0
+    assert main.main(arguments) == 1  # every check is skipped
     table = capsys.readouterr().out
-    assert main.main([*arguments, "--json"]) == 0
+    assert main.main([*arguments, "--json"]) == 1
     results = json.loads(capsys.readouterr().out)
     assert results["model"]["name"] == "untrained"
     assert table == real.markdown(results["checks"], real.title(results)) == (tmp_path / "real.md").read_text()

@@ -98,6 +98,7 @@ def test_an_event_outside_the_assumed_sensor_names_the_flag(tmp_path):
         ("3 9 1 2\n2 8 0 1\n1 7 1 0\n" * 9, "no column is a time"),
         ("0.5 1 0.1 2\n0.4 0 0.2 3\n0.3 1 0.3 5\n", "no two columns are x and y"),
         ("5 7 1 100\n" * 300, "the time can be column 1 or 2 or 4; add a header line"),
+        ("0.1 2 3 1\r0.2 3 4 0\r", "its lines end with CR: save it with LF or CR LF"),
         ("t\u0000,x".encode("utf-16").decode("latin1"), "the text is UTF-16: save it as UTF-8"),
     ],
 )
@@ -125,6 +126,14 @@ def test_the_order_of_columns_is_guessed_although_a_few_events_are_late(order, s
     assert columns.order == tuple(order.index(name) for name in "txyp")
 
 
+@pytest.mark.parametrize("order", ["txyp", "xypt", "xytp"])
+def test_times_without_order_are_recognised_because_they_are_no_pixels(order):
+    events = make_events(1000, seed=1, start_us=1_000_000)
+    times = np.random.default_rng(0).permutation(events.t)
+    table = np.stack([{"t": times, "x": events.x, "y": events.y, "p": events.p}[name] for name in order], axis=1)
+    assert by_values(table.astype(np.float64)).order == tuple(order.index(name) for name in "txyp")
+
+
 def test_random_bytes_and_lines_give_declared_errors_and_valid_events(tmp_path):
     rng = np.random.default_rng(0)
     texts = list(DIALECTS.values())
@@ -136,6 +145,15 @@ def test_random_bytes_and_lines_give_declared_errors_and_valid_events(tmp_path):
             read(open_source(put(tmp_path, "a.csv", bytes(data)), SENSOR))
         except (UnknownSource, MissingGeometry) as error:
             assert "a.csv" in error.message  # noqa: PT017 most files can be read
+
+
+@pytest.mark.parametrize(
+    "line", ["0.5 1\r 2 1", "0.5\v1 2 1", "0.5 1 2 1\r\r", "\x1c0.5 1 2 1", "0_5 1 2 1", "0x1 1 2 1"]
+)
+def test_a_line_with_other_white_space_or_digits_is_counted_and_the_others_are_read(line, tmp_path):
+    recording = open_source(put(tmp_path, "a.txt", f"0.1 1 2 1\n{line}\n0.6 1 2 1\n".encode()))
+    assert read(recording).n + sum(fault.count for fault in recording.faults.found) == 3
+    assert all(fault.reason == "damaged" and fault.where == "line 2" for fault in recording.faults.found)
 
 
 def test_a_line_without_an_end_is_bounded_and_counted(tmp_path):

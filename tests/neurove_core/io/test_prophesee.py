@@ -190,8 +190,12 @@ def test_a_header_without_geometry_requires_a_sensor_size(header, tmp_path):
     [
         (b"", "does not name a word format"),
         (b"% geometry 64x48\n", "does not name a word format"),
-        (b"% evt 2.1\n", "its words are EVT21"),
-        (b"% format EVT4;width=64;height=48\n", "its words are EVT4"),
+        (b"% evt 5.0\n", "its words are EVT 5.0; supported: EVT2, EVT21, EVT3, EVT4"),
+        (b"% format HISTO3D;width=64;height=48\n", "its words are HISTO3D"),
+        (
+            b"% format EVT21;width=64;height=48;endianness=middle\n",
+            "its endianness is 'middle'; supported: little, big",
+        ),
     ],
 )
 def test_words_of_another_format_are_refused(header, why, tmp_path):

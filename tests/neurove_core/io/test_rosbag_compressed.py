@@ -57,9 +57,9 @@ def test_a_missing_library_is_reported(compressed_bag, monkeypatch):
         open_source(str(compressed_bag))
 
 
-def test_the_error_for_compressed_files_gives_the_command_to_decompress_them(tmp_path):
+def test_a_compressed_file_that_is_no_bag_is_refused(tmp_path):
     (tmp_path / "run_0.db3.zstd").write_bytes(zstandard.compress(b"a bag"))
-    with pytest.raises(UnknownSource, match="decompress them with `zstd -d`"):
+    with pytest.raises(UnknownSource, match="not a ROS 2 bag"):
         open_source(str(tmp_path))
 
 

@@ -42,7 +42,7 @@ def test_a_new_bundle_can_be_inspected(run, tmp_path):
         (("bundle", "inspect", "nowhere.safetensors"), "No such file"),
         (("bundle", "new", "model.pt"), "must end in .safetensors"),
         (("bundle", "new", "no/such/folder/m.safetensors"), "No such file"),
-        (("drive", "nowhere.xyz"), "supported sources"),
+        (("drive", "nowhere.xyz"), "no such file or folder"),
         (("drive", "gopher://x"), "unknown scheme"),
         (("config", "show", "--queue-s", "-1"), "queue_s='-1' (from flag): Input should be greater than 0"),
         (("health", "--connect", "nonsense"), "connect='nonsense' (from flag): 'nonsense' is no endpoint"),

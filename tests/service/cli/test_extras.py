@@ -13,7 +13,7 @@ from neurove_service.cli.commands import COMMANDS
 from neurove_service.cli.extras import EXTRAS, missing_extra
 
 ROOT = Path(__file__).parents[3]
-MODULE_OF = {"pillow": "PIL"}
+MODULE_OF = {"ruamel.yaml": "ruamel", "pillow": "PIL"}
 NOWHERE = "tcp/127.0.0.1:9"  # the discard port: nothing listens there
 
 BASE_INSTALL = f"""
@@ -69,19 +69,19 @@ def test_the_help_of_every_command_needs_no_extra(command):
 
 @pytest.mark.parametrize("command", [["health"], ["models"], ["watch"], ["activate", "other"], ["rollback"]])
 def test_a_client_without_extras_reports_that_no_service_answers(command):
-    ran = on_base_install(*command, "--connect", NOWHERE)
+    ran = on_base_install(*command, "--connect", NOWHERE, "--wait", "0")
     assert ran.returncode == EXIT_FAILURE
     assert ran.stderr.startswith("neurove: no service: ")
 
 
 def test_push_needs_no_extra(tmp_path):
     (tmp_path / "a.safetensors").write_bytes(b"any bytes")
-    ran = on_base_install("push", tmp_path / "a.safetensors", "--connect", NOWHERE)
+    ran = on_base_install("push", tmp_path / "a.safetensors", "--connect", NOWHERE, "--wait", "0")
     assert (ran.returncode, ran.stderr.startswith("neurove: no service: ")) == (EXIT_FAILURE, True)
 
 
 def test_drive_publishes_the_built_in_pattern_without_extras():
-    ran = on_base_install("drive", "pattern://", "--connect", NOWHERE)
+    ran = on_base_install("drive", "pattern://", "--connect", NOWHERE, "--wait", "0")
     assert ran.returncode == EXIT_FAILURE
     assert ran.stderr.startswith("neurove: no service: ")
 

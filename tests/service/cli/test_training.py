@@ -101,6 +101,54 @@ def test_a_recording_without_truth_is_refused_in_one_line(run, source, why):
     assert why in err
 
 
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [(None, "No such file or directory"), ("0.1 5 6 1\n", "columns=4: expected 8 columns: t x y z qx qy qz qw")],
+)
+def test_a_wrong_truth_file_is_named_and_not_called_a_source(run, tmp_path, text, why):
+    truth = tmp_path / "truth.txt"
+    if text:
+        truth.write_text(text)
+    code, _, err = run("evaluate", "untrained", SOURCE, "--truth", truth)
+    assert (code, str(truth) in err, why in err, "source" in err, err.count("\n")) == (2, True, True, False, 1), err
+
+
+def test_a_truth_of_another_time_is_refused_with_both_spans(run, tmp_path):
+    truth = tmp_path / "truth.txt"
+    truth.write_text("".join(f"{t / 10} 0 0 0 0 0 0 1\n" for t in range(1000, 1010)))
+    code, _, err = run("evaluate", "untrained", SOURCE, "--truth", truth)
+    assert (code, "windows 0.000 to 0.700 s, truth 100.000 to 100.900 s on the sensor clock" in err) == (2, True), err
+
+
+def test_evaluate_uses_one_unit_for_error_and_sigma_and_judges_in_one_sentence(trained, run):
+    model, source = str(trained / "out" / "tiny.safetensors"), "sim://street?seconds=0.8&trajectory=slider?vz=3"
+    code, text, _ = run("evaluate", model, source + "&camera=pinhole:24x18:75")
+    units = [line.split()[-1] for line in text.splitlines() if line[:2] in ("vx", "wy")]
+    assert (code, units) == (0, ["m/s", "deg/s", "m/s", "deg/s"])
+    assert "e+" not in text
+    assert "constant truth, constant truth" in text
+    assert text.count("linear velocity has a constant truth, and is ") == 1
+    found = json.loads(run("evaluate", model, source + "&camera=pinhole:24x18:75", "--json")[1])
+    sigma = found["uncertainty"]["per_axis"]["wy"]
+    assert sigma["median_sigma_deg_s"] == pytest.approx(np.degrees(sigma["median_sigma_rad_s"]))
+    assert found["judgement"] in text
+    assert found["r2_v_l"] is None
+
+
+def test_evaluate_refuses_a_folder_for_plots_before_it_runs(run, tmp_path):
+    (tmp_path / "file").write_text("")
+    code, out, err = run("evaluate", "untrained", SOURCE, "--plot", tmp_path / "file")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "--plot=" in err
+
+
+def test_a_missing_recording_and_an_unknown_parameter_are_one_short_line(run, tmp_path):
+    _, _, err = run("evaluate", "untrained", tmp_path / "nothing.h5")
+    assert err == f"neurove: source '{tmp_path / 'nothing.h5'}': no such file or folder\n"
+    _, _, err = run("evaluate", "untrained", "sim://street?sped=3")
+    assert "unknown parameter 'sped'; known parameters: trajectory, seed, camera, height, pitch, seconds" in err
+
+
 def test_a_file_of_poses_can_be_the_truth(trained, run, tmp_path):
 
     poses = open_source(SOURCE).trajectory.poses

@@ -6,10 +6,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neurove_core.io import BrokenRecording
+from neurove_core.io.formats.packet_log.reader import RecordedPacket
 from neurove_core.io.packets import PACKET_EVENTS, PACKET_US, slices
 from neurove_protocol import Events
 from neurove_service.clients.driver import repeated
-from tests.builders import make_events
+from neurove_service.clients.replay import Pace
+from tests.builders import make_events, make_packet
 
 
 def split(events, cuts):
@@ -40,6 +42,33 @@ def test_slices_hold_every_event_once_for_any_chunks_of_the_reader(n, seed, cuts
 def test_a_silent_span_ticks_at_packet_rate():
     quiet = Events.from_columns([0, 40_000], [1, 1], [1, 1], [1, 1])
     assert [piece.t0_us for piece in slices(iter([quiet]))] == [*range(0, 44_000, PACKET_US), 40_001]
+
+
+def test_a_gap_of_years_is_skipped_with_one_tick():
+    years_us = 50 * 365 * 86_400_000_000
+    events = Events.from_columns([0, 5_000, years_us, years_us + 9_000], [1] * 4, [1] * 4, [1] * 4)
+    pieces = list(slices(iter([events])))
+    assert [piece.t0_us for piece in pieces] == [
+        0,
+        4_000,
+        years_us,
+        years_us + 4_000,
+        years_us + 8_000,
+        years_us + 9_001,
+    ]
+    assert [piece.skipped_us for piece in pieces] == [0, 0] + [years_us - 8_000] * 4
+    assert [piece.events.n for piece in pieces] == [1, 1, 1, 0, 1, 0]
+    cut = [piece.t0_us for piece in slices(iter(split(events, [1, 2, 3])))]
+    assert cut == [piece.t0_us for piece in pieces]
+
+
+def test_a_replay_skips_a_gap_and_says_so(caplog):
+    pace = Pace(speed=1.0)
+    recorded = RecordedPacket("cam0", b"", 0)
+    times = (0, 4_000, 60_000_000, 60_004_000)
+    elapsed = [pace.due(recorded, make_packet(0, t0_us=t_us))[1] for t_us in times]
+    assert elapsed == [0, 0.004, 0.004, 0.008]
+    assert "gap skipped: stream=cam0 seconds=60.0" in caplog.text
 
 
 def test_a_burst_is_split_by_count():

@@ -13,6 +13,7 @@ from neurove_service.models.change import Rules
 from neurove_service.models.signatures import verifier
 from neurove_service.models.slot import ModelSlot
 from neurove_service.models.store import ModelStore
+from neurove_service.node.condition import Condition
 from neurove_service.node.handlers import Handlers
 
 KEY, OTHER = signing_keys.new(), signing_keys.new()
@@ -40,7 +41,7 @@ def handlers_of(folder, key_file, highest_release=0):
     active_file = ActiveFile(None)
     active_file.keep(Active(digest="0" * 64, previous=None, configured="x", highest_release=highest_release))
     slot = ModelSlot("untrained", folder, Rules(probation_s=0.1), pushed=store.files)
-    return Handlers("edge", slot, list, lambda: 0, store, active_file)
+    return Handlers("edge", slot, list, Condition, store, active_file)
 
 
 def test_a_signed_model_may_serve_and_an_unsigned_one_may_not(folder, key_file):

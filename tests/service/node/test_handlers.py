@@ -25,12 +25,14 @@ from neurove_protocol.errors import (
     NoStore,
     NothingBefore,
     UnknownModel,
+    Untrained,
 )
 from neurove_service.models.active_file import Active, ActiveFile
 from neurove_service.models.change import Rules
 from neurove_service.models.signatures import Signed
 from neurove_service.models.slot import ModelSlot
 from neurove_service.models.store import ModelStore
+from neurove_service.node.condition import Condition
 from neurove_service.node.handlers import Handlers
 from neurove_service.node.health import stream_status
 from neurove_service.streams.intake import Arrival
@@ -53,7 +55,7 @@ def stream(slot, clock):
 
 @pytest.fixture
 def handlers(slot, stream, clock):
-    return Handlers("edge", slot, lambda: [stream_status("edge", stream, clock[0])], lambda: 0)
+    return Handlers("edge", slot, lambda: [stream_status("edge", stream, clock[0])])
 
 
 def feed(stream, clock, packets):
@@ -118,7 +120,7 @@ def test_health_reports_the_newest_model_change_and_whether_the_node_is_ready(sl
         slot.activate("three")
     assert ask_health(handlers).change.startswith("three was refused: ")
     assert not HealthReply.decode(
-        Handlers("edge", slot, list, lambda: 0, ready=lambda: False).health(HealthRequest().encode())
+        Handlers("edge", slot, list, ready=lambda: False).health(HealthRequest().encode())
     ).ready
 
 
@@ -176,7 +178,7 @@ def storing(models_dir, tmp_path):
         active_file = ActiveFile(None)
         active_file.keep(Active(digest="0" * 64, previous=None, configured="one", highest_release=highest_release))
         slot = ModelSlot("one", models_dir, Rules(probation_s=0.2), pushed=store.files)
-        return Handlers("edge", slot, list, lambda: 0, store, active_file)
+        return Handlers("edge", slot, list, Condition, store, active_file)
 
     return make
 
@@ -223,6 +225,39 @@ def test_an_older_release_is_neither_stored_nor_activated_unless_a_trusted_signa
     assert ActivateReply.decode(handlers.rollback(RollbackRequest().encode())).active.name == "one"
 
 
+def test_after_a_signed_release_the_built_in_model_may_serve_and_an_untrained_one_may_not(storing):
+    handlers = storing(highest_release=7)
+    with pytest.raises(Downgrade, match="model untrained"):
+        handlers.activate(ActivateRequest(model="untrained").encode())
+    assert ActivateReply.decode(handlers.activate(ActivateRequest(model="default").encode())).active.name == "default"
+
+
+def test_a_node_for_trained_models_stores_no_untrained_one(models_dir, tmp_path, progress):
+    store = ModelStore(tmp_path, models_dir)
+    slot = ModelSlot("one", models_dir, pushed=store.files, trained_only=True)
+    handlers = Handlers("edge", slot, list, lambda: 0, store)
+    request, pull = push_of("eight")
+    with pytest.raises(Untrained, match="model eight: it is untrained"):
+        handlers.push(request, progress, pull, RUNS)
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+
+
+def test_health_is_not_ok_while_an_untrained_model_answers(slot, handlers):
+    assert ask_health(handlers).ok
+    slot.activate("untrained")
+    health = ask_health(handlers)
+    assert (health.ok, health.why) == (False, "model untrained is untrained: its estimates have no meaning")
+    slot.rollback()
+    assert ask_health(handlers).ok
+
+
+def test_activating_the_active_model_is_answered_as_unchanged(handlers):
+    handlers.activate(ActivateRequest(model="two").encode())
+    again = ActivateReply.decode(handlers.activate(ActivateRequest(model="two").encode()))
+    assert (again.changed, again.active, again.epoch) == (False, again.previous, 1)
+    assert ModelsReply.decode(handlers.models(ModelsRequest().encode())).previous.name == "one"
+
+
 def test_a_refusal_is_the_last_reported_step(handlers, progress):
     with pytest.raises(UnknownModel):
         handlers.activate(ActivateRequest(model="three").encode(), progress)
@@ -240,7 +275,7 @@ def test_a_model_whose_signature_is_refused_is_listed_as_untrusted(models_dir):
         raise NeuroVEError("untrusted")
 
     slot = ModelSlot("one", models_dir)
-    handlers = Handlers("edge", slot, list, lambda: 0, ModelStore(None, models_dir, verify=refuses))
+    handlers = Handlers("edge", slot, list, Condition, ModelStore(None, models_dir, verify=refuses))
     models = ModelsReply.decode(handlers.models(ModelsRequest().encode()))
     states = {info.name: info.signature for info in models.available}
     assert states == {"default": "unsigned", "untrained": "unsigned", "one": "untrusted", "two": "untrusted"}

@@ -217,4 +217,4 @@ def _open(path: Path, sensor: Sensor | None, topic: str | None) -> Aedat2Recordi
     return Aedat2Recording.open(path, sensor)
 
 
-FORMAT = Format("FILE.aedat (AEDAT 2.0 of jAER)", _open, (".aedat",))
+FORMAT = Format("FILE.aedat (AEDAT 2.0 of jAER)", _open, (".aedat",), signature=b"#!AER-DAT2")

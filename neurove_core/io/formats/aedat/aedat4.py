@@ -292,4 +292,4 @@ def _next_packet(file: BinaryIO, at: int, size: int, streams: set[int]) -> _Pack
     return None
 
 
-FORMAT = Format("FILE.aedat4 (DV)", Aedat4Recording.open, (".aedat4",))
+FORMAT = Format("FILE.aedat4 (DV)", Aedat4Recording.open, (".aedat4",), signature=b"#!AER-DAT4")

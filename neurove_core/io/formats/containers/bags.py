@@ -18,6 +18,7 @@ from neurove_core.io.unpack import unpacked
 
 T = TypeVar("T")
 
+SQLITE_MAGIC: Final = b"SQLite format 3\0"
 ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 MAX_RECORD_BYTES: Final = 64 << 20
 """Maximum size of one message or chunk [bytes], compressed and decompressed."""
@@ -247,13 +248,8 @@ def in_recorded_order(folder: Path) -> list[Path]:
     Raises:
         UnknownSource: the folder has no such file.
     """
-    files = [path for path in folder.iterdir() if path.suffix in (".db3", ".mcap")]
+    files = [path for path in folder.iterdir() if re.search(r"\.(db3|mcap)(\.zstd)?$", path.name)]
     if not files:
-        compressed = any(path.suffix == ".zstd" for path in folder.iterdir())
-        why = (
-            "its files are compressed: decompress them with `zstd -d`"
-            if compressed
-            else "the folder has no .db3 or .mcap file"
-        )
-        raise UnknownSource(folder, why)
-    return sorted(files, key=lambda path: (int((re.findall(r"_(\d+)$", path.stem) or [-1])[0]), path.name))
+        raise UnknownSource(folder, "the folder has no .db3 or .mcap file")
+    number = re.compile(r"_(\d+)\.(?:db3|mcap)")
+    return sorted(files, key=lambda path: (int((number.findall(path.name) or [-1])[-1]), path.name))

@@ -61,4 +61,9 @@ def open_hdf5(path: Path, sensor: Sensor | None = None, topic: str | None = None
     raise UnknownSource(path, why + (f"; it has poses: {truth[0]}" if truth else ""))
 
 
-FORMAT = Format("FILE.h5, FILE.hdf5 (MVSEC, DSEC, M3ED, Prophesee, v2e, EDS, events/xs)", open_hdf5, (".h5", ".hdf5"))
+FORMAT = Format(
+    "FILE.h5, FILE.hdf5 (MVSEC, DSEC, M3ED, Prophesee, v2e, EDS, events/xs)",
+    open_hdf5,
+    (".h5", ".hdf5"),
+    signature=rb"\x89HDF\r\n\x1a\n",
+)

@@ -124,7 +124,7 @@ def _event_table(path: Path, file: Any, layout: str) -> EventTable:
         return EventTable("events", (dataset(path, file, "events", 4),), _of_matrix)
     x, y, t, p = (dataset(path, file, name) for name in LAYOUTS[layout])
     seconds = layout != "eds" and t.dtype.kind == "f"
-    return EventTable(t.name, (t, x, y, p), _in_seconds if seconds else _unchanged)
+    return EventTable(t.name, (t, x, y, p), _in_seconds if seconds else _unchanged, unit="s" if seconds else "us")
 
 
 def _sensor(path: Path, file: Any, layout: str) -> Sensor | None:

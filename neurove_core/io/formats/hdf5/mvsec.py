@@ -130,7 +130,7 @@ class MvsecRecording(TableRecording):
     def event_table(self, file: Any) -> EventTable:
         """The table `events` (N, 4); see the module."""
         name = f"{self.topic}/events"
-        return EventTable(name, (dataset(self.path, file, name, 4),), _txyp)
+        return EventTable(name, (dataset(self.path, file, name, 4),), _txyp, unit="s")
 
     def imu_table(self, file: Any) -> ImuTable | None:
         """The left camera's IMU for both cameras: only its mounting was calibrated."""

@@ -2,7 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +15,8 @@ from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.faults import Faults, Reason, Tally
 from neurove_core.io.formats.hdf5.file import FAULTS, Column, check_ratio, opened, read_rows
 from neurove_core.io.order import Where
-from neurove_core.io.recording import CHUNK_EVENTS, EventsOnly, Imu, later
+from neurove_core.io.recording import CHUNK_EVENTS, EventsOnly, Imu, Recording, later
+from neurove_core.io.units import SAMPLE, UNITS, TimeSample, scaled
 from neurove_protocol.events import Events, Sensor
 
 _MAX_T_US, _MAX_XY = 1 << 62, 1 << 40
@@ -28,6 +29,17 @@ class EventTable(NamedTuple):
     columns: tuple[Any, ...]  # data sets, one row per event
     txyp: Callable[..., tuple[Column, Column, Column, Column]]  # rows of the columns -> t [us], x, y, p of any type
     offset_us: int = 0  # added to the times
+    unit: str = "us"  # of the times in the file
+
+    def in_unit(self, unit: str) -> "EventTable":
+        """The same table with the times of the file, and the offset, read in another unit."""
+
+        def txyp(*rows: Column) -> tuple[Column, Column, Column, Column]:
+            t, x, y, p = self.txyp(*rows)
+            return scaled(t, unit, self.unit), x, y, p
+
+        offset_us = round(self.offset_us * UNITS[unit] / UNITS[self.unit])
+        return self._replace(txyp=txyp, offset_us=offset_us, unit=unit)
 
     @property
     def n(self) -> int:
@@ -40,7 +52,8 @@ class EventTable(NamedTuple):
         Raises:
             Any of FAULTS: the rows cannot be read.
         """
-        t = self.txyp(*(column[first:stop] for column in self.columns))[0]
+        with np.errstate(all="ignore"):
+            t = self.txyp(*(column[first:stop] for column in self.columns))[0]
         return np.asarray(t.astype(np.float64) + self.offset_us)
 
 
@@ -172,6 +185,23 @@ class TableRecording(EventsOnly):
     held: tuple[str, ...]  # the value of `streams`
     endless: bool = False
     faults: Faults = field(default_factory=Faults, compare=False, repr=False)
+    time_unit: str | None = None  # of the times of the events in the file; None: that of the layout
+
+    def time_sample(self) -> TimeSample | None:
+        """Times of the first events, see `Timed`."""
+        with opened(self.path) as file:
+            try:
+                table = self.event_table(file)
+                with np.errstate(all="ignore"):
+                    t, *_ = table.txyp(*(column[:SAMPLE] for column in table.columns))
+            except (*FAULTS, BrokenRecording):  # reading the events reports it
+                return None
+            times = t if table.unit == "us" else t / UNITS[table.unit]
+            return TimeSample(self.path, times, table.unit, table.n)
+
+    def in_unit(self, unit: str) -> Recording:
+        """The same recording with the times of its events in another unit, see `Timed`."""
+        return replace(self, time_unit=unit)
 
     @property
     def streams(self) -> tuple[str, ...]:
@@ -210,6 +240,7 @@ class TableRecording(EventsOnly):
     def _pieces(self, t_us: int | None, tally: Tally) -> Iterator[Piece]:
         with opened(self.path) as file:
             table = self.event_table(file)
+            table = table.in_unit(self.time_unit) if self.time_unit is not None else table
             first = 0 if t_us is None else self.first_row(file, table, t_us)
             yield from event_pieces(self.path, table, tally, first)
 

@@ -241,5 +241,9 @@ def _accepts(path: Path) -> bool:
 
 
 FORMAT = Format(
-    "FILE.mcap (NeuroVE, from `neurove record` and `neurove convert`)", McapRecording.open, (".mcap",), _accepts
+    "FILE.mcap (NeuroVE, from `neurove record` and `neurove convert`)",
+    McapRecording.open,
+    (".mcap",),
+    _accepts,
+    rb"\x89MCAP0\r\n",
 )

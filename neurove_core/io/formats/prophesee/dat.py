@@ -138,4 +138,4 @@ def _open(path: Path, sensor: Sensor | None, topic: str | None) -> DatRecording:
     return DatRecording.open(path, sensor)
 
 
-FORMAT = Format("FILE.dat (Prophesee DAT)", _open, (".dat",))
+FORMAT = Format("FILE.dat (Prophesee DAT)", _open, (".dat",), signature=rb"(?:% [^\n]*\n)*?% (?i:data file|version) ")

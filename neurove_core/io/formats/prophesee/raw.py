@@ -1,6 +1,9 @@
-"""Prophesee .raw files: a text header, then EVT2 or EVT3 words from the camera."""
+"""Prophesee .raw files: a text header, then EVT2, EVT2.1, EVT3 or EVT4 words from the camera.
 
-from collections.abc import Callable, Iterator
+Source: docs.prophesee.ai/stable/data/file_formats/raw.html.
+"""
+
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -12,31 +15,14 @@ from neurove_core.io.checked import Piece, cleaned, numbered, ordered
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
 from neurove_core.io.faults import Faults, Reason, Tally
 from neurove_core.io.format import Format
-from neurove_core.io.formats.prophesee import evt, triggers
+from neurove_core.io.formats.prophesee.words import ENDIANNESS, FORMATS, Words, endianness_of, words_in
 from neurove_core.io.recording import BLOCK_BYTES, CHUNK_EVENTS, EventsOnly, Triggers, empty_events, refuse_topic
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
 
 HEADER_BYTES = 64 << 10  # maximum size; a header has about 500 bytes
 
-Decode = Callable[[NDArray[Any], Any, Events, NDArray[np.int64]], tuple[Any, int, int]]
-FindTriggers = Callable[[NDArray[Any], triggers.TriggerState], tuple[triggers.TriggerState, triggers.Columns]]
-
-
-class Words(NamedTuple):
-    """A word format: its word type and its decoders."""
-
-    dtype: np.dtype[Any]
-    decode: Decode
-    start: NamedTuple
-    triggers: FindTriggers
-
-
-FORMATS = {
-    "EVT2": Words(np.dtype("<u4"), evt.evt2_decode, evt.Evt2State(), triggers.evt2_triggers),
-    "EVT3": Words(np.dtype("<u2"), evt.evt3_decode, evt.Evt3State(), triggers.evt3_triggers),
-}
-_FORMAT_OF_EVT = {"2.0": "EVT2", "2.1": "EVT21", "3.0": "EVT3"}
+_FORMAT_OF_EVT = {"2.0": "EVT2", "2.1": "EVT21", "3.0": "EVT3", "4.0": "EVT4"}
 
 
 class Header(NamedTuple):
@@ -46,6 +32,7 @@ class Header(NamedTuple):
     sensor: Sensor | None  # None if the header has no valid sensor size
     size: int  # [bytes]
     version: str | None = None  # of the records of a .dat file
+    endianness: str | None = None  # order of the bytes of a word
 
 
 def parse_header(path: Path, head: bytes) -> Header:
@@ -55,7 +42,7 @@ def parse_header(path: Path, head: bytes) -> Header:
     If a value occurs twice, the later one applies.
 
     >>> parse_header(Path("a.raw"), b"% evt 3.0\n% format EVT3;height=720;width=1280\n% end\n\x00\x80")
-    Header(format='EVT3', sensor=Sensor(width=1280, height=720), size=52, version=None)
+    Header(format='EVT3', sensor=Sensor(width=1280, height=720), size=52, version=None, endianness=None)
 
     Raises:
         BrokenRecording: a header line has no end.
@@ -82,17 +69,21 @@ def parse_header(path: Path, head: bytes) -> Header:
         sensor = Sensor(int(fields.get("width", "")), int(fields.get("height", "")))
     except (ValueError, InvalidField):
         sensor = None
-    return Header(fields.get("format"), sensor, at, fields.get("version"))
+    return Header(fields.get("format"), sensor, at, fields.get("version"), fields.get("endianness"))
 
 
 @dataclass(frozen=True, slots=True)
 class PropheseeRecording(EventsOnly):
-    """A .raw file of EVT2 or EVT3 words; see `Recording`."""
+    """A .raw file; see `Recording`.
+
+    If the header does not give the order of the bytes, it is little-endian; the order of EVT2.1 is found in its words.
+    """
 
     path: Path
     sensor: Sensor
     words: Words
     header_bytes: int
+    endianness: str = "little"
     endless: bool = False
     faults: Faults = field(default_factory=Faults, compare=False, repr=False)
 
@@ -111,13 +102,19 @@ class PropheseeRecording(EventsOnly):
         """
         with path.open("rb") as file:
             header = parse_header(path, file.read(HEADER_BYTES))
+            file.seek(header.size)
+            first = file.read(HEADER_BYTES)
         if header.format not in FORMATS:
+            known = ", ".join(FORMATS)
             why = f"its words are {header.format}" if header.format else "its header does not name a word format"
-            raise UnknownSource(path, why)
+            raise UnknownSource(path, f"{why}; supported: {known}")
+        endianness = header.endianness or endianness_of(header.format, first) or "little"
+        if endianness not in ENDIANNESS:
+            raise UnknownSource(path, f"its endianness is {endianness!r}; supported: {', '.join(ENDIANNESS)}")
         sensor = sensor or header.sensor
         if sensor is None:
             raise MissingGeometry(path)
-        return cls(path, sensor, FORMATS[header.format], header.size)
+        return cls(path, sensor, FORMATS[header.format], header.size, endianness)
 
     @property
     def streams(self) -> tuple[str, ...]:
@@ -148,13 +145,15 @@ class PropheseeRecording(EventsOnly):
                     place = f"byte {at + first * words.itemsize}"
                     tally.add(Reason.RESERVED, place, f"the word {word} has a reserved type", count)
                 at, words = at + read * words.itemsize, words[read:]
+        if getattr(state, "pending", -1) >= 0:
+            tally.add(Reason.UNREAD, f"byte {self.path.stat().st_size}", "the file ends within a vector")
 
     def triggers(self) -> Iterator[Triggers]:
         """All edges on the trigger inputs; see `Recording`. Their times are in the clock of the events."""
         return ordered(self._edges(), self.faults.begin("triggers"))
 
     def _edges(self) -> Iterator[tuple[str, Triggers]]:
-        state = triggers.TriggerState()
+        state = self.words.first
         for at, words in self._blocks():
             state, columns = self.words.triggers(words, state)
             yield f"the words from byte {at}", Triggers(*columns)
@@ -165,7 +164,7 @@ class PropheseeRecording(EventsOnly):
         with self.path.open("rb") as file:
             file.seek(at)
             while block := file.read(BLOCK_BYTES):
-                words = np.frombuffer(block, dtype, len(block) // dtype.itemsize)
+                words = words_in(block, self.words, self.endianness)
                 yield at, words
                 at += words.nbytes
                 if len(block) % dtype.itemsize:
@@ -177,4 +176,6 @@ def _open(path: Path, sensor: Sensor | None, topic: str | None) -> PropheseeReco
     return PropheseeRecording.open(path, sensor)
 
 
-FORMAT = Format("FILE.raw (Prophesee EVT2, EVT3)", _open, (".raw",))
+FORMAT = Format(
+    "FILE.raw (Prophesee EVT2, EVT2.1, EVT3, EVT4)", _open, (".raw",), signature=rb"(?:% [^\n]*\n)*?% (?i:evt|format) "
+)

@@ -2,29 +2,33 @@
 
 The clock of `t` depends on the encoding:
 
-- `evt3` and `mono`: the sensor clock, unwrapped.
+- `evt2`, `evt21`, `evt3`, `evt4` and `mono`: the sensor clock, unwrapped.
 - `libcaer`, `libcaer_cmp` and dvs_msgs: unix time of the driver's host, continued by the sensor clock.
+
+Source: github.com/ros-event-camera/event_camera_msgs. The encodings `evt...` are the words of the camera, unchanged.
 """
 
 from collections.abc import Iterator
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.io.clock import unwraps
 from neurove_core.io.faults import Reason, Tally
-from neurove_core.io.formats.prophesee import evt, triggers
+from neurove_core.io.formats.prophesee.words import FORMATS, Words, endianness_of, words_in
 from neurove_core.io.formats.ros.libcaer import WORD_EVENTS, LibcaerState, libcaer_decode
 from neurove_core.io.formats.ros.messages import DVS, BadMessage, EventMessage
 from neurove_core.io.recording import CHUNK_EVENTS, Triggers, empty_events
 from neurove_protocol.events import Events
 
-ENCODINGS: Final = ("evt3", "libcaer", "libcaer_cmp", "mono")
+PROPHESEE: Final = {name.lower(): words for name, words in FORMATS.items()}
+"""Encodings of Prophesee words: evt2, evt21, evt3, evt4. Only they have triggers."""
+
+ENCODINGS: Final = (*PROPHESEE, "libcaer", "libcaer_cmp", "mono")
 UNIX_TIME: Final = ("libcaer", "libcaer_cmp", DVS)
 """Encodings whose times are unix time."""
 
-_EVT3_PERIOD_US = 1 << 24
 _LIBCAER_PERIOD_US = 1 << 31
 _MICROSECOND = 1000  # [ns]
 _WORDS = CHUNK_EVENTS // WORD_EVENTS  # words decoded in one call
@@ -53,8 +57,10 @@ class Decoder:
         self._tally = tally
         self._seq: int | None = None
         self._where = ""
-        self._evt3 = evt.Evt3State()
-        self._triggers = triggers.TriggerState()
+        self._encoding = ""  # of Prophesee words
+        self._endianness: str | None = None
+        self._state: Any = None  # of the decoder of Prophesee words; None: at the start
+        self._triggers: Any = None
         self._libcaer = LibcaerState()
         self._known_wraps_us: int | None = 0 if anchor is None else None  # None: unknown after a gap
 
@@ -74,8 +80,8 @@ class Decoder:
 
     def _decoded(self, message: EventMessage) -> Iterator[Events]:
         match message.encoding:
-            case "evt3":
-                yield from self._decode_evt3(message)
+            case encoding if encoding in PROPHESEE:
+                yield from self._decode_prophesee(message, PROPHESEE[encoding])
             case "libcaer_cmp":
                 yield from self._decode_libcaer_cmp(message)
             case "libcaer":
@@ -86,44 +92,57 @@ class Decoder:
                 raise BadMessage(f"unknown encoding {other!r}; supported: {', '.join(ENCODINGS)}")
 
     def triggers(self, message: EventMessage) -> Iterator[Triggers]:
-        """Yield the trigger edges of the next message. Only `evt3` has them.
+        """Yield the trigger edges of the next message. Only Prophesee words have them.
 
         Call either this method or `events` for a message, not both.
 
         Raises:
             BadMessage: a word of the message is invalid.
         """
-        if message.encoding != "evt3":
+        words = PROPHESEE.get(message.encoding)
+        if words is None:
             return
         self._reset_after_gap(message)
         for _ in self._decoded(message):  # advances the clock
             pass
-        self._triggers, (t, channel, level) = triggers.evt3_triggers(_words(message), self._triggers)
+        found = self._words_of(message, words)
+        self._triggers, (t, channel, level) = words.triggers(found, self._triggers or words.first)
         if t.size:
             yield Triggers(t + self._wraps_us(message, int(t[0])), channel, level)
 
     def _reset_after_gap(self, message: EventMessage) -> None:
         """Reset row, column and time after lost messages: their last values are unknown."""
         if self._seq is not None and message.seq not in (self._seq + 1, -1):
-            self._evt3, self._triggers, self._known_wraps_us = evt.Evt3State(), triggers.TriggerState(), None
+            self._state = self._triggers = self._known_wraps_us = None
             self._libcaer = LibcaerState()
-        self._seq = message.seq
+        if message.encoding != self._encoding:
+            self._state = self._triggers = self._endianness = None
+        self._seq, self._encoding = message.seq, message.encoding
 
-    def _decode_evt3(self, message: EventMessage) -> Iterator[Events]:
-        words, done = _words(message), 0
+    def _words_of(self, message: EventMessage, words: Words) -> NDArray[Any]:
+        if len(message.data) % words.dtype.itemsize:
+            raise BadMessage("the message ends within a word")
+        if self._endianness is None:
+            self._endianness = endianness_of(message.encoding.upper(), message.data)
+        return words_in(message.data, words, self._endianness or "little")
+
+    def _decode_prophesee(self, message: EventMessage, format_: Words) -> Iterator[Events]:
+        words, done = self._words_of(message, format_), 0
+        state = format_.start if self._state is None else self._state
         while words.size:
-            out = empty_events(min(CHUNK_EVENTS, max(words.size * evt.VECTOR_EVENTS, evt.VECTOR_EVENTS)))
+            out = empty_events(min(CHUNK_EVENTS, (words.size + 1) * format_.events))
             reserved = np.zeros(2, np.int64)
-            self._evt3, read, n = evt.evt3_decode(words, self._evt3, out, reserved)
+            state, read, n = format_.decode(words, state, out, reserved)
+            self._state = state
             if n:
                 yield self._unwrapped(out.span(0, n), message)
             self._count(reserved, words, done)
             words, done = words[read:], done + read
 
-    def _count(self, reserved: NDArray[np.int64], words: NDArray[np.uint16], done: int) -> None:
+    def _count(self, reserved: NDArray[np.int64], words: NDArray[Any], done: int) -> None:
         count, first = reserved.tolist()
         if count and self._tally is not None:
-            why = f"word {done + first} (0x{int(words[first]):04x}) has an unknown type"
+            why = f"word {done + first} (0x{int(words[first]):0{2 * words.itemsize}x}) has an unknown type"
             self._tally.add(Reason.RESERVED, self._where, why, count)
 
     def _unwrapped(self, events: Events, message: EventMessage) -> Events:
@@ -136,7 +155,8 @@ class Decoder:
         """Return the duration of all clock wraps in a gap [us], from the message stamps before and after the gap."""
         if self._known_wraps_us is None and self._anchor is not None:
             elapsed_us = (message.stamp_ns - self._anchor.stamp_ns) // _MICROSECOND
-            self._known_wraps_us = round((self._anchor.t_us + elapsed_us - t0_us) / _EVT3_PERIOD_US) * _EVT3_PERIOD_US
+            period_us = PROPHESEE[message.encoding].period_us
+            self._known_wraps_us = round((self._anchor.t_us + elapsed_us - t0_us) / period_us) * period_us
         return self._known_wraps_us or 0
 
     def _decode_libcaer_cmp(self, message: EventMessage) -> Iterator[Events]:

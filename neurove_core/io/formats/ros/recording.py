@@ -1,6 +1,7 @@
 """One camera of a ROS bag: a .bag file (ROS 1), or a .db3 file, an .mcap file or a folder of them (ROS 2)."""
 
 import contextlib
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import takewhile
@@ -15,19 +16,32 @@ from neurove_core.io.checked import cleaned, ordered, unread
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
 from neurove_core.io.faults import Faults, Reason, Tally
 from neurove_core.io.format import Format
-from neurove_core.io.formats.containers.bags import BagFile, BagFolder, BagMessage, SqliteBag, in_recorded_order
+from neurove_core.io.formats.containers.bags import (
+    SQLITE_MAGIC,
+    BagFile,
+    BagFolder,
+    BagMessage,
+    SqliteBag,
+    in_recorded_order,
+)
 from neurove_core.io.formats.containers.mcap import McapFile
+from neurove_core.io.formats.containers.mcap_records import MAGIC as MCAP_MAGIC
+from neurove_core.io.formats.containers.ros1 import MAGIC as ROS1_MAGIC
 from neurove_core.io.formats.containers.ros1 import Ros1Bag
 from neurove_core.io.formats.ros import messages
-from neurove_core.io.formats.ros.events import UNIX_TIME, Anchor, Decoder
+from neurove_core.io.formats.ros.events import PROPHESEE, UNIX_TIME, Anchor, Decoder
 from neurove_core.io.formats.ros.messages import BadMessage, EventMessage
 from neurove_core.io.order import Where
 from neurove_core.io.recording import EventsOnly, Imu, Triggers, later
+from neurove_core.io.spool import plain_file
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
 
-EVENT_TYPES: Final = ("event_camera_msgs/EventPacket", "event_array_msgs/EventArray", "dvs_msgs/EventArray")
+DVS_TYPES: Final = ("dvs_msgs/EventArray", "prophesee_event_msgs/EventArray")
+"""Types with one layout: github.com/uzh-rpg/rpg_dvs_ros and github.com/prophesee-ai/prophesee_ros_wrapper."""
+
+EVENT_TYPES: Final = ("event_camera_msgs/EventPacket", "event_array_msgs/EventArray", *DVS_TYPES)
 IMU_TYPE: Final = "sensor_msgs/Imu"
 CAMERA_TYPE: Final = "sensor_msgs/CameraInfo"
 POSE_TYPES: Final = ("geometry_msgs/PoseStamped", "nav_msgs/Odometry")
@@ -37,32 +51,37 @@ _MARGIN_NS = 2_000_000_000  # margin for reading before the requested time, beca
 
 T = TypeVar("T")
 
+_CONTAINERS: Final = ((ROS1_MAGIC, ".bag", Ros1Bag), (SQLITE_MAGIC, ".db3", SqliteBag), (MCAP_MAGIC, ".mcap", McapFile))
+
 
 def open_bag(path: Path) -> BagFile:
-    """Open a bag of any supported container.
+    """Open a bag of any supported container. Its content decides; only without a signature does the suffix.
+
+    Compressed files of a folder, such as `run_0.mcap.zstd`, are decompressed into temporary files.
 
     Raises:
         UnknownSource: the path is not a bag.
     """
     if path.is_dir():
-        return BagFolder(path, tuple(open_bag(file) for file in in_recorded_order(path)))
-    match path.suffix.lower():
-        case ".bag":
-            return Ros1Bag.open(path)
-        case ".db3":
-            return SqliteBag.open(path)
-        case ".mcap":
-            return McapFile.open(path)
-        case suffix:
-            raise UnknownSource(path, f"{suffix!r} is not a suffix of a bag")
+        return BagFolder(path, tuple(open_bag(plain_file(file).path) for file in in_recorded_order(path)))
+    with path.open("rb") as file:
+        head = file.read(len(SQLITE_MAGIC))
+    for magic, _, container in _CONTAINERS:
+        if head.startswith(magic):
+            return container.open(path)
+    for _, suffix, container in _CONTAINERS:
+        if path.suffix.lower() == suffix:
+            return container.open(path)
+    raise UnknownSource(path, f"{path.suffix!r} is not a suffix of a bag")
 
 
 @dataclass(frozen=True, slots=True)
 class RosbagRecording(EventsOnly):
     """One camera of a ROS bag; see `Recording`.
 
-    Event times of `evt3` and `mono` messages are on the unwrapped sensor clock. Event times of `libcaer`, `libcaer_cmp`
-    and dvs_msgs are unix time. All other data have the stamp of their header minus `ros_offset_us`.
+    Event times of Prophesee words and of `mono` messages are on the unwrapped sensor clock. Event times of `libcaer`,
+    `libcaer_cmp`, dvs_msgs and prophesee_event_msgs are unix time. All other data have the stamp of their header minus
+    `ros_offset_us`.
     """
 
     path: Path
@@ -92,9 +111,7 @@ class RosbagRecording(EventsOnly):
         bag = open_bag(path)
         topics = sorted(name for name, kind in bag.topics.items() if kind in EVENT_TYPES)
         if not topics or topic not in (None, *topics):
-            known = ", ".join(topics or sorted(bag.topics)) or "none"
-            what = f"topic {topic!r} has no events; topics with events are" if topics else "no topic has events; it has"
-            raise UnknownSource(path, f"{what} {known}")
+            raise UnknownSource(path, _no_events(bag, topics, topic))
         name = path.resolve().name
         if topic is not None:
             name = f"{name} ({topic})"
@@ -113,7 +130,7 @@ class RosbagRecording(EventsOnly):
         """Names of the data that the bag holds for this camera; the first is `events`."""
         present = {
             "imu": self._nearest_topic(IMU_TYPE) is not None,
-            "triggers": self.first.encoding == "evt3",
+            "triggers": self.first.encoding in PROPHESEE,
             "poses": self._nearest_topic(*POSE_TYPES) is not None,
             "twists": self._nearest_topic(*POSE_TYPES) is not None,
         }
@@ -209,8 +226,8 @@ class RosbagRecording(EventsOnly):
                 tally.add(Reason.DAMAGED, message.where, str(why))
 
     def triggers(self) -> Iterator[Triggers]:
-        """Yield the edges of the trigger input. `evt3` messages hold them among the events."""
-        if self.first.encoding == "evt3":
+        """Yield the edges of the trigger input. Messages of Prophesee words hold them among the events."""
+        if self.first.encoding in PROPHESEE:
             tally = self.faults.begin("triggers")
             yield from ordered(self._edges(tally), tally)
 
@@ -248,9 +265,17 @@ class RosbagRecording(EventsOnly):
         return max(names, key=lambda name: _shared_parts(name, self.topic), default=None)
 
 
+def _no_events(bag: BagFile, topics: list[str], topic: str | None) -> str:
+    """Why the bag has no events of this topic: the topics with events, or all topics and the types that have events."""
+    if topics:
+        return f"topic {topic!r} has no events; topics with events are {', '.join(topics)}"
+    found = ", ".join(f"{name} ({kind})" for name, kind in sorted(bag.topics.items())) or "none"
+    return f"no topic has events; it has {found}; types with events are {', '.join(EVENT_TYPES)}"
+
+
 def _parsed(message: BagMessage, bag: BagFile) -> tuple[EventMessage, Events | None]:
     """Return the message, and its events if the message type defines their layout (dvs_msgs)."""
-    if bag.topics[message.topic] == "dvs_msgs/EventArray":
+    if bag.topics[message.topic] in DVS_TYPES:
         return messages.dvs_events(message.data, cdr=bag.cdr)
     return messages.event_packet(message.data, cdr=bag.cdr), None
 
@@ -329,7 +354,9 @@ def _imu(samples: list[messages.ImuSample], offset_us: int) -> Imu:
 def _accepts(path: Path) -> bool:
     """Return whether the path is a bag. A folder has no metadata.yaml if its recorder was killed."""
     if path.is_file():
-        return path.suffix.lower() in (".bag", ".db3", ".mcap")
+        with path.open("rb") as file:
+            head = file.read(len(SQLITE_MAGIC))
+        return any(head.startswith(magic) or path.suffix.lower() == suffix for magic, suffix, _ in _CONTAINERS)
     if (path / "events.txt").is_file():
         return False
     return any(
@@ -339,5 +366,8 @@ def _accepts(path: Path) -> bool:
 
 
 FORMAT = Format(
-    "FILE.bag (ROS 1), FILE.db3, FILE.mcap or a folder of them (ROS 2)", RosbagRecording.open, accepts=_accepts
+    "FILE.bag (ROS 1), FILE.db3, FILE.mcap or a folder of them (ROS 2)",
+    RosbagRecording.open,
+    accepts=_accepts,
+    signature=b"|".join(re.escape(magic) for magic, _, _ in _CONTAINERS),
 )
