@@ -199,8 +199,12 @@ class Cache:
             return
         context = multiprocessing.get_context("spawn")  # the threads of torch do not survive a fork
         with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
-            for done in concurrent.futures.as_completed([pool.submit(_make, job) for job in jobs]):
-                yield done.result()
+            try:
+                for done in concurrent.futures.as_completed([pool.submit(_make, job) for job in jobs]):
+                    yield done.result()
+            except BaseException:
+                pool.shutdown(cancel_futures=True)  # a full disk or a signal: do not simulate the rest
+                raise
 
     def open(self) -> "Sequences":
         """Open all simulated sequences of the configuration.
