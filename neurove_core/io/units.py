@@ -21,7 +21,7 @@ SAMPLE: Final = 4096
 """Events of which a reader gives the times."""
 
 _FEWEST = 16  # a smaller sample is not judged by its rate
-_MAX_T_US = 1e17
+_MAX_T, _MAX_T_US = 1e30, 1e17
 _MAX_SPAN_S = 86_400.0
 _MIN_RATE_HZ, _GUESS_RATE_HZ = 1.0, 10.0
 _EPOCH_S = (946_684_800.0, 4_102_444_800.0)  # unix times of the years 2000 to 2100
@@ -95,7 +95,7 @@ def doubt(sample: TimeSample, unit: str) -> str:
     'less than 1 event per second'
     """
     t = sample.times.astype(np.float64)
-    t = t[np.isfinite(t)]
+    t = t[np.abs(t) < _MAX_T]  # in this form nan is left out
     if not t.size:
         return ""
     to_s = UNITS[unit] / 1e6
@@ -117,7 +117,7 @@ def doubt(sample: TimeSample, unit: str) -> str:
 def guess(sample: TimeSample) -> str | None:
     """The unit in which the times are the most plausible, or None."""
     t = sample.times.astype(np.float64)
-    t = t[np.isfinite(t)]
+    t = t[np.abs(t) < _MAX_T]
     if not t.size:
         return None
     fractions = bool((t != np.rint(t)).any())

@@ -54,7 +54,8 @@ def _from_matrices(
         name = partial(_row, path, names[1], np.arange(first, first + len(t)))
         rigid, position, quaternion = rigid_motions(matrices.astype(np.float64), name, tally, inverse=inverse)
         rows.append(first + np.flatnonzero(rigid))
-        parts.append((to_us(t[rigid]), position, quaternion))
+        with np.errstate(all="ignore"):  # such times are checked below
+            parts.append((to_us(t[rigid]), position, quaternion))
     if tally is None and found.faults:
         raise BrokenRecording(path, found.faults[0].where, found.faults[0].why)
     t_us, position, quaternion = (np.concatenate(part) for part in zip(*parts[len(parts) > 1 :], strict=True))

@@ -52,7 +52,8 @@ class EventTable(NamedTuple):
         Raises:
             Any of FAULTS: the rows cannot be read.
         """
-        t = self.txyp(*(column[first:stop] for column in self.columns))[0]
+        with np.errstate(all="ignore"):
+            t = self.txyp(*(column[first:stop] for column in self.columns))[0]
         return np.asarray(t.astype(np.float64) + self.offset_us)
 
 
@@ -191,7 +192,8 @@ class TableRecording(EventsOnly):
         with opened(self.path) as file:
             try:
                 table = self.event_table(file)
-                t, *_ = table.txyp(*(column[:SAMPLE] for column in table.columns))
+                with np.errstate(all="ignore"):
+                    t, *_ = table.txyp(*(column[:SAMPLE] for column in table.columns))
             except (*FAULTS, BrokenRecording):  # reading the events reports it
                 return None
             times = t if table.unit == "us" else t / UNITS[table.unit]
