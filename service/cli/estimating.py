@@ -64,7 +64,7 @@ class Offline:
         self._newest_us: int | None = None
         self.stream = Stream(stream, OneModel(estimator), lambda: self._now_ns)
         if camera is not None:
-            self.stream.set_camera(camera.model_copy(update={"stream": stream}))
+            self.stream.set_camera(camera)
 
     def accept(self, packet: EventPacket) -> list[TwistEstimate]:
         """The estimates of the windows that a packet completes. They have no time of the host."""

@@ -174,13 +174,7 @@ class Stream:
         self.lanes.leave_out_until(start_us)
 
     def set_camera(self, camera: CameraInfo) -> None:
-        """Use this CameraInfo from the next packet on.
-
-        Raises:
-            InvalidField: it belongs to another stream.
-        """
-        if camera.stream != self.name:
-            raise InvalidField("camera info", "stream", camera.stream, f"received on the key of stream {self.name!r}")
+        """Use this CameraInfo from the next packet on."""
         if camera == self.camera:
             return
         self.camera = camera

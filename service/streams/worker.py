@@ -10,7 +10,7 @@ from typing import NamedTuple
 from neurove_core.ingest.wire import read_packet
 from neurove_protocol import CameraInfo
 from neurove_protocol.camera import MAX_CAMERA_BYTES
-from neurove_protocol.errors import NeuroVEError
+from neurove_protocol.errors import InvalidField, NeuroVEError
 from neurove_protocol.events import PacketLimits
 from neurove_protocol.velocity import TwistEstimate
 from neurove_service import logs
@@ -292,11 +292,14 @@ class StreamWorker:
 
     def _set_camera(self, get: Callable[[], CameraInfo | None]) -> None:
         try:
-            camera = get()
-            if camera is not None:
-                self.stream.set_camera(camera)
+            camera, name = get(), self.stream.name
+            if camera is not None and camera.stream != name:
+                raise InvalidField("camera info", "stream", camera.stream, f"received on the key of stream {name!r}")
         except NeuroVEError as error:
             self._refused_camera(error.message)
+            return
+        if camera is not None:
+            self.stream.set_camera(camera)
 
     def _refused_camera(self, why: str) -> None:
         self.stream.refused_camera(why)
