@@ -16,7 +16,8 @@ from neurove_core.io.unpack import FREE_BYTES, MAX_RATIO, unpacked
 from neurove_core.sources import open_source
 from neurove_protocol import Events, NeuroVEError
 from neurove_protocol.errors import InvalidField
-from tests.builders import SENSOR
+from tests import ros_bags
+from tests.builders import SENSOR, make_events
 from tests.mutations import DAVIS, WRITTEN, mutated, read_or_refused
 from tests.recordings import put, read
 
@@ -40,6 +41,27 @@ def test_a_file_whose_name_is_in_capitals_is_read(name, tmp_path):
     recording = open_source(put(tmp_path, name.upper(), WRITTEN[name](tmp_path)), sensor)
     assert Events.join(list(recording.chunks())).n > 0
     assert not recording.faults.found
+
+
+@pytest.mark.parametrize("topic", ["/cam/events", "/other"])
+def test_pages_of_a_bag_that_form_a_circle_are_left(topic, tmp_path):
+    """The last pages of the messages point to the first one, so that SQLite would give its rows again and again."""
+    store = ros_bags.Store(2)
+    messages = [(topic, i, ros_bags.dvs(store, make_events(100, seed=i, start_us=i * 100_000))) for i in range(60)]
+    first = ("/cam/events", 0, ros_bags.dvs(store, make_events(5)))
+    path = next(ros_bags.write_bag(tmp_path / "bag", store, [first, *messages]).glob("*.db3"))
+    data, size = bytearray(path.read_bytes()), 4096
+    for page in range(size, len(data), size):
+        cells = int.from_bytes(data[page + 3 : page + 5], "big")
+        if data[page] == 5 and cells > 10:  # an inner page of a table
+            pointers = struct.unpack_from(f">{cells}H", data, page + 12)
+            for pointer in pointers[5:]:
+                data[page + pointer : page + pointer + 4] = data[page + pointers[0] : page + pointers[0] + 4]
+    assert bytes(data) != path.read_bytes()
+    path.write_bytes(data)
+    recording = open_source(str(path))
+    assert read(recording).n < 6005
+    assert recording.faults.found
 
 
 # --- decompression is bounded --------------------------------------------------------------------------------------
