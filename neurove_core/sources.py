@@ -29,6 +29,7 @@ GROUP: Final = "neurove.recordings"
 FORMATS: Final = (
     "neurove_core.io.formats.aedat.aedat4",
     "neurove_core.io.formats.aedat.aedat2",
+    "neurove_core.io.formats.aedat.aedat3",
     "neurove_core.io.formats.prophesee.raw",
     "neurove_core.io.formats.prophesee.dat",
     "neurove_core.io.formats.eventstream",
@@ -80,10 +81,10 @@ def open_source(
     scheme, separator, _ = source.partition("://")
     if separator:
         if scheme not in URLS:
-            raise UnknownSource(source, f"unknown scheme {scheme}://", supported())
+            raise UnknownSource(source, f"unknown scheme {scheme}://", _known())
         return with_unit(_url_format(scheme).open(source, sensor, topic), time_unit)
     if not source.strip():
-        raise UnknownSource(source, "the name of the source is empty", supported())
+        raise UnknownSource(source, "the name of the source is empty", _known())
     try:
         return with_unit(_open_path(Path(source), sensor, topic), time_unit)
     except OSError as error:
@@ -98,6 +99,12 @@ def supported() -> tuple[str, ...]:
     return (*dict.fromkeys(one.about for one in table.formats), *urls, *table.failed)
 
 
+def _known() -> tuple[str, ...]:
+    """What `supported` lists, for an error: without what stands in brackets, and what is not loaded first."""
+    failed = _table().failed
+    return (*failed, *dict.fromkeys(re.sub(r" \([^)]*\)", "", line) for line in supported() if line not in failed))
+
+
 def _open_path(path: Path, sensor: Sensor | None, topic: str | None) -> Recording:
     if not path.exists():
         raise UnknownSource(path, "no such file or folder")
@@ -105,7 +112,7 @@ def _open_path(path: Path, sensor: Sensor | None, topic: str | None) -> Recordin
         for one in _table().formats:
             if one.fits(path):
                 return one.open(path, sensor, topic)
-        raise UnknownSource(path, "the folder has no events.txt", supported())
+        raise UnknownSource(path, "the folder has no events.txt", _known())
     if path.is_symlink() and path.is_file() and not path.suffix:  # /dev/stdin of a redirected file
         path = path.resolve()
     plain = _plain(path)
@@ -134,7 +141,7 @@ def _plain(path: Path) -> Plain:
             suffix = suffix or (".txt" if is_text(head) else "")
             if not suffix and not compression_of(head) and not any(one.recognises(head) for one in _table().formats):
                 why = "its first bytes are of no known format" if head else "it gives nothing"
-                raise UnknownSource(path, f"{why}; a pipe needs content that identifies its format", supported())
+                raise UnknownSource(path, f"{why}; a pipe needs content that identifies its format", _known())
             path = piped(path, stream, head, path.name.removesuffix(path.suffix) + (suffix or path.suffix))
     if not path.is_file():
         raise UnknownSource(path, "it is no plain file, pipe or folder")
@@ -162,7 +169,7 @@ def _format_of(path: Path) -> Format:
     if found is None:
         suffix = path.suffix.lower()
         why = f"unknown suffix {suffix!r}" if suffix else "the file has no suffix"
-        raise UnknownSource(path, f"{why}, and its first bytes are of no known format", supported())
+        raise UnknownSource(path, f"{why}, and its first bytes are of no known format", _known())
     return found
 
 

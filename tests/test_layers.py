@@ -60,7 +60,9 @@ MAY_IMPORT = {
     "neurove_service.guard": "logs",
     "neurove_service.transport": "logs guard",
     "neurove_service.streams": "core:ingest core:networks core:models core:estimator logs guard",
-    "neurove_service.models": "core:files core:ingest core:models core:estimator core:self_test logs streams",
+    "neurove_service.models": (
+        "core:config core:files core:ingest core:networks core:models core:estimator core:self_test logs streams"
+    ),
     "neurove_service.clients": (
         "core:config core:geometry core:ingest core:io core:io.formats core:bench logs config transport"
     ),

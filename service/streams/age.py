@@ -8,10 +8,6 @@ from neurove_protocol.events import Packet
 DRIFT = 200e-6
 """The clock of a sensor may be slower than that of this node by this share: 100 ppm for each of two crystals."""
 
-PAUSE_NS = 1_000_000_000
-"""After a silence of this time the source may have paused, see Ages."""
-
-_CATCHES_UP = 0.2  # share of the elapsed time by which the delay decreases where old packets are delivered
 _DELAYS = 64
 
 
@@ -23,15 +19,14 @@ class Ages:
     seen.
     The clock of a stream is that of the sensor, or the driver's time of sending where it is given.
 
-    A source may also pause together with its clock, as a player does. Then the packets after the silence look old, but
-    they do not arrive faster than they were made. After PAUSE_NS the offset is learned anew.
+    A source that pauses together with its clock, as a player does, or a sensor whose clock is too slow, looks like a
+    link that delays everything: nothing here can tell them apart, so a player gives its time of sending.
     """
 
     def __init__(self) -> None:
         self._offset_ns: int | None = None
         self._learned_ns = 0
         self._delays_ns: deque[int] = deque(maxlen=_DELAYS)
-        self._resumed: tuple[int, int] | None = None  # arrival and delay of the first packet after a silence
 
     @property
     def uncertainty_ns(self) -> int:
@@ -40,7 +35,7 @@ class Ages:
 
     def forget(self) -> None:
         """Begin anew: the clock of the stream has changed."""
-        self._offset_ns = self._resumed = None
+        self._offset_ns = None
         self._delays_ns.clear()
 
     def learn(self, clock_us: int, received_ns: int) -> int:
@@ -52,26 +47,12 @@ class Ages:
         """
         offset_ns = received_ns - clock_us * 1000
         drifted_ns = offset_ns
-        silent = self._offset_ns is not None and received_ns - self._learned_ns > PAUSE_NS
-        if self._offset_ns is not None and not self._has_paused(offset_ns - self._offset_ns, received_ns):
+        if self._offset_ns is not None:
             drifted_ns = self._offset_ns + int(DRIFT * max(0, received_ns - self._learned_ns))
         self._offset_ns, self._learned_ns = min(offset_ns, drifted_ns), received_ns
         delay_ns = offset_ns - self._offset_ns
-        if silent:
-            self._resumed = received_ns, delay_ns
         self._delays_ns.append(delay_ns)
         return delay_ns
-
-    def _has_paused(self, delay_ns: int, received_ns: int) -> bool:
-        """Whether the source has paused: it sends again for some time, and its delay does not decrease."""
-        if self._resumed is None:
-            return False
-        since_ns = received_ns - self._resumed[0]
-        if since_ns < PAUSE_NS:
-            return False
-        paused = delay_ns > self._resumed[1] - _CATCHES_UP * since_ns
-        self._resumed = None
-        return paused
 
 
 def newest_us(packet: Packet) -> int:

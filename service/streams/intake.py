@@ -96,11 +96,14 @@ class Intake:
             newest_us(packet) if arrival.sent_us is None else arrival.sent_us, arrival.received_ns
         )
         if self._delay_ns + arrival.queued_ns - arrival.received_ns <= self._max_age_ns:
-            self._repetition.add(packet)
             return False
         self._activity.lost("stale_packets", packets)
         self._flags.missing()
         return True
+
+    def compare(self, packet: Packet) -> None:
+        """Notice whether the camera repeats the same events."""
+        self._repetition.add(packet)
 
     def shed(self, packets: int) -> None:
         """Expect that many missing numbers, of windows that this node left out whole: the next window is complete."""

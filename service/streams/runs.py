@@ -23,6 +23,7 @@ class Run(NamedTuple):
 
     packet: WirePacket  # with the number of the first one and the events of all
     marks: list[tuple[int, int]]  # number and t0_us of each
+    first: WirePacket
 
 
 class Wanted(NamedTuple):
@@ -80,4 +81,4 @@ def _merged(packets: list[WirePacket]) -> Run:
     times = np.frombuffer(columns[0], "<u2").astype("<u4") + np.repeat(begins, counts)
     blob = np.frombuffer(times.tobytes() + columns[1] + columns[2], np.uint8)
     events = WireEvents(first.t0_us, blob, True, 0, times.size)
-    return Run(first._replace(events=events), [(packet.seq, packet.t0_us) for packet in packets])
+    return Run(first._replace(events=events), [(packet.seq, packet.t0_us) for packet in packets], first)

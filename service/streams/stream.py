@@ -86,7 +86,7 @@ class Stream:
             return []
         else:
             self._flags.close_gap(self.lanes.open_window, packet.t0_us)
-        return self._process(packet, arrival)
+        return self._process(packet, arrival, packet)
 
     def collect(self, payloads: Sequence[bytes], limits: PacketLimits) -> Run | None:
         """The packets at the begin of some payloads that `accept_run` takes at once; None if there are none.
@@ -102,13 +102,13 @@ class Stream:
 
     def accept_run(self, run: Run, arrival: Arrival) -> list[TwistEstimate]:
         """Process a run of packets, the last of which arrived then, with the results of `accept` for each."""
-        packet, marks = run
+        packet, marks, first = run
         self._heard(packet, arrival, len(marks))
         self._intake.advance_run(marks, arrival.received_ns)
         if self._intake.is_stale(packet, arrival, len(marks)):
             return []
         self._flags.close_gap(self.lanes.open_window, packet.t0_us)
-        return self._process(packet, arrival)
+        return self._process(packet, arrival, first)
 
     def _heard(self, packet: Packet, arrival: Arrival, packets: int) -> None:
         self.counters.packets_received += packets
@@ -116,7 +116,7 @@ class Stream:
         self.activity.heard(arrival.received_ns)
         self.activity.taken_ns = arrival.queued_ns
 
-    def _process(self, packet: Packet, arrival: Arrival) -> list[TwistEstimate]:
+    def _process(self, packet: Packet, arrival: Arrival, first: Packet) -> list[TwistEstimate]:
         activity, window = self.activity, self.lanes.open_window
         pushing = self._push(self._intake.without_shed_events(packet, window.start_us if window else None))
         self.counters.outside_events += pushing.outside_events
@@ -124,9 +124,10 @@ class Stream:
             activity.lost("late_events", pushing.late_events)
         if pushing.skipped_windows:
             activity.lost("skipped_windows", pushing.skipped_windows)
-        return [
-            self._answers.of(window, pushing.serving, self.calibration, packet, arrival) for window in pushing.estimates
-        ]
+        about = pushing.serving, self.calibration, packet, arrival
+        estimates = [self._answers.of(one, *about) for one in pushing.estimates]
+        self._intake.compare(first)  # later: the windows ended before this packet
+        return estimates
 
     @property
     def flowing(self) -> bool:

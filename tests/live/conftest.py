@@ -127,8 +127,9 @@ class Source:
         self._publisher = transport.publisher(config.keys.events(stream), "application/msgpack")
         wait_until(lambda: self._publisher.matching)
 
-    def put(self, payload):
-        self._publisher.put(payload)
+    def put(self, payload, *, live=False):
+        """Publish; unless it is `live`, as a replay, whose sensor clock says nothing about the age of a packet."""
+        self._publisher.put(payload, None if live else time.monotonic_ns() // 1000)
 
     def play(self, payloads, pause_s=0.002):
         """Publish one after the other, as a camera does: by contract, a link may drop packets of a burst."""

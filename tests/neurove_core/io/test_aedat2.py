@@ -135,7 +135,7 @@ def test_a_truncated_pair_is_reported_after_the_complete_pairs(tmp_path):
     [
         (header(b"CochleaAMS1c"), "its chip is 'CochleaAMS1c'"),
         (b"#!AER-DAT2.0\r\n", "has no AEChip"),
-        (b"#!AER-DAT3.1\r\n", "does not begin with the AEDAT 2.0 signature"),
+        (b"#!AER-DAT1.0\r\n", "does not begin with the AEDAT 2.0 signature"),
     ],
 )
 def test_an_unknown_chip_or_version_is_refused(head, why, tmp_path):

@@ -1,5 +1,9 @@
 """HDF5 files of Prophesee, v2e, EDS and `events/xs`. The tests write the files."""
 
+import os
+import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -159,6 +163,46 @@ def test_a_filter_that_is_not_installed_is_named_with_its_cure(number, name, tmp
     assert "HDF5_PLUGIN_PATH" in caught.value.message
     assert caught.value.details["filter"] == number
     assert caught.value.code == "missing_filter"
+
+
+PLUGIN = """
+#include <stddef.h>
+typedef struct {
+    int version, id;
+    unsigned encoder, decoder;
+    const char *name;
+    void *can_apply, *set_local;
+    size_t (*filter)(unsigned, size_t, const unsigned *, size_t, size_t *, void **);
+} H5Z_class2;
+static size_t invert(unsigned flags, size_t n, const unsigned *values, size_t size, size_t *space, void **data) {
+    for (size_t i = 0; i < size; i++) ((unsigned char *)*data)[i] ^= 0xFF;
+    return size;
+}
+static const H5Z_class2 info = {1, 0x8ECF, 1, 1, "inverts", 0, 0, invert};
+int H5PLget_plugin_type(void) { return 0; }
+const void *H5PLget_plugin_info(void) { return &info; }
+"""
+"""A filter with the number of ECF that inverts all bits. It stands for Prophesee's, which is not distributed by pip."""
+
+READ = """
+import sys
+from neurove_core.sources import open_source
+print(sum(chunk.n for chunk in open_source(sys.argv[1]).chunks()))
+"""
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+def test_a_filter_in_the_folder_of_hdf5_plugin_path_is_used(tmp_path):
+    path = packed_with(tmp_path / "ecf.hdf5", ECF, bytes(0xFF ^ byte for byte in cd(EVENTS).tobytes()), 0)
+    (tmp_path / "plugin").mkdir()
+    (tmp_path / "plugin.c").write_text(PLUGIN)
+    library = str(tmp_path / "plugin/libecf.so")
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", library, str(tmp_path / "plugin.c")], check=True, timeout=60)
+    environment = os.environ | {"HDF5_PLUGIN_PATH": str(tmp_path / "plugin")}
+    ran = subprocess.run(
+        [sys.executable, "-c", READ, path], env=environment, capture_output=True, text=True, timeout=60
+    )
+    assert ran.stdout == "1000\n", ran.stderr
 
 
 def test_a_chunk_that_is_stored_without_its_optional_filter_is_read(tmp_path):

@@ -52,6 +52,12 @@ def test_an_inbox_never_exceeds_its_maximum_size():
     assert drain(inbox) == ([], 1)
 
 
+def put(worker, payload):
+    """Queue a packet of a replay, whose sensor clock says nothing about its age."""
+    now_ns = time.monotonic_ns()
+    worker.put_packet(payload, now_ns, now_ns // 1000)
+
+
 class Published:
     """An outlet that records the published estimates."""
 
@@ -90,15 +96,15 @@ def worker(slot, published):
 
 def test_bytes_in_estimates_out(worker, published):
     for packet in make_packets(100):
-        worker.put_packet(encode_packet(packet), time.monotonic_ns())
+        put(worker, encode_packet(packet))
     assert [one.seq for one in published.wait_for(7)] == list(range(7))
     assert all(one.trace.received_ns <= one.trace.queued_ns <= one.trace.computed_ns for one in published.estimates)
 
 
 def test_malformed_packets_are_counted_and_lose_nothing_else(worker, published):
     for packet in make_packets(100):
-        worker.put_packet(encode_packet(packet), time.monotonic_ns())
-        worker.put_packet(b"\x81garbage", 1)
+        put(worker, encode_packet(packet))
+        put(worker, b"\x81garbage")
     published.wait_for(7)
     assert worker.stream.counters.losses().nonzero().keys() <= {"malformed_packets"}
 
@@ -114,7 +120,7 @@ def test_an_internal_error_on_a_packet_does_not_end_the_stream(worker, published
 
     monkeypatch.setattr(worker.stream.lanes, "push", faulty)
     for packet in make_packets(100):
-        worker.put_packet(encode_packet(packet), time.monotonic_ns())
+        put(worker, encode_packet(packet))
     published.wait_for(5)
     counters = worker.stream.counters
     assert 1 <= counters.failed_packets < 20
@@ -126,7 +132,7 @@ def test_a_standby_model_runs_however_often_packets_arrive(worker, monkeypatch):
     monkeypatch.setattr(Lanes, "has_backlog", property(lambda _: True))
     monkeypatch.setattr(worker.stream.lanes, "run_standby", lambda: turns.append(threading.Event().wait(0.03)))
     for packet in make_packets(400, n=5):
-        worker.put_packet(encode_packet(packet), time.monotonic_ns())
+        put(worker, encode_packet(packet))
         threading.Event().wait(0.005)  # a packet arrives in each of its pauses
         if len(turns) == 4:
             return
@@ -143,7 +149,7 @@ def test_an_unreadable_camera_info_is_refused_and_the_stream_continues(slot):
     good = CameraInfo(stream="cam0", width=64, height=48, lens="pinhole", fx=40, fy=40, cx=32, cy=24)
     worker.put_camera(good.encode(), time.monotonic_ns())
     for packet in make_packets(30):
-        worker.put_packet(encode_packet(packet), time.monotonic_ns())
+        put(worker, encode_packet(packet))
     assert "uncalibrated" not in published.wait_for(2)[0].flags
     worker.stop()
     worker.join(5)
@@ -172,8 +178,7 @@ def test_packets_that_wait_together_give_the_same_estimates_as_one_by_one(slot):
         PacketLimits(),
     )
     for payload in payloads:
-        now_ns = time.monotonic_ns()
-        worker.put_packet(payload, now_ns, now_ns // 1000)
+        put(worker, payload)
     gate.set()
     published.wait_for(expected.counters.estimates)
     wait_until(lambda: worker.stream.counters.packets_received == expected.counters.packets_received)
@@ -234,8 +239,7 @@ def test_an_overloaded_worker_answers_whole_windows_of_the_newest_data(slot):
     packets = make_packets(1200, n=20)  # 4.8 s
     for packet in packets:
         time.sleep(max(0.0, began + packet.t0_us * 1e-6 - time.monotonic()))
-        now_ns = time.monotonic_ns()
-        worker.put_packet(encode_packet(packet), now_ns, now_ns // 1000)
+        put(worker, encode_packet(packet))
     worker.stop()
     worker.join(5)
     late = published.estimates[len(published.estimates) // 2 :]

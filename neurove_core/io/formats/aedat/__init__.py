@@ -1,1 +1,1 @@
-"""AEDAT 2.0 and AEDAT4 files of iniVation cameras."""
+"""AEDAT 2.0, 3.1 and 4 files of iniVation cameras."""
