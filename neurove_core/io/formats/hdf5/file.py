@@ -44,9 +44,9 @@ def opened(path: Path) -> Iterator[Any]:
     head = head[: len(_MAGIC)]
     if not head or not _MAGIC.startswith(head):
         raise UnknownSource(path, "the file does not start with the HDF5 signature")
-    fault = heap_fault(path)
-    if fault is not None:
-        raise BrokenRecording(path, f"byte {fault[0]}", f"its texts cannot be read: {fault[1]}")
+    heap = heap_fault(path)
+    if heap is not None:
+        raise BrokenRecording(path, f"byte {heap[0]}", f"its texts cannot be read: {heap[1]}")
     try:
         opened_file = h5py.File(path, "r", rdcc_nbytes=_CACHE_BYTES, locking="best-effort")
     except FAULTS as error:
