@@ -60,7 +60,7 @@ def run(
         model: as `neurove serve --model`.
         stop: ends the demo early.
         console: receives the live table, if it is a terminal.
-        screenshot: SVG file to write the last table to.
+        screenshot: SVG file to write the last live table to.
         truth: of a simulated source; the table and the summary compare the estimates with it.
 
     Returns:
@@ -84,12 +84,12 @@ def run(
         ask.listen(transport, config, on_estimate, board.on_status)
         with _process(*drive, stdout=subprocess.PIPE) as driver:
             _show(board, console, lambda: driver.poll() is None and service.poll() is None, stop)
+            if screenshot:
+                _draw(board.at_newest(), screenshot)
             if service.poll() is not None:
                 raise DemoFailed(f"the service ended with exit code {service.returncode}")
             sent = _sent(driver, stop)
         status = _drained(transport, config, sent, stop)
-    if screenshot:
-        _draw(board, screenshot)
     return _summary(source, sent, status, board) | {"error": comparison.error}
 
 

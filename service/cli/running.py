@@ -221,7 +221,7 @@ def add_demo(parser: argparse.ArgumentParser) -> None:
     add_playback_flags(parser, f"seconds of the source to play; default: until its end or Ctrl-C, {most}")
     about = "bundle to serve, or the name of a built-in model; default `default`"
     parser.add_argument("--model", metavar="BUNDLE", help=about)
-    parser.add_argument("--screenshot", metavar="FILE", help="write the last table as SVG")
+    parser.add_argument("--screenshot", metavar="FILE", help="write the last live table as SVG")
 
 
 def add_serve(parser: argparse.ArgumentParser) -> None:

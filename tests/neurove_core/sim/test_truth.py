@@ -1,6 +1,5 @@
 """The truth of a simulation at any time."""
 
-
 import numpy as np
 import pytest
 
