@@ -220,7 +220,7 @@ def legend(streams: dict[str, Received]) -> str:
     return f"vx vy vz in m/s, wx wy wz in rad/s; {frame}x right, y down, z forward. {SIGMA}"
 
 
-SIGMA = "±: sigma, one standard deviation by the model's calibration; 90 % of errors are within 1.64 sigma."
+SIGMA = "±: sigma, one standard deviation; on simulated scenes 90 % of the errors are within 1.64 sigma."
 
 
 def notes(name: str, received: Received) -> Iterator[str]:
