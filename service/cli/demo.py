@@ -18,6 +18,7 @@ from typing import Any
 from rich.console import Console
 from rich.live import Live
 
+from neurove_core.files import write_atomically
 from neurove_protocol import Flag
 from neurove_protocol.control import StreamStatus
 from neurove_protocol.errors import EXIT_FAILURE, NeuroVEError
@@ -208,7 +209,7 @@ def _draw(board: Board, file: str) -> None:
     console = Console(record=True, width=100, file=io.StringIO())
     console.print(board)
     svg = console.export_svg(title="neurove demo")
-    Path(file).write_text(re.sub(r"@font-face \{.*?\}", "", svg, flags=re.DOTALL), encoding="utf-8")
+    write_atomically(Path(file), re.sub(r"@font-face \{.*?\}", "", svg, flags=re.DOTALL).encode())
 
 
 def _summary(source: str, sent: dict[str, Any], status: StreamStatus | None, board: Board) -> dict[str, Any]:

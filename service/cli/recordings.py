@@ -105,10 +105,7 @@ def _write_mcap(recording: Any, path: Path, progress: Progress) -> tuple[str, ..
 def _write_dsec(recording: Any, path: Path, progress: Progress) -> tuple[str, ...]:
     from neurove_core.io.formats.hdf5.dsec_write import write_dsec
 
-    try:
-        return write_dsec(recording, path, progress).left_out
-    except OSError as error:
-        raise InvalidField("recording", "FILE", str(path), error.strerror or str(error)) from None
+    return write_dsec(recording, path, progress).left_out
 
 
 WRITERS: Final[dict[str, Callable[[Any, Path, Progress], tuple[str, ...]]]] = {".mcap": _write_mcap, ".h5": _write_dsec}

@@ -6,9 +6,9 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from neurove_core.files import atomic_path
-from neurove_core.io.formats.hdf5 import file as hdf5
+from neurove_core.io.checked import truth
 from neurove_core.io.formats.hdf5.dsec import LENS_FIELDS
+from neurove_core.io.formats.hdf5.sink import Sink, write_file
 from neurove_core.io.recording import Recording
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events
@@ -46,19 +46,26 @@ def write_dsec(recording: Recording, path: Path, progress: Callable[[int], None]
 
     Raises:
         InvalidField: the recording is endless, or its times span more than MAX_SPAN_S.
-        BrokenRecording: the recording could not be read to its end; nothing is written.
+        BrokenRecording: the recording raises it; nothing is written.
         MissingExtra: h5py or hdf5plugin is not installed. OSError: the file cannot be written.
     """
     if recording.endless:
         raise InvalidField("write_dsec", "recording", recording.name, "must not be endless")
-    h5py = hdf5.library()
-    with atomic_path(path) as part, h5py.File(part, "w") as file:
-        n = _write_events(recording, file, progress)
+
+    def write(file: Any, sink: Sink) -> Written:
+        def written(events: int) -> None:
+            sink.check()
+            if progress is not None:
+                progress(events)
+
+        n = _write_events(recording, file, written)
         streams = ("events", *_write_truth(recording, file), *_write_imu(recording, file))
-    return Written(n, streams, tuple(stream for stream in recording.streams if stream not in streams))
+        return Written(n, streams, tuple(stream for stream in recording.streams if stream not in streams))
+
+    return write_file(path, write)
 
 
-def _write_events(recording: Recording, file: Any, progress: Callable[[int], None] | None) -> int:
+def _write_events(recording: Recording, file: Any, progress: Callable[[int], None]) -> int:
     """Write the groups `events`, `ms_to_idx`, `t_offset` and `camera`; return the number of events."""
     group = file.create_group("events")
     group.attrs["width"], group.attrs["height"] = recording.sensor.width, recording.sensor.height
@@ -82,8 +89,7 @@ def _write_events(recording: Recording, file: Any, progress: Callable[[int], Non
         for entries in _index_entries(shifted, n, int(index.shape[0])):
             _append(index, entries)
         n += chunk.n
-        if progress is not None:
-            progress(n)
+        progress(n)
     file["t_offset"] = np.int64(offset_us)
     return n
 
@@ -104,7 +110,7 @@ def _index_entries(events: Events, first: int, ms: int) -> Iterator[np.ndarray[A
 
 def _write_truth(recording: Recording, file: Any) -> Iterator[str]:
     """Write the groups `poses` and `twists`; yield their names."""
-    poses, twists = recording.poses(), recording.twists()
+    poses, twists = truth(recording)
     if poses is not None:
         _write_group(file, "poses", t=poses.t, position=poses.position_m, orientation=poses.orientation)
         yield "poses"
