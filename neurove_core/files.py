@@ -16,6 +16,16 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+LFS_POINTER: Final = b"version https://git-lfs.github.com/spec/"
+"""First bytes of a Git LFS pointer, which stands for a large file in a repository that was fetched without Git LFS."""
+
+
+def pointer_fault(head: bytes) -> str:
+    """Why a file that begins with these bytes cannot be read, if it is a Git LFS pointer; empty if it is none."""
+    if not head.startswith(LFS_POINTER):
+        return ""
+    return "this is a Git LFS pointer, not the content; fetch it with `git lfs pull`"
+
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:

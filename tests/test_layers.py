@@ -33,7 +33,7 @@ MAY_IMPORT = {
     "neurove_core.models": "config files networks",
     "neurove_core.estimator": "geometry ingest networks engine models io",
     "neurove_core.self_test": "config models estimator",
-    "neurove_core.io": "extras figures geometry",
+    "neurove_core.io": "files extras figures geometry",
     "neurove_core.io.formats": "compiled files extras geometry io",
     "neurove_core.sim": "compiled config figures geometry io io.formats",
     "neurove_core.sources": "io io.formats sim",

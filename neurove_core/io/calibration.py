@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
 from neurove_core.extras import MissingExtra
+from neurove_core.files import pointer_fault
 from neurove_core.geometry.motion import Poses, Twists
 from neurove_core.io.faults import Faults
 from neurove_core.io.recording import Frame, Imu, Recording, Triggers
@@ -185,6 +186,8 @@ def _tree(path: Path) -> Mapping[str, Any]:
         raise InvalidField("calibration", "FILE", str(path), error.strerror or str(error)) from None
     if len(data) > MAX_BYTES:
         raise InvalidField("calibration", "FILE", str(path), f"a calibration file has at most {MAX_BYTES:,} bytes")
+    if fault := pointer_fault(data):
+        raise InvalidField("calibration", "FILE", str(path), fault)
     text = data.decode("utf-8-sig", errors="replace")
     found = _xml(path, text) if text.lstrip().startswith("<") else _yaml(path, text)
     if not isinstance(found, Mapping):

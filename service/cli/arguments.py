@@ -109,6 +109,13 @@ def flags(args: argparse.Namespace, kind: type[ServiceConfig] | type[ClientConfi
     return {name: getattr(args, name, None) for name in kind.model_fields}
 
 
+def count(text: str) -> int:
+    """A whole number above 0."""
+    if not (text.isascii() and text.isdecimal() and 0 < int(text) < 1 << 31):
+        raise argparse.ArgumentTypeError(f"{text!r}: give a whole number above 0")
+    return int(text)
+
+
 def metres(text: str) -> float:
     """A number of metres above 0."""
     try:

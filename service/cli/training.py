@@ -7,7 +7,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurove_service.cli.arguments import add_lens_flags, add_recording_flags, check_folder, command, tell_faults
+from neurove_service.cli.arguments import (
+    add_lens_flags,
+    add_recording_flags,
+    check_folder,
+    command,
+    count,
+    tell_faults,
+)
 from neurove_service.cli.bars import event_count, progress
 
 if TYPE_CHECKING:
@@ -41,9 +48,9 @@ def train(args: argparse.Namespace) -> int:
             calibration_sequences=args.calibration_sequences,
             on_progress=show,
         )
-    size = path.stat().st_size
-    summary = {"bundle": str(path), "bytes": size, "run": str(out / loop.RUN_JSON)}
-    print(json.dumps(summary) if args.json else f"wrote {path}, {size:,} bytes")
+    size, told = path.stat().st_size, json.loads((out / loop.RUN_JSON).read_bytes())["validated"]
+    summary = {"bundle": str(path), "bytes": size, "run": str(out / loop.RUN_JSON), "validated": told}
+    print(json.dumps(summary) if args.json else "\n".join([*told, f"wrote {path}, {size:,} bytes"]))
     return 0
 
 
@@ -181,12 +188,12 @@ def add_train(parser: argparse.ArgumentParser) -> None:
     about = "initialise weights from BUNDLE, a file or `default`, instead of randomly"
     parser.add_argument("--start", metavar="BUNDLE", help=about)
     about = "number of devices that share each batch; default 1"
-    parser.add_argument("--devices", type=int, default=1, metavar="N", help=about)
+    parser.add_argument("--devices", type=count, default=1, metavar="N", help=about)
     about = "auto, cpu or cuda; default auto: GPUs if there are any"
     parser.add_argument("--device", default="auto", metavar="KIND", help=about)
     _add_workers(parser)
     about = "threads of each device's process; default 1"
-    parser.add_argument("--threads", type=int, default=1, metavar="N", help=about)
+    parser.add_argument("--threads", type=count, default=1, metavar="N", help=about)
     _add_calibration(parser, "; 0: no uncertainty")
 
 
@@ -217,7 +224,7 @@ def add_evaluate(parser: argparse.ArgumentParser) -> None:
 
 def _add_workers(parser: argparse.ArgumentParser) -> None:
     about = "number of processes that simulate; default 1"
-    parser.add_argument("--workers", type=int, default=1, metavar="N", help=about)
+    parser.add_argument("--workers", type=count, default=1, metavar="N", help=about)
 
 
 def _add_calibration(parser: argparse.ArgumentParser, none: str) -> None:
