@@ -12,9 +12,19 @@ import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
+
+LFS_POINTER: Final = b"version https://git-lfs.github.com/spec/"
+"""First bytes of a Git LFS pointer, which stands for a large file in a repository that was fetched without Git LFS."""
+
+
+def pointer_fault(head: bytes) -> str:
+    """Why a file that begins with these bytes cannot be read, if it is a Git LFS pointer; empty if it is none."""
+    if not head.startswith(LFS_POINTER):
+        return ""
+    return "this is a Git LFS pointer, not the content; fetch it with `git lfs pull`"
 
 
 @contextmanager
@@ -54,7 +64,8 @@ def write_errors(path: Path, part: Path) -> Iterator[None]:
         yield
     except OSError as error:
         number = error.errno if error.errno is not None else _errno_in(str(error))
-        if number is None or (error.filename is not None and os.fspath(error.filename) not in (str(path), str(part))):
+        of_this = number in _OF_WRITING if error.filename is None else str(error.filename) in (str(path), str(part))
+        if number is None or not of_this:  # of something that is read meanwhile
             raise
         raise OSError(number, os.strerror(number), str(path)) from None
     except RuntimeError as error:
@@ -69,7 +80,40 @@ def _errno_in(text: str) -> int | None:
     return int(found[1]) if found else None
 
 
+_OF_WRITING: Final = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS}
 _ERRNO: Final = re.compile(r"\berrno = (\d+)")
+
+
+class Stamp(NamedTuple):
+    """What changes when a file changes or another one replaces it.
+
+    Size and time of content can stay equal. Nothing but the system sets the time of state.
+    """
+
+    device: int
+    inode: int
+    size: int  # [bytes]
+    content_ns: int  # time of the last change
+    state_ns: int
+
+
+def stamp(path: Path) -> Stamp | None:
+    """The stamp of a file; None if it cannot be found."""
+    try:
+        about = path.stat()
+    except OSError:
+        return None
+    return Stamp(about.st_dev, about.st_ino, about.st_size, about.st_mtime_ns, about.st_ctime_ns)
+
+
+def why_unreadable(folder: Path) -> str | None:
+    """Why the entries of a folder cannot be listed, such as `No such file or directory`; None if they can."""
+    try:
+        with os.scandir(folder) as entries:
+            next(entries, None)
+    except OSError as error:
+        return error.strerror or str(error)
+    return None
 
 
 def read_toml(path: Path) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from neurove_core.io.errors import BrokenRecording, RecordingError, UnknownSourc
 from neurove_core.io.faults import Reason
 from neurove_core.io.format import Format, UrlFormat
 from neurove_core.io.recording import Recording
-from neurove_core.io.spool import HEAD_BYTES, Plain, compression_of, is_text, piped, plain_file
+from neurove_core.io.spool import HEAD_BYTES, Plain, compression_of, discard, is_text, piped, plain_file
 from neurove_core.io.units import with_unit
 from neurove_protocol.events import Sensor
 
@@ -46,8 +46,6 @@ FORMATS: Final = (
 
 URLS: Final = {"sim": "neurove_core.sim.source", "pattern": "neurove_core.io.formats.pattern"}
 """Modules of the sources that a URL names, by scheme."""
-
-LFS_POINTER: Final = b"version https://git-lfs.github.com/spec/"
 
 _SUFFIXES: Final = ((rb"PK\x03\x04.{26}[^\0]{0,255}\.npy", ".npz"), (rb"PK\x03\x04", ".zip"))
 """Suffix that the content of a pipe asks for, where the format looks at the suffix."""
@@ -118,7 +116,8 @@ def _open_path(path: Path, sensor: Sensor | None, topic: str | None) -> Recordin
     plain = _plain(path)
     try:
         recording = _format_of(plain.path).open(plain.path, sensor, topic)
-    except RecordingError:
+    except (RecordingError, OSError):
+        discard(plain.path)
         if plain.why:
             raise BrokenRecording(path, "its compressed content", plain.why) from None
         raise
@@ -146,8 +145,8 @@ def _plain(path: Path) -> Plain:
     if not path.is_file():
         raise UnknownSource(path, "it is no plain file, pipe or folder")
     plain = plain_file(path)
-    if _head(plain.path).startswith(LFS_POINTER):
-        raise UnknownSource(path, "this is a Git LFS pointer, not the recording; fetch it with `git lfs pull`")
+    if plain.path != path:
+        discard(path)  # a compressed file from a pipe
     return plain
 
 

@@ -10,7 +10,10 @@ from types import FrameType
 from typing import Final
 
 _PARENT_CHECK_S = 0.5
-_ENDING: Final = (signal.SIGTERM, signal.SIGHUP)
+_ENDING: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+_AGAIN_S = 0.001
+_OF_TUPLES: Final = ("namedtuple_", "numba.core.serialize")
+"""Modules of the functions that numba calls to make a named tuple: its own, and the one that finds its class."""
 
 
 class Terminated(KeyboardInterrupt):
@@ -24,20 +27,37 @@ class Terminated(KeyboardInterrupt):
 def interrupt_on_signals() -> None:
     """Let SIGTERM and SIGHUP end a command as Ctrl-C does, so that each `finally` runs.
 
-    A second one is ignored, because the cleanup is under way. SIGHUP stays ignored where it was, as under nohup. Does
-    nothing outside the main thread, which alone can set handlers.
+    A second one is ignored, because the cleanup is under way; a second Ctrl-C is not. SIGHUP stays ignored where it
+    was, as under nohup. Does nothing outside the main thread, which alone can set handlers.
     """
     if threading.current_thread() is not threading.main_thread():
         return
 
-    def end(number: int, _: FrameType | None) -> None:
-        for one in _ENDING:
+    def end(number: int, frame: FrameType | None) -> None:
+        if _makes_tuple(frame):
+            signal.signal(signal.SIGALRM, lambda _, later: end(number, later))
+            signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
+            return
+        for one in (signal.SIGTERM, signal.SIGHUP):
             signal.signal(one, signal.SIG_IGN)
         raise Terminated(number)
 
     for one in _ENDING:
         if signal.getsignal(one) is not signal.SIG_IGN:
             signal.signal(one, end)
+
+
+def _makes_tuple(frame: FrameType | None) -> bool:
+    """Whether a named tuple is being made, as at the end of a compiled function that returns one.
+
+    There numba calls Python and does not expect an exception: one ends the process with a segmentation fault. It is the
+    first Python code after a long compiled loop, so most signals meet it.
+    """
+    while frame is not None:
+        if str(frame.f_globals.get("__name__")).startswith(_OF_TUPLES):
+            return True
+        frame = frame.f_back
+    return False
 
 
 def stop_on_signals(*, with_parent: bool = False, on_hangup: Callable[[], None] | None = None) -> threading.Event:

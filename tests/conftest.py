@@ -43,7 +43,9 @@ def logging_as_before():
 
 @pytest.fixture
 def signals_as_before():
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    handlers = {
+        number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGALRM)
+    }
     yield
     for number, handler in handlers.items():
         signal.signal(number, handler)

@@ -33,7 +33,7 @@ MAY_IMPORT = {
     "neurove_core.models": "config files networks",
     "neurove_core.estimator": "geometry ingest networks engine models io",
     "neurove_core.self_test": "config models estimator",
-    "neurove_core.io": "extras figures geometry",
+    "neurove_core.io": "files extras figures geometry",
     "neurove_core.io.formats": "compiled files extras geometry io",
     "neurove_core.sim": "compiled config figures geometry io io.formats",
     "neurove_core.sources": "io io.formats sim",
@@ -60,7 +60,9 @@ MAY_IMPORT = {
     "neurove_service.guard": "logs",
     "neurove_service.transport": "logs guard",
     "neurove_service.streams": "core:ingest core:networks core:models core:estimator logs guard",
-    "neurove_service.models": "core:files core:ingest core:models core:estimator core:self_test logs streams",
+    "neurove_service.models": (
+        "core:config core:files core:ingest core:networks core:models core:estimator core:self_test logs streams"
+    ),
     "neurove_service.clients": (
         "core:config core:geometry core:ingest core:io core:io.formats core:bench logs config transport"
     ),

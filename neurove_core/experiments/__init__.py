@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from neurove_core.figures import unwritable
+from neurove_core.files import write_atomically
 
 
 def save_text(text: str, file: Path) -> Path:
@@ -13,7 +14,7 @@ def save_text(text: str, file: Path) -> Path:
     """
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(text)
+        write_atomically(file, text.encode())
     except OSError as error:
         raise unwritable(file, error) from None
     return file

@@ -59,6 +59,20 @@ def lookup_table(canonical: CanonicalConfig, sensor: Sensor, camera: CameraInfo 
     return cells.astype(np.int32)
 
 
+def field_of_view_deg(camera: CameraInfo) -> tuple[float, float]:
+    """Angles between the rays of the outer columns, and of the outer rows, through the optical axis [deg].
+
+    Returns:
+        horizontal and vertical; nan where the lens model has no ray for the edge.
+    """
+    x = (np.array([0.0, camera.width - 1.0]) - camera.cx) / camera.fx
+    y = (np.array([0.0, camera.height - 1.0]) - camera.cy) / camera.fy
+    across, _ = undistort(x, np.zeros(2), camera)
+    _, along = undistort(np.zeros(2), y, camera)
+    wide, high = (np.degrees(np.arctan(rays)) for rays in (across, along))
+    return float(wide[1] - wide[0]), float(high[1] - high[0])
+
+
 def undistort(
     xd: NDArray[np.float64], yd: NDArray[np.float64], camera: CameraInfo
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

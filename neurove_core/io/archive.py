@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.extras import MissingExtra
+from neurove_core.files import pointer_fault
 from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.unpack import ERRORS, bounded
 
@@ -39,10 +40,15 @@ class Place(NamedTuple):
 
         Raises:
             BrokenRecording: the file in the .zip file cannot be decompressed. It can be raised while the file is read.
+            UnknownSource: the file is a Git LFS pointer.
         """
         try:
             if self.inside is None:
                 with (self.path / name).open("rb") as file:
+                    fault = pointer_fault(file.read(64))
+                    if fault:
+                        raise UnknownSource(self.path / name, fault)
+                    file.seek(0)
                     yield file
                 return
             with member(self.path, self.inside + name) as packed:

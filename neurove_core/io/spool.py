@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Final, NamedTuple
 
+from neurove_core.files import pointer_fault
 from neurove_core.io.errors import UnknownSource
 from neurove_core.io.recording import BLOCK_BYTES
 from neurove_core.io.unpack import Unpackable, parts
@@ -34,7 +35,7 @@ _SUFFIXES: Final = (".gz", ".zst", ".zstd", ".bz2", ".lz4")
 _TEXT: Final = bytes(range(0x20, 0x7F)) + b"\t\r\n"
 _BOM: Final = b"\xef\xbb\xbf"
 
-_kept: list[tempfile.TemporaryDirectory[str]] = []  # each removes its folder when the process ends
+_kept: dict[Path, tempfile.TemporaryDirectory[str]] = {}  # each removes its folder when the process ends
 
 
 class Plain(NamedTuple):
@@ -58,12 +59,15 @@ def plain_file(path: Path, max_bytes: int = MAX_BYTES) -> Plain:
     """The file itself, or for a compressed file a decompressed copy without the suffix of the compression.
 
     Raises:
-        UnknownSource: the copy becomes larger than `max_bytes`.
+        UnknownSource: the copy becomes larger than `max_bytes` or cannot be written, or the file is a Git LFS pointer.
         MissingExtra: the library for the compression is not installed.
-        OSError: the file cannot be read, or no temporary file can be written.
+        OSError: the file cannot be read, or there is no temporary folder.
     """
     with path.open("rb") as file:
-        compression = compression_of(file.read(HEAD_BYTES))
+        head = file.read(HEAD_BYTES)
+        if fault := pointer_fault(head):
+            raise UnknownSource(path, fault)
+        compression = compression_of(head)
         if compression is None:
             return Plain(path)
         packed = file.seek(0, 2)
@@ -83,7 +87,8 @@ def piped(source: Path, stream: IO[bytes], head: bytes, name: str, max_bytes: in
         max_bytes: bound for its size.
 
     Raises:
-        UnknownSource: the pipe gives more than `max_bytes`. OSError: no temporary file can be written.
+        UnknownSource: the pipe gives more than `max_bytes`, or the copy cannot be written.
+        OSError: there is no temporary folder.
     """
     return _copied(source, _blocks(stream, head), name, max_bytes).path
 
@@ -108,8 +113,17 @@ def _copied(source: Path, blocks: Iterable[bytes], name: str, max_bytes: int) ->
                     file.write(block)
             except Unpackable as error:
                 why = f"after {size:,} decompressed bytes: {error}"
+    except OSError as error:
+        folder.cleanup()
+        raise UnknownSource(source, f"no temporary copy can be made in {folder.name}: {error.strerror}") from None
     except BaseException:
         folder.cleanup()
         raise
-    _kept.append(folder)
+    _kept[path] = folder
     return Plain(path, why)
+
+
+def discard(path: Path) -> None:
+    """Remove a temporary copy before the process ends. Any other file stays."""
+    if folder := _kept.pop(path, None):
+        folder.cleanup()

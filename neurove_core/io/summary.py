@@ -12,6 +12,7 @@ from neurove_core.geometry.motion import Twists
 from neurove_core.io.errors import BrokenRecording
 from neurove_core.io.faults import Fault
 from neurove_core.io.recording import Imu, Recording
+from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
 
@@ -74,11 +75,13 @@ class Summary:
     imu: ImuSummary | None
     truth: TruthSummary | None
     broken: str | None  # the error that ended the reading, if any
+    lens: CameraInfo | None = None
     faults: tuple[Fault, ...] = ()  # what was skipped, discarded or not read, by reason
 
     def as_json(self) -> dict[str, Any]:
         """The summary as a dict for `json.dumps`."""
         fields = asdict(self)
+        fields["lens"] = None if self.lens is None else self.lens.model_dump(mode="json", exclude={"stream"})
         fields["faults"] = [fault.as_json() for fault in self.faults]
         if self.truth is not None:
             truth = fields["truth"]
@@ -143,6 +146,7 @@ def survey(recording: Recording, seconds: float | None = None) -> Survey:
         imu=imu.summary(),
         truth=None if truth is None else _truth(truth, "poses" if "poses" in recording.streams else "twists"),
         broken=broken or next(map(str, recording.faults.unread), None),
+        lens=recording.camera("recording"),
         faults=recording.faults.found,
     )
     return Survey(summary, *tally.picture(), *tally.rate(), truth)

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neurove_core.files import pointer_fault
 from neurove_protocol.errors import BadModel, shown
 
 Data = bytes | memoryview
@@ -54,6 +55,8 @@ def read_container(data: Data, name: str) -> Container:
     """
     if len(data) < 8:
         raise BadModel(name, f"size={len(data)}: not a safetensors file")
+    if fault := pointer_fault(bytes(data[:64])):
+        raise BadModel(name, fault)
     (length,) = struct.unpack("<Q", data[:8])
     if length > min(MAX_HEADER_BYTES, len(data) - 8):
         raise BadModel(

@@ -81,7 +81,7 @@ def calibration_sets(config: TrainingConfig, sequences: int) -> list[tuple[Train
         InvalidField: there are too few sequences for the folds of each set.
     """
     if sequences < 4 * _FOLDS:
-        raise InvalidField("calibration", "sequences", sequences, f"must be at least {4 * _FOLDS}")
+        raise InvalidField("calibration", "calibration_sequences", sequences, f"must be at least {4 * _FOLDS}")
     fast, hard = sequences // 4, sequences // 4
     seed = (config.data.seed + _SEED_SHIFT) % (_SEEDS - 3 * _KIND_SEEDS)
     drives = {"slowed_drive": (1.0, 1.0), "scenes": {"street": 1.0}}
@@ -120,12 +120,7 @@ def calibrate(bundle: Bundle, config: TrainingConfig, folder: Path, sequences: i
             is not per metre of height.
         BrokenRecording: a sequence is missing or broken.
     """
-    if (bundle.config.window, bundle.config.canonical) != (config.model.window, config.model.canonical):
-        raise BadModel(bundle.name, "its windows or its canonical camera differ from those of the configuration")
-    if bundle.linear_unit != PER_HEIGHT:
-        raise BadModel(
-            bundle.name, f"linear_unit={bundle.linear_unit!r}: the truth of the sequences is in {PER_HEIGHT!r}"
-        )
+    check(bundle, config, sequences)
     parts = [(Cache(folder, one).open(), hard) for one, hard in calibration_sets(config, sequences)]
     first = calibration_sets(config, sequences)[0][0].data
     provenance = (
@@ -133,6 +128,22 @@ def calibrate(bundle: Bundle, config: TrainingConfig, folder: Path, sequences: i
         f"{len(VARIANTS)} times, {_FOLDS} folds, commit {commit() or 'unknown'}"
     )
     return with_uncertainty(bundle, list(collect_errors(bundle, parts)), provenance)
+
+
+def check(bundle: Bundle, config: TrainingConfig, sequences: int) -> None:
+    """Check that a model can be calibrated, before anything is simulated; see `calibrate`.
+
+    Raises:
+        BadModel: the model does not fit. InvalidField: there are too few sequences.
+    """
+    _neurove(bundle)
+    calibration_sets(config, sequences)
+    if (bundle.config.window, bundle.config.canonical) != (config.model.window, config.model.canonical):
+        raise BadModel(bundle.name, "its windows or its canonical camera differ from those of the configuration")
+    if bundle.linear_unit != PER_HEIGHT:
+        raise BadModel(
+            bundle.name, f"linear_unit={bundle.linear_unit!r}: the truth of the sequences is in {PER_HEIGHT!r}"
+        )
 
 
 def with_uncertainty(bundle: Bundle, errors: list[SequenceErrors], provenance: str) -> Calibration:
@@ -255,11 +266,15 @@ def laplace_scale(inputs: Array, size: Array, penalty: float) -> Array:
 
 
 def _copy(bundle: Bundle) -> NeuroVE:
+    return copy.deepcopy(_neurove(bundle))
+
+
+def _neurove(bundle: Bundle) -> NeuroVE:
     if not isinstance(bundle.network, NeuroVE):
         raise BadModel(
             bundle.name, f"kind={bundle.config.kind!r}: only a network of kind 'neurove' can have an uncertainty"
         )
-    return copy.deepcopy(bundle.network)
+    return bundle.network
 
 
 def _fit(errors: list[SequenceErrors]) -> Array:

@@ -157,6 +157,15 @@ class RecipeConfig(Config):
     hole_windows: LogSpan = Field((1.0, 20.0), description="Length of a gap in windows, log-uniform.")
     thinned: float = Field(0.0, ge=0, le=1, description="Share of segments with few events from a random window on.")
     thinned_to: LogSpan = Field((0.01, 0.5), description="Share of the events that remain, log-uniform.")
+    validation_share: float = Field(
+        0.15, ge=0, le=0.5, description="Share of each recording, its end, that validates the run; 0: none."
+    )
+    validation_sequences: int = Field(
+        8, ge=0, le=1000, description="Simulated sequences of one segment that validate the run; 0: none."
+    )
+    patience: float = Field(
+        0.3, gt=0, le=1, description="Share of the updates without improvement that ends a run early; 1: never."
+    )
     checkpoint_s: float = Field(120.0, ge=0, description="Interval of checkpoints [s]; one is also written at the end.")
 
     @model_validator(mode="after")
@@ -195,7 +204,10 @@ class TrainingConfig(Config):
     def _segments_fit(self) -> Self:
         windows, needed = self.sequence_windows, self.recipe.most_windows
         if windows < needed:
-            raise ValueError(f"a sequence has {windows} windows, a segment needs {needed}")
+            twice = " at twice the speed (recipe.doubled)" if self.recipe.doubled else ""
+            have = f"data.seconds={self.data.seconds:g} has {windows} windows of {self.model.window.duration_us} us"
+            wants = f"recipe.segment_windows={self.recipe.segment_windows} needs {needed}{twice}"
+            raise ValueError(f"a sequence of {have}, a segment of {wants}")
         return self
 
     @property
@@ -219,8 +231,8 @@ def load(source: str) -> TrainingConfig:
         known = ", ".join(sorted(found.stem for found in CONFIGS.glob("*.toml")))
         why = f"{error.strerror or error}; expected a TOML file or one of: {known}"
         raise InvalidField("training", "config", source, why) from None
-    except ValueError as error:
-        raise InvalidField("training", "config", source, f"not TOML: {error}") from None
-    except ValidationError as error:
+    except ValidationError as error:  # before ValueError, which it is
         wrong = WrongField.of(error)
         raise InvalidField("training", wrong.name or "config", wrong.value, wrong.why) from None
+    except ValueError as error:
+        raise InvalidField("training", "config", source, f"not TOML: {error}") from None

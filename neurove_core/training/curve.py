@@ -56,8 +56,12 @@ class Scalars:
         self._writer.flush()
 
 
-def draw_curve(curve: list[dict[str, float]], folder: Path, title: str) -> list[Path]:
+def draw_curve(
+    curve: list[dict[str, float]], folder: Path, title: str, validation: list[dict[str, float]] | None = None
+) -> list[Path]:
     """Write curve.png and curve.svg, with both errors and the learning rate over the updates.
+
+    The errors are those of training, and of each set of `validation`; see `validation.Point`.
 
     Without matplotlib, log a warning and write nothing.
 
@@ -84,8 +88,9 @@ def draw_curve(curve: list[dict[str, float]], folder: Path, title: str) -> list[
         if panel is panels[-1]:
             panel.plot(step, values, linewidth=1)
         else:
-            panel.plot(step, values, linewidth=0.6, alpha=0.5, label="mean since the previous point")
-            panel.plot(step, smooth(values, _SMOOTH), linewidth=1.5, label=f"mean of {_SMOOTH} points")
+            panel.plot(step, values, linewidth=0.6, alpha=0.5, label="training, mean since the previous point")
+            panel.plot(step, smooth(values, _SMOOTH), linewidth=1.5, label=f"training, mean of {_SMOOTH} points")
+            _draw_validation(panel, validation or [], name, factor)
             panel.set_yscale("log")
         panel.set_ylabel(label)
         panel.grid(visible=True, which="both", alpha=0.3)
@@ -93,6 +98,15 @@ def draw_curve(curve: list[dict[str, float]], folder: Path, title: str) -> list[
     panels[0].set_title(title)
     panels[-1].set_xlabel("updates of the weights")
     return save_figure(figure, folder / FIGURE)
+
+
+def _draw_validation(panel: Any, validation: list[dict[str, float]], name: str, factor: float) -> None:
+    for kept, style in (("recorded", "-"), ("simulated", "--")):
+        points = [
+            (point["step"], point[f"{kept}_{name}"] * factor) for point in validation if f"{kept}_{name}" in point
+        ]
+        if points:
+            panel.plot(*zip(*points, strict=True), style, linewidth=1, color="black", label=f"validation, {kept}")
 
 
 def smooth(values: NDArray[np.float64], points: int) -> NDArray[np.float64]:

@@ -9,7 +9,7 @@ import hashlib
 import json
 import math
 import multiprocessing
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -31,7 +31,9 @@ from neurove_core.sim.render.pixels import PixelConfig
 from neurove_core.sim.simulate import Simulation
 from neurove_core.sim.world.path import CameraPath
 from neurove_core.sim.world.scene import named_scene
-from neurove_core.training.config import DataConfig, Span, TrainingConfig
+from neurove_core.training.config import DataConfig, TrainingConfig
+from neurove_core.training.config import Span as Range
+from neurove_protocol.errors import InvalidField
 
 FORMAT: Final = 1
 """Version of the files; it is part of the name of their folder."""
@@ -41,6 +43,9 @@ DRIVE_S: Final = 120.0
 
 HAND_HELD_SCENES: Final = ("room", "plain-room")
 """Scenes for a hand-held camera."""
+
+_HANDS: Final = {"waved": (1.0, 1.0), "turned": (0.0, 1.0), "slid": (1.0, 0.0), "spun": (0.0, 1.0)}
+"""Each motion of a hand-held camera: how much of the translation and of the rotation it has; `spun` is steady."""
 
 _SAMPLES: Final = 4  # samples of the exact twist per bin; the bin has their mean
 
@@ -82,6 +87,26 @@ class Part(Trajectory):
     def twist(self, t_s: ArrayLike) -> NDArray[np.float64]:
         """See `Trajectory`."""
         return self.trajectory.twist(self.start_s + self._within(t_s) / self.slowed) / self.slowed
+
+
+def check_names(config: DataConfig) -> None:
+    """Check the names of scenes, motions and cameras that the sequences are drawn from.
+
+    Raises:
+        InvalidField: a name is unknown, or the mount of a camera is out of bounds.
+    """
+    for scene in _drawn(config.scenes):
+        named_scene(scene)
+    for hand in _drawn(config.hands):
+        if hand not in _HANDS:
+            raise InvalidField("training", "data.hands", hand, f"known motions: {', '.join(_HANDS)}")
+    for name in _drawn(config.cameras):
+        for height_m, pitch_deg, hfov_deg in zip(config.height_m, config.pitch_deg, config.hfov_deg, strict=True):
+            named_camera(f"{name}:{hfov_deg:.2f}" if name.count(":") == 1 else name, height_m, pitch_deg)
+
+
+def _drawn(shares: dict[str, float]) -> list[str]:
+    return [name for name, share in shares.items() if share > 0]
 
 
 def draw_simulation(config: DataConfig, index: int) -> Simulation:
@@ -174,8 +199,12 @@ class Cache:
             return
         context = multiprocessing.get_context("spawn")  # the threads of torch do not survive a fork
         with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
-            for done in concurrent.futures.as_completed([pool.submit(_make, job) for job in jobs]):
-                yield done.result()
+            try:
+                for done in concurrent.futures.as_completed([pool.submit(_make, job) for job in jobs]):
+                    yield done.result()
+            except BaseException:
+                pool.shutdown(cancel_futures=True)  # a full disk or a signal: do not simulate the rest
+                raise
 
     def open(self) -> "Sequences":
         """Open all simulated sequences of the configuration.
@@ -204,22 +233,32 @@ def save(sequence: Sequence, path: Path) -> None:
     write_atomically(path, safetensors.numpy.save(arrays, metadata))
 
 
+class Span(NamedTuple):
+    """Consecutive windows of a file: all of them, or [start, stop)."""
+
+    path: Path
+    start: int = 0
+    stop: int | None = None
+
+
 class Sequences:
     """Sequences in memory-mapped files; counts are read on demand.
 
     Args:
-        paths: of the files.
+        paths: of the files, or spans of their windows.
 
     Raises:
         BrokenRecording: a file is missing, or `save` did not write it.
     """
 
-    def __init__(self, paths: list[Path]) -> None:
-        self.paths = paths
+    def __init__(self, paths: Iterable[Path | Span]) -> None:
+        self.paths = list(paths)
         self._files: list[Any] = []
+        self._first: list[int] = []
         self.twists: list[NDArray[np.float32]] = []  # each (T, n, 6)
         self.height_m: list[float] = []
-        for path in paths:
+        for one in self.paths:
+            path, start, stop = one if isinstance(one, Span) else Span(one)
             try:
                 file: Any = safetensors.safe_open(path, "numpy")
                 metadata = file.metadata()
@@ -231,7 +270,8 @@ class Sequences:
                 why = f"counts {tuple(shape)} do not match twists {twists.shape}"
                 raise BrokenRecording(path, "its header", why)
             self._files.append(file)
-            self.twists.append(twists)
+            self._first.append(start)
+            self.twists.append(twists[start:stop])
             self.height_m.append(height_m)
 
     def __len__(self) -> int:
@@ -239,7 +279,8 @@ class Sequences:
 
     def counts(self, index: int, start: int, stop: int) -> NDArray[np.uint8]:
         """Counts (stop - start, 2n, H, W) of windows start to stop of a sequence."""
-        found: NDArray[np.uint8] = self._files[index].get_slice("counts")[start:stop]
+        first = self._first[index]
+        found: NDArray[np.uint8] = self._files[index].get_slice("counts")[first + start : first + stop]
         return found
 
 
@@ -251,7 +292,7 @@ def _hand_held(rng: np.random.Generator, config: DataConfig, seed: int, slowed: 
         rate = log_uniform(rng, config.spun_rad_s) * axis / np.linalg.norm(axis)
         wx, wy, wz = (float(one) for one in rate)
         return rotation(wx, wy, wz, config.seconds)
-    moved, turned = {"waved": (1.0, 1.0), "turned": (0.0, 1.0), "slid": (1.0, 0.0)}[motion]
+    moved, turned = _HANDS[motion]
     return Part(hand_held(seed, config.seconds, moved, turned), 0.0, slowed, config.seconds)
 
 
@@ -268,7 +309,7 @@ def _choice(rng: np.random.Generator, shares: dict[str, float]) -> str:
     return str(rng.choice(names, p=weights / weights.sum()))
 
 
-def log_uniform(rng: np.random.Generator, span: Span) -> float:
+def log_uniform(rng: np.random.Generator, span: Range) -> float:
     """Draw a number from a span, with a uniform logarithm."""
     return math.exp(rng.uniform(math.log(span[0]), math.log(span[1])))
 

@@ -25,14 +25,16 @@ from neurove_core.models.bundle import Bundle
 from neurove_core.models.metadata import MadeBy, Metadata
 from neurove_core.networks.encoding import to_spikes
 from neurove_core.networks.state import detached
+from neurove_core.training import validation
 from neurove_core.training.batches import Segment, draw
 from neurove_core.training.config import RecipeConfig, TrainingConfig
 from neurove_core.training.curve import Scalars, draw_curve
-from neurove_core.training.data import Cache, Sequences
+from neurove_core.training.data import Cache, Sequences, Span
 from neurove_core.training.loss import group_loss, scaled_sum
 from neurove_core.training.ranks import Ranks, process_group
 from neurove_core.training.recorded import RecordedSequences
 from neurove_core.training.run import TrainingRun
+from neurove_core.training.validation import Held
 
 CHECKPOINT: Final = "checkpoint.safetensors"
 RUN_JSON: Final = "run.json"
@@ -51,6 +53,7 @@ class Progress(NamedTuple):
     steps: int
     linear_m_s: float  # mean length of the linear error since the last point of the curve
     angular_rad_s: float
+    validated: dict[str, float] | None = None  # the newest validation, see `validation.Point`
 
 
 class _Losses(NamedTuple):
@@ -82,6 +85,7 @@ def train(
     data: Path,
     *,
     more: Sequence[Path] = (),
+    held: Held | None = None,
     resume: bool = False,
     start: Bundle | None = None,
     devices: int = 1,
@@ -95,6 +99,8 @@ def train(
         out: folder for the checkpoint, run.json, the curve and the bundle.
         data: folder of the sequences, filled by `Cache.fill` and `RecordedSequences.fill`.
         more: files of further sequences, as `data.save` writes them.
+        held: windows that validate the run; without them it is not validated and not stopped early. With them, the
+            held-out parts of the recordings are not trained on; see `RecordedSequences.split`.
         resume: continue from the checkpoint in `out`, if it exists.
         start: model whose weights the run begins from; ignored if the run continues from a checkpoint.
         devices: number of processes that share each batch, each with its own device.
@@ -112,16 +118,18 @@ def train(
     """
     out.mkdir(parents=True, exist_ok=True)
     resume = resume and (out / CHECKPOINT).exists()
-    sequences = Sequences([*Cache(data, config).paths(), *RecordedSequences(data, config).paths(), *more])
+    recorded = RecordedSequences(data, config)
+    parts = recorded.split()[0] if held else recorded.paths()
+    sequences = Sequences([*Cache(data, config).paths(), *parts, *more])
     how = Start(resume, start)
     begin_run(config, out, sequences, how, Ranks(count=devices))  # one process raises the errors of the arguments
     with process_group(devices, device, train_rank, (config, out, sequences.paths, how)) as ranks:
         run = begin_run(config, out, sequences, how, ranks)
         with Scalars(out, run.step) as scalars:
-            train_to_end(run, sequences, out, on_progress, scalars.add)
-    draw_curve(run.curve, out, f"{config.name}: {run.step} updates")
+            train_to_end(run, sequences, out, on_progress, scalars.add, held)
+    draw_curve(run.curve, out, f"{config.name}: {run.step} updates", run.validation)
     path = out / f"{config.name}{bundle.SUFFIX}"
-    made = run.bundle(provenance(run, len(more)), metadata_of(run))
+    made = run.bundle(provenance(run, len(more)), metadata_of(run), best=kept_step(run) < run.step)
     test = self_test.record(Estimator(made), golden_windows(sequences))
     bundle.save(replace(made, golden=test), path)
     return path
@@ -141,7 +149,7 @@ def begin_run(config: TrainingConfig, out: Path, sequences: Sequences, how: Star
     return TrainingRun.begin(config, sequences, ranks, how.start)
 
 
-def train_rank(config: TrainingConfig, out: Path, paths: list[Path], how: Start, ranks: Ranks) -> None:
+def train_rank(config: TrainingConfig, out: Path, paths: list[Path | Span], how: Start, ranks: Ranks) -> None:
     """Main function of every rank except the first: train, and write nothing."""
     sequences = Sequences(paths)
     train_to_end(begin_run(config, out, sequences, how, ranks), sequences, out)
@@ -153,26 +161,59 @@ def train_to_end(
     out: Path,
     on_progress: Callable[[Progress], None] = lambda _: None,
     on_point: Callable[[dict[str, float]], None] = lambda _: None,
+    held: Held | None = None,
 ) -> None:
-    """Train to the end of the recipe; the first rank writes checkpoints and run.json to `out`."""
+    """Train to the end of the recipe, or until the validation does not improve any more.
+
+    The first rank validates the run, and writes checkpoints and run.json to `out`.
+    """
     recipe, share = run.config.recipe, run.rank_recipe
     spent_s, saved_s, began_s, recent = run.cpu_s, time.monotonic(), time.process_time(), list[_Losses]()
-    while run.step < recipe.updates:
+    if held and not run.validation:
+        on_point(_validated(run, held))
+    over = _is_over(run)
+    while run.step < recipe.updates and not over:
         recent += train_segment(run, draw(run.rng, sequences, share))
         mean = _mean(recent)
-        on_progress(Progress(run.step, recipe.updates, 2 * mean.linear, 2 * mean.angular))
+        validated = run.validation[-1] if run.validation else None
+        on_progress(Progress(run.step, recipe.updates, 2 * mean.linear, 2 * mean.angular, validated))
         if len(recent) < min(_CURVE_STEPS, recipe.steps / 100) and run.step < recipe.updates:
             continue
-        ranks = run.ranks.gather((run.rng_state, time.process_time() - began_s))
-        run.cpu_s = spent_s + sum(cpu_s for _, cpu_s in ranks)
+        if held:
+            on_point(_validated(run, held))
+        ranks = run.ranks.gather((run.rng_state, time.process_time() - began_s, _is_over(run)))
+        run.cpu_s = spent_s + sum(cpu_s for _, cpu_s, _ in ranks)
+        over = any(ends for _, _, ends in ranks)
         run.curve.append(_point(run, mean))
         on_point(run.curve[-1])
         recent = []
-        due = time.monotonic() - saved_s >= recipe.checkpoint_s or run.step >= recipe.updates
+        due = time.monotonic() - saved_s >= recipe.checkpoint_s or run.step >= recipe.updates or over
         if due and run.ranks.first:
-            run.save(out / CHECKPOINT, [order for order, _ in ranks])
+            run.save(out / CHECKPOINT, [order for order, _, _ in ranks])
             _write_run(run, out)
             saved_s = time.monotonic()
+
+
+def _validated(run: TrainingRun, held: Held) -> validation.Point:
+    """Validate a run, and keep its weights if they are the best so far."""
+    point = validation.validate(run.network, held, run.config, (run.offset, run.scale), run.step)
+    run.validation.append(point)
+    if validation.best_of(run.validation) == len(run.validation) - 1:
+        run.best = {name: tensor.detach().clone() for name, tensor in run.network.state_dict().items()}
+    return point
+
+
+def _is_over(run: TrainingRun) -> bool:
+    """Whether the validation ends the run early. Only the first rank has validations."""
+    return validation.is_over(run.validation, run.config.recipe)
+
+
+def kept_step(run: TrainingRun) -> int:
+    """The update whose weights the bundle gets: the last one, unless the best validation is clearly better."""
+    if not run.validation or not run.best:
+        return run.step
+    best, last = run.validation[validation.best_of(run.validation)], run.validation[-1]
+    return int(best["step"]) if validation.score(last) > validation.WORSE * validation.score(best) else run.step
 
 
 def train_segment(run: TrainingRun, segment: Segment) -> list[_Losses]:
@@ -245,7 +286,10 @@ def metadata_of(run: TrainingRun) -> Metadata:
     )
     last = run.curve[-1] if run.curve else {}
     errors = ("linear_error_m_s", "angular_error_rad_s")
-    return Metadata(made_by=made_by, figures={f"training_{name}": last[name] for name in errors if name in last})
+    figures = {f"training_{name}": last[name] for name in errors if name in last}
+    kept = next((point for point in run.validation if point["step"] == kept_step(run)), {})
+    figures |= {f"validation_{name}": value for name, value in kept.items() if name != "step"}
+    return Metadata(made_by=made_by, figures=figures)
 
 
 def _program(run: TrainingRun) -> str:
@@ -303,5 +347,10 @@ def _write_run(run: TrainingRun, out: Path) -> None:
         "device": run.ranks.device.type,
         "cpu_s": round(run.cpu_s, 1),
         "curve": run.curve,
+        "validation": run.validation,
+        "kept_step": kept_step(run),
+        "validated": validation.sentences(
+            run.validation, kept_step(run), run.config.recipe, from_model=bool(run.start)
+        ),
     }
     write_atomically(out / RUN_JSON, json.dumps(summary, indent=1).encode())

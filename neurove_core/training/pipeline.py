@@ -14,14 +14,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from neurove_core.files import make_writable
 from neurove_core.models import bundle
 from neurove_core.models.bundle import Bundle
-from neurove_core.training import calibration, loop
+from neurove_core.training import calibration, loop, validation
 from neurove_core.training.config import TrainingConfig
-from neurove_core.training.data import Cache
-from neurove_core.training.ranks import device_of
+from neurove_core.training.data import Cache, check_names
+from neurove_core.training.ranks import Ranks, device_of
 from neurove_core.training.recorded import RecordedSequences
-from neurove_core.training.run import check_start
+from neurove_core.training.run import TrainingRun, check_start
+from neurove_core.training.validation import Held
+from neurove_protocol.errors import InvalidField
 
 OnProgress = Callable[[str, int, int, str], None]
 """Called after each step of a task with the task's name, the steps done, the number of steps, and a detail."""
@@ -42,6 +45,9 @@ def train(
 ) -> Path:
     """Make the sequences of a configuration, train its network, and fit the network's uncertainty.
 
+    The end of each recording and a few more simulated scenes are kept for validation; see `validation`. The run stops
+    early if they do not improve any more. `run.json` has the curve of both, and sentences about the result.
+
     Args:
         config: of the run.
         out: folder for the bundle, the checkpoint, run.json and the learning curve.
@@ -61,24 +67,42 @@ def train(
     Raises:
         BadModel: `start` or the checkpoint does not match the configuration.
         InvalidField: the batch does not split over the devices, a device is missing, a recording cannot be trained on,
-            or there are too few calibration sequences.
+            there are too few calibration sequences, a name in the configuration is unknown, or a folder cannot be
+            written. All of these are checked before anything is simulated.
         BrokenRecording, UnknownSource, MissingGeometry, MissingExtra: a recording cannot be read.
         LostRank: one of the processes ended early.
     """
-    if start is not None:
-        check_start(start, config)
-    device_of(device, devices=devices)  # an error of the arguments is raised before anything is simulated
     data = data or out / "data"
-    _fill(config, data, workers, on_progress)
+    calibrated = calibration_sequences != 0 and config.model.kind == "neurove"
+    _check(config, out, start, resume=resume, devices=devices, device=device, workers=workers)
+    if calibrated:
+        calibration.calibration_sets(config, calibration_sequences)
+    recordings = RecordedSequences(data, config)
+    for field, folder in (("out", out), ("data", data)):
+        _check_writable(field, folder)
+    _fill(config, data, recordings, workers, on_progress)
+    validating = validation.simulated_config(config) if config.recipe.validation_sequences else None
+    if validating:
+        _simulate("simulated to validate", validating, data, workers, on_progress)
+    simulated = Cache(data, validating).paths() if validating else []
+    held = Held.read(recordings.split()[1], simulated, config.recipe)
 
     def trained(progress: loop.Progress) -> None:
-        errors = f"{progress.linear_m_s:.3f} m/s {progress.angular_rad_s:.4f} rad/s"
+        errors = f"{progress.linear_m_s:.3f} m/s {progress.angular_rad_s:.4f} rad/s{_validated(progress.validated)}"
         on_progress("trained", progress.step, progress.steps, errors)
 
     path = loop.train(
-        config, out, data, resume=resume, start=start, devices=devices, device=device, on_progress=trained
+        config,
+        out,
+        data,
+        held=None if held == (None, None) else held,
+        resume=resume,
+        start=start,
+        devices=devices,
+        device=device,
+        on_progress=trained,
     )
-    if calibration_sequences and config.model.kind == "neurove":
+    if calibrated:
         calibrate(bundle.load(path), config, data, path, calibration_sequences, workers, on_progress)
     return path
 
@@ -109,6 +133,9 @@ def calibrate(
     Raises:
         BadModel, InvalidField, BrokenRecording: as `calibration.calibrate`.
     """
+    calibration.check(model, config, sequences)
+    _check_writable("out", out.parent)
+    _check_count("workers", workers)
     for done, name in enumerate(calibration.fill(config, data, sequences, workers), 1):
         on_progress("simulated to calibrate", done, sequences, name)
     made = calibration.calibrate(model, config, data, sequences)
@@ -116,12 +143,60 @@ def calibrate(
     return made.report
 
 
-def _fill(config: TrainingConfig, folder: Path, workers: int, on_progress: OnProgress) -> None:
-    """Make the sequences of the configuration that are not in the folder."""
-    cache, wanted = Cache(folder, config), config.data.sequences
-    for done, name in enumerate(cache.fill(workers), wanted - len(cache.missing()) + 1):
-        on_progress("simulated", done, wanted, name)
-    recordings = RecordedSequences(folder, config)
+def _check(
+    config: TrainingConfig, out: Path, start: Bundle | None, *, resume: bool, devices: int, device: str, workers: int
+) -> None:
+    """Check the arguments of a run that need no data."""
+    if start is not None:
+        check_start(start, config)
+    _check_count("workers", workers)
+    _check_count("devices", devices)
+    if config.recipe.batch % devices:
+        bound = f"recipe.batch={config.recipe.batch} does not split into this many equal parts"
+        raise InvalidField("training", "devices", devices, bound)
+    device_of(device, devices=devices)
+    check_names(config.data)
+    if resume and (out / loop.CHECKPOINT).exists():
+        TrainingRun.restore(out / loop.CHECKPOINT, config, Ranks(count=devices))
+
+
+def _check_count(field: str, count: int) -> None:
+    if count < 1:
+        raise InvalidField("training", field, count, "must be at least 1")
+
+
+def _check_writable(field: str, folder: Path) -> None:
+    try:
+        make_writable(folder)
+    except OSError as error:
+        raise InvalidField(
+            "training", field, str(folder), f"files cannot be written: {error.strerror or error}"
+        ) from None
+
+
+def _validated(point: validation.Point | None) -> str:
+    """The newest validation, of the set that decides, as text."""
+    for name in validation.SETS:
+        errors = [(key, value) for key, value in (point or {}).items() if key.startswith(f"{name}_")]
+        if errors:
+            told = " ".join(
+                f"{value:.3f} m/s" if key.endswith("m_s") else f"{value:.4f} rad/s" for key, value in errors
+            )
+            return f", validation {told}"
+    return ""
+
+
+def _fill(
+    config: TrainingConfig, folder: Path, recordings: RecordedSequences, workers: int, on_progress: OnProgress
+) -> None:
+    """Make the sequences of the configuration that are not in the folder; recordings first, as they may be unusable."""
     missing = recordings.missing()
     for done, name in enumerate(recordings.fill(), 1):
         on_progress("split into windows", done, missing, name)
+    _simulate("simulated", config, folder, workers, on_progress)
+
+
+def _simulate(task: str, config: TrainingConfig, folder: Path, workers: int, on_progress: OnProgress) -> None:
+    cache, wanted = Cache(folder, config), config.data.sequences
+    for done, name in enumerate(cache.fill(workers), wanted - len(cache.missing()) + 1):
+        on_progress(task, done, wanted, name)

@@ -24,7 +24,7 @@ from neurove_core.io import Recording, UnknownSource
 from neurove_core.io.formats.pose_files import read_truth
 from neurove_core.sources import open_source
 from neurove_core.training.config import RecordedConfig, TrainingConfig
-from neurove_core.training.data import FORMAT, Sequence, save
+from neurove_core.training.data import FORMAT, Sequence, Sequences, Span, save
 from neurove_protocol.errors import InvalidField
 
 log = logging.getLogger(__name__)
@@ -91,6 +91,35 @@ class RecordedSequences:
             InvalidField: a recording has no such sequence.
         """
         return [path for found in self._found for path in self._paths_of(found)]
+
+    def split(self) -> tuple[list[Span], list[Span]]:
+        """The windows to train on, and those that are held out for validation: the end of each recording.
+
+        A recording that is too short to hold a segment out of it is trained on as a whole.
+
+        Raises:
+            InvalidField: a recording has no sequence that is long enough.
+        """
+        training: list[Span] = []
+        held: list[Span] = []
+        recipe = self._config.recipe
+        for found in self._found:
+            paths = self._paths_of(found)
+            if not recipe.validation_share:
+                training += map(Span, paths)
+            elif len(paths) > 1:
+                count = max(1, round(recipe.validation_share * len(paths)))
+                training += map(Span, paths[:-count])
+                held += map(Span, paths[-count:])
+            else:
+                windows = len(Sequences(paths).twists[0])
+                wanted = max(recipe.segment_windows, round(recipe.validation_share * windows))
+                first = max(recipe.most_windows, windows - wanted)
+                training.append(Span(paths[0], 0, first))
+                held += [Span(paths[0], first, windows)] if windows - first >= recipe.segment_windows else []
+                if windows - first < recipe.segment_windows:
+                    training[-1] = Span(paths[0])
+        return training, held
 
     def _paths_of(self, found: "_OpenRecording") -> list[Path]:
         folder, needed = self._folder_of(found), self._config.recipe.most_windows

@@ -49,6 +49,8 @@ class TrainingRun:
     step: int = 0
     cpu_s: float = 0.0
     curve: list[dict[str, float]] = field(default_factory=list)
+    validation: list[dict[str, float]] = field(default_factory=list)  # see `validation.Point`
+    best: dict[str, Tensor] = field(default_factory=dict)  # weights of the best validation; empty without one
     start: str = ""  # digest of the bundle that it began from, hex; empty if the seed initialised the weights
 
     @classmethod
@@ -84,10 +86,10 @@ class TrainingRun:
         batch = self.config.recipe.batch // self.ranks.count
         return self.config.recipe.model_copy(update={"batch": batch})
 
-    def bundle(self, provenance: str, metadata: Metadata | None = None) -> Bundle:
-        """Return the current model as a bundle."""
+    def bundle(self, provenance: str, metadata: Metadata | None = None, *, best: bool = False) -> Bundle:
+        """Return the current model as a bundle, or that of the best validation."""
         network = kinds.make(self.config.model)
-        network.load_state_dict(self.network.state_dict())
+        network.load_state_dict(self.best if best else self.network.state_dict())
         return Bundle(
             name=self.config.name,
             trained=True,
@@ -113,7 +115,8 @@ class TrainingRun:
                 tensors[f"adam.{index}.{name}"] = value
         tensors |= {"offset": self.offset, "scale": self.scale, "balance": torch.stack(list(self.balance))}
         metadata = {"config": self.config.model_dump(mode="json"), "step": self.step, "cpu_s": self.cpu_s}
-        metadata |= {"orders": orders, "curve": self.curve, "start": self.start}
+        tensors |= {f"best.{name}": tensor.contiguous() for name, tensor in self.best.items()}
+        metadata |= {"orders": orders, "curve": self.curve, "validation": self.validation, "start": self.start}
         stored = {name: tensor.cpu() for name, tensor in tensors.items()}
         write_atomically(path, safetensors.torch.save(stored, {_KEY: json.dumps(metadata)}))
 
@@ -152,6 +155,8 @@ class TrainingRun:
             run = cls(config, network, optimiser, offset, scale, np.random.default_rng())
             run.balance, run.ranks = Balance(*balance.unbind()), ranks
             run.step, run.cpu_s, run.curve = int(metadata["step"]), float(metadata["cpu_s"]), list(metadata["curve"])
+            run.validation = list(metadata.get("validation", []))
+            run.best = {n[5:]: tensor.to(ranks.device) for n, tensor in tensors.items() if n.startswith("best.")}
             run.start = str(metadata.get("start", ""))  # older checkpoints began from weights of the seed
             run.rng.bit_generator.state = orders[ranks.rank]
         except (KeyError, TypeError, ValueError, RuntimeError) as error:

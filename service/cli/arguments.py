@@ -54,6 +54,13 @@ def add_recording_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--time-unit", choices=("s", "ms", "us", "ns"), metavar="U", help=about)
 
 
+def add_lens_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the lens and the height of the camera, if the recording lacks them."""
+    about = "lens of the camera: YAML of ROS, Kalibr or OpenCV, or XML of OpenCV; FILE#NAME for one of several cameras"
+    parser.add_argument("--calibration", metavar="FILE", help=about)
+    parser.add_argument("--height", type=metres, metavar="M", help="height of the camera above the ground [m]")
+
+
 def add_playback_flags(parser: argparse.ArgumentParser, seconds_help: str) -> None:
     """Add how fast and how long a source is played."""
     parser.add_argument(
@@ -100,6 +107,13 @@ def client_config(args: argparse.Namespace) -> ClientConfig:
 def flags(args: argparse.Namespace, kind: type[ServiceConfig] | type[ClientConfig]) -> dict[str, Any]:
     """The settings that the command line gives; None for each that it does not give."""
     return {name: getattr(args, name, None) for name in kind.model_fields}
+
+
+def count(text: str) -> int:
+    """A whole number above 0."""
+    if not (text.isascii() and text.isdecimal() and 0 < int(text) < 1 << 31):
+        raise argparse.ArgumentTypeError(f"{text!r}: give a whole number above 0")
+    return int(text)
 
 
 def metres(text: str) -> float:

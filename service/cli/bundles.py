@@ -106,7 +106,11 @@ def keygen(args: argparse.Namespace) -> int:
     try:
         args.out.mkdir(parents=True, exist_ok=True)
         _write_new(private, signing_keys.private_pem(key), 0o600)
-        _write_new(public, signing_keys.public_pem(key.public_key()), 0o644)
+        try:
+            _write_new(public, signing_keys.public_pem(key.public_key()), 0o644)
+        except BaseException:
+            private.unlink()  # half a pair is no use, and blocks its name
+            raise
     except OSError as error:
         raise InvalidField("bundle keygen", "--out", str(args.out), error.strerror or str(error)) from None
     made = {"key_id": signing_keys.key_id(key.public_key()), "private": str(private), "public": str(public)}
@@ -201,10 +205,15 @@ def _public(path: Path) -> "Ed25519PublicKey":
 
 
 def _write_new(path: Path, data: bytes, mode: int) -> None:
+    """Write a new file with these permissions, or nothing."""
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
+        try:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        except BaseException:
+            path.unlink()
+            raise
 
 
 def add_bundle(parser: Parser) -> None:

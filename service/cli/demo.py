@@ -18,6 +18,7 @@ from typing import Any
 from rich.console import Console
 from rich.live import Live
 
+from neurove_core.files import write_atomically
 from neurove_protocol import Flag
 from neurove_protocol.control import StreamStatus
 from neurove_protocol.errors import EXIT_FAILURE, NeuroVEError
@@ -46,6 +47,8 @@ def run(
     *,
     sensor: str | None,
     topic: str | None,
+    calibration: str | None = None,
+    height_m: float | None = None,
     time_unit: str | None = None,
     speed: str,
     loop: bool,
@@ -61,6 +64,8 @@ def run(
         source: as sources.open_source.
         sensor: WIDTHxHEIGHT, if the source lacks it.
         topic: as sources.open_source.
+        calibration: as `neurove drive --calibration`.
+        height_m: height of the camera above the ground [m], if the source lacks it.
         time_unit: as sources.open_source.
         speed: as `neurove drive --speed`.
         loop: start again at the end.
@@ -83,6 +88,8 @@ def run(
     drive = ["drive", source, "--connect", endpoint, "--stream", STREAM, "--speed", speed, "--wait", "10", "--json"]
     drive += ["--sensor", sensor] if sensor else []
     drive += ["--topic", topic] if topic else []
+    drive += ["--calibration", calibration] if calibration else []
+    drive += ["--height", str(height_m)] if height_m else []
     drive += ["--time-unit", time_unit] if time_unit else []
     drive += ["--loop"] if loop else []
     drive += ["--seconds", str(duration_s)] if math.isfinite(duration_s) else []
@@ -202,7 +209,7 @@ def _draw(board: Board, file: str) -> None:
     console = Console(record=True, width=100, file=io.StringIO())
     console.print(board)
     svg = console.export_svg(title="neurove demo")
-    Path(file).write_text(re.sub(r"@font-face \{.*?\}", "", svg, flags=re.DOTALL), encoding="utf-8")
+    write_atomically(Path(file), re.sub(r"@font-face \{.*?\}", "", svg, flags=re.DOTALL).encode())
 
 
 def _summary(source: str, sent: dict[str, Any], status: StreamStatus | None, board: Board) -> dict[str, Any]:

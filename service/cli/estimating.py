@@ -11,7 +11,14 @@ from typing import TYPE_CHECKING, Any
 from neurove_protocol import CameraInfo, EventPacket, TwistEstimate
 from neurove_protocol.errors import EXIT_FAILURE, InvalidField, NeuroVEError
 from neurove_service import logs
-from neurove_service.cli.arguments import add_recording_flags, command, metres, refuse_existing, seconds, tell_faults
+from neurove_service.cli.arguments import (
+    add_lens_flags,
+    add_recording_flags,
+    command,
+    refuse_existing,
+    seconds,
+    tell_faults,
+)
 from neurove_service.cli.bars import event_count
 
 if TYPE_CHECKING:
@@ -119,6 +126,7 @@ def estimate(args: argparse.Namespace) -> int:
 
     from neurove_core import models
     from neurove_core.estimator import Estimator
+    from neurove_core.io.calibration import lens_of
     from neurove_core.io.formats.estimate_files import WRITERS, estimate_file
     from neurove_core.sources import open_source
 
@@ -130,7 +138,7 @@ def estimate(args: argparse.Namespace) -> int:
     if recording.endless and args.seconds is None:
         raise InvalidField("estimate", "RECORDING", args.source, "it never ends: give --seconds S")
     refuse_existing("estimate", "--out", path, args.source, force=args.force)
-    camera = _camera(recording, args.height)
+    camera = lens_of(recording, args.calibration, args.height)
     torch.set_num_threads(1)
     estimator = Estimator(models.find(args.model))
     offline = Offline(estimator, camera, getattr(recording, "stream", _STREAM))
@@ -147,16 +155,6 @@ def estimate(args: argparse.Namespace) -> int:
     print(json.dumps(summary) if args.json else "\n".join(_lines(summary)))
     tell_faults(recording)
     return EXIT_FAILURE if recording.faults.unread or not told.estimates else 0
-
-
-def _camera(recording: "Recording", height_m: float | None) -> CameraInfo | None:
-    """The lens of a recording, at the height that the user gives."""
-    camera = recording.camera(_STREAM)
-    if height_m is None:
-        return camera
-    if camera is None:
-        raise InvalidField("estimate", "--height", height_m, "a height needs a lens, and the recording gives none")
-    return CameraInfo(**(camera.model_dump() | {"height_m": height_m}))
 
 
 class _Told:
@@ -215,7 +213,7 @@ def add_estimate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help=about)
     about = "name of a built-in model, or file of a bundle; default `default`"
     parser.add_argument("--model", default="default", metavar="BUNDLE", help=about)
-    parser.add_argument("--height", type=metres, metavar="M", help="height of the camera above the ground [m]")
+    add_lens_flags(parser)
     add_recording_flags(parser)
     parser.add_argument("--seconds", type=seconds, metavar="S", help="seconds of the recording to read; default: all")
     parser.add_argument("--force", action="store_true", help="replace FILE if it exists")

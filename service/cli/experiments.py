@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from neurove_protocol.errors import EXIT_FAILURE, InvalidField
-from neurove_service.cli.arguments import commit, subcommand
+from neurove_service.cli.arguments import check_folder, commit, count, subcommand
 from neurove_service.cli.bars import progress
 from neurove_service.cli.parser import Parser
 
@@ -17,6 +17,7 @@ def reproduce_firing(args: argparse.Namespace) -> int:
     """Compare how often ALIF, LIF and LTC fire under one random current."""
     from neurove_core.experiments import firing
 
+    _check_out(args.out)
     report = firing.run(args.seed)
     files = firing.save(report, args.out) if args.out else []
     print(firing.to_json(report) if args.json else firing.to_markdown(report), end="")
@@ -29,6 +30,7 @@ def reproduce_repriming(args: argparse.Namespace) -> int:
     """Measure how settled the first estimates are after a model change."""
     from neurove_core.experiments import repriming
 
+    _check_out(args.out)
     on_terminal = sys.stderr.isatty()
     report = repriming.run(
         args.model,
@@ -50,6 +52,7 @@ def reproduce_sine(args: argparse.Namespace) -> int:
     from neurove_core.experiments.sine import report
     from neurove_service.cli.console import console
 
+    _check_out(args.out)
     models, seeds = args.models.split(","), range(args.seed, args.seed + args.seeds)
     command_line, made_by = shlex.join(["neurove", *sys.argv[1:]]), commit()
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
@@ -82,6 +85,7 @@ def reproduce_real(args: argparse.Namespace) -> int:
     """Check a model on real events that it was not tuned on."""
     from neurove_core.experiments import real
 
+    _check_out(args.out)
     rows, about = _real_rows(args.model, args.recordings, args.out)
     print(json.dumps(about | {"checks": rows}) if args.json else real.markdown(rows, real.title(about)), end="")
     if any(row["skipped"] is None for row in rows):
@@ -129,6 +133,8 @@ def reproduce_velocity(args: argparse.Namespace) -> int:
     experiment = run.Experiment(config, tuple(args.methods.split(",")), seeds, args.recordings, args.quick)
     out: Path = args.out or Path("runs") / config.name
     folder: Path = args.data or out / "data"
+    for path in (out, folder):
+        _check_out(path)
     found = []
     with progress() as show:
         for one in run.reproduce(experiment, folder, out, show, args.workers):
@@ -147,6 +153,12 @@ def reproduce_velocity(args: argparse.Namespace) -> int:
     if args.recordings:
         _real_rows("default", args.recordings, out)
     return 0
+
+
+def _check_out(folder: Path | None) -> None:
+    """Refuse a folder that cannot be written, before the experiment begins."""
+    if folder is not None:
+        check_folder("reproduce", "--out", folder)
 
 
 def _made_by() -> dict[str, str]:
@@ -186,7 +198,7 @@ def _add_firing(parser: argparse.ArgumentParser) -> None:
 def _add_repriming(parser: argparse.ArgumentParser) -> None:
     about = "name of a built-in model, or file of a bundle; default `default`"
     parser.add_argument("--model", default="default", metavar="BUNDLE", help=about)
-    parser.add_argument("--streets", type=int, default=6, metavar="N", help="number of held-out streets; default 6")
+    parser.add_argument("--streets", type=count, default=6, metavar="N", help="number of held-out streets; default 6")
     about = "numbers of windows to replay; default 8,16,32,64"
     parser.add_argument("--primed", type=_numbers, metavar="N,...", help=about)
     _add_out(parser, "folder for table, figures and picture")
@@ -219,21 +231,21 @@ def _add_velocity(parser: argparse.ArgumentParser) -> None:
     about = "another recipe, a TOML file or a name; default: that of the experiment"
     parser.add_argument("--config", metavar="CONFIG", help=about)
     about = "number of updates; default: that of the configuration"
-    parser.add_argument("--steps", type=int, metavar="N", help=about)
+    parser.add_argument("--steps", type=count, metavar="N", help=about)
     parser.add_argument("--data", type=Path, metavar="DIR", help="folder for the sequences; default OUT/data")
     about = "folder with MVSEC's poses, for Table III"
     parser.add_argument("--recordings", type=Path, metavar="DIR", help=about)
     _add_out(parser, "folder for methods, tables and figures; default runs/velocity")
     about = "number of processes that simulate; default 1"
-    parser.add_argument("--workers", type=int, default=1, metavar="N", help=about)
-    parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads that train; default 1")
+    parser.add_argument("--workers", type=count, default=1, metavar="N", help=about)
+    parser.add_argument("--threads", type=count, default=1, metavar="N", help="threads that train; default 1")
     about = "tiny networks and sequences, to check that the command works; its figures mean nothing"
     parser.add_argument("--quick", action="store_true", help=about)
 
 
 def _add_seeds(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="first seed; default 0")
-    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="number of seeds; default 1")
+    parser.add_argument("--seeds", type=count, default=1, metavar="N", help="number of seeds; default 1")
 
 
 def _add_out(parser: argparse.ArgumentParser, about: str) -> None:

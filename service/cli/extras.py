@@ -7,7 +7,7 @@ from neurove_core.extras import MissingExtra
 
 EXTRAS: Final[dict[str, tuple[str, ...]]] = {
     "serve": ("cryptography", "numba", "safetensors", "torch"),
-    "recordings": ("h5py", "hdf5plugin", "lz4", "mcap", "numba", "PIL", "rosbags", "scipy", "zstandard"),
+    "recordings": ("h5py", "hdf5plugin", "lz4", "mcap", "numba", "PIL", "rosbags", "ruamel", "scipy", "zstandard"),
     "train": ("matplotlib", "tensorboard"),
     "experiments": ("matplotlib", "scipy"),
     "bench": ("dv_processing", "faery", "loguru", "snntorch", "tonic"),

@@ -15,6 +15,7 @@ from neurove_protocol.errors import EXIT_FAILURE, InvalidField, NeuroVEError
 from neurove_protocol.keys import check_name
 from neurove_service.cli.arguments import (
     add_client_flags,
+    add_lens_flags,
     add_recording_flags,
     client_config,
     command,
@@ -104,10 +105,7 @@ def _write_mcap(recording: Any, path: Path, progress: Progress) -> tuple[str, ..
 def _write_dsec(recording: Any, path: Path, progress: Progress) -> tuple[str, ...]:
     from neurove_core.io.formats.hdf5.dsec_write import write_dsec
 
-    try:
-        return write_dsec(recording, path, progress).left_out
-    except OSError as error:
-        raise InvalidField("recording", "FILE", str(path), error.strerror or str(error)) from None
+    return write_dsec(recording, path, progress).left_out
 
 
 WRITERS: Final[dict[str, Callable[[Any, Path, Progress], tuple[str, ...]]]] = {".mcap": _write_mcap, ".h5": _write_dsec}
@@ -155,11 +153,13 @@ def _write(recording: Any, path: Path, *, as_json: bool) -> int:
 def info(args: argparse.Namespace) -> int:
     """Show what a recording holds: sensor, counts, rates, IMU and truth."""
     from neurove_core.io import summary
+    from neurove_core.io.calibration import with_lens
     from neurove_core.sources import open_source
     from neurove_service.cli.console import console
     from neurove_service.cli.views import survey_table
 
-    recording = open_source(args.source, args.sensor, args.topic, args.time_unit)
+    opened = open_source(args.source, args.sensor, args.topic, args.time_unit)
+    recording = with_lens(opened, args.calibration, args.height)
     duration_s = args.seconds if args.seconds is not None else (_ENDLESS_S if recording.endless else None)
     surveyed = summary.survey(recording, duration_s)
     if args.plot:
@@ -236,6 +236,7 @@ def add_info(parser: argparse.ArgumentParser) -> None:
     command(parser, info)
     parser.add_argument("source", metavar="SOURCE", help="recording of any format, pattern:// or sim://")
     add_recording_flags(parser)
+    add_lens_flags(parser)
     most = f"default: all, of an endless source {_ENDLESS_S:.0f} s"
     parser.add_argument("--seconds", type=duration, metavar="S", help=f"seconds of the source to read; {most}")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw events, rate and truth (.png or .svg)")

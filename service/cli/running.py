@@ -12,6 +12,7 @@ from neurove_protocol.errors import EXIT_FAILURE, InvalidField
 from neurove_service import logs
 from neurove_service.cli.arguments import (
     add_client_flags,
+    add_lens_flags,
     add_playback_flags,
     add_service_flags,
     add_source,
@@ -55,15 +56,17 @@ def serve(args: argparse.Namespace) -> int:
 
 def drive(args: argparse.Namespace) -> int:
     """Publish a recording or a synthetic source as one stream; publish a packet log as it was recorded."""
+    from neurove_core.io.calibration import lens_of
     from neurove_core.sources import open_source
     from neurove_service.clients import ask
 
     stop = stop_on_signals(with_parent=args.with_parent)
     config = client_config(args)
     recording = open_source(args.source, args.sensor, args.topic, args.time_unit)
+    lens = lens_of(recording, args.calibration, args.height)
     wait = Wait(config, args.wait, stop)
     with wait.connect(config) as transport:
-        player = _player(args, recording, transport, config.keys)
+        player = _player(args, recording, lens, transport, config.keys)
         if args.wait and not _listened_to(player, wait, stop):
             hint = "; if one runs, does it accept this certificate?" if config.zenoh_config else ""
             raise ask.NoService(f"no service subscribed to stream {player.label} within {args.wait:g} s{hint}")
@@ -94,7 +97,7 @@ def _listened_to(player: Any, wait: Wait, stop: threading.Event) -> bool:
     return player.wait_for_listener(wait.left_s, stop) or stop.is_set()
 
 
-def _player(args: argparse.Namespace, recording: Any, transport: Any, keys: Any) -> Any:
+def _player(args: argparse.Namespace, recording: Any, lens: Any, transport: Any, keys: Any) -> Any:
     """A replay for a packet log, a driver for any other recording; both have the same methods."""
     from neurove_core.io.formats.packet_log.reader import McapRecording
     from neurove_service.clients.driver import Driver
@@ -103,22 +106,29 @@ def _player(args: argparse.Namespace, recording: Any, transport: Any, keys: Any)
     if (
         not isinstance(recording, McapRecording) or args.stream
     ):  # the name is in every packet, so another name means new packets
-        return Driver(recording, args.stream or _STREAM, transport, keys)
+        return Driver(recording, args.stream or _STREAM, transport, keys, lens)
     if args.loop:
         why = "a replay would repeat sequence numbers and times; give --stream NAME to encode the events again"
         raise InvalidField("drive", "--loop", True, why)
-    return Replay(recording, recording.stream if args.topic else None, transport, keys)
+    given = args.calibration is not None or args.height is not None
+    if given and not args.topic and len(recording.all_streams) > 1:
+        why = f"this packet log has the streams {', '.join(recording.all_streams)}: choose one with --topic"
+        raise InvalidField("drive", "--calibration, --height", args.calibration or args.height, why)
+    return Replay(recording, recording.stream if args.topic else None, transport, keys, lens if given else None)
 
 
 def demo(args: argparse.Namespace) -> int:
     """Run driver, service and consumer on any source, then print a summary."""
+    from neurove_core.io.calibration import with_lens
     from neurove_core.sources import open_source
     from neurove_service.cli.console import console
     from neurove_service.cli.demo import run
 
     stop = stop_on_signals()
     logs.configure("warning")
-    endless = open_source(args.source, args.sensor, args.topic, args.time_unit).endless
+    opened = open_source(args.source, args.sensor, args.topic, args.time_unit)
+    recording = with_lens(opened, args.calibration, args.height)
+    endless = recording.endless
     shown = console(stderr=args.json)
     duration_s = args.seconds
     if duration_s is None:
@@ -127,6 +137,8 @@ def demo(args: argparse.Namespace) -> int:
         args.source,
         sensor=str(args.sensor) if args.sensor else None,
         topic=args.topic,
+        calibration=args.calibration,
+        height_m=args.height,
         time_unit=args.time_unit,
         speed="max" if math.isinf(args.speed) else str(args.speed),
         loop=args.loop,
@@ -177,6 +189,7 @@ def show_config(args: argparse.Namespace) -> int:
 def add_demo(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `neurove demo`."""
     add_source(command(parser, demo), nargs="?", default=DEFAULT_SOURCE)
+    add_lens_flags(parser)
     most = f"{_DEFAULT_DEMO_S:.0f} s of an endless source that no terminal shows"
     add_playback_flags(parser, f"seconds of the source to play; default: until its end or Ctrl-C, {most}")
     about = "bundle to serve, or the name of a built-in model; default `default`"
@@ -193,6 +206,7 @@ def add_serve(parser: argparse.ArgumentParser) -> None:
 def add_drive(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `neurove drive`."""
     add_source(command(parser, drive))
+    add_lens_flags(parser)
     add_client_flags(parser)
     about = f"name of the stream, one key chunk; default {_STREAM}, and for a packet log the names in it"
     parser.add_argument("--stream", metavar="NAME", help=about)

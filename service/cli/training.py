@@ -7,7 +7,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurove_service.cli.arguments import add_recording_flags, check_folder, command, tell_faults
+from neurove_service.cli.arguments import (
+    add_lens_flags,
+    add_recording_flags,
+    check_folder,
+    command,
+    count,
+    tell_faults,
+)
 from neurove_service.cli.bars import event_count, progress
 
 if TYPE_CHECKING:
@@ -41,9 +48,9 @@ def train(args: argparse.Namespace) -> int:
             calibration_sequences=args.calibration_sequences,
             on_progress=show,
         )
-    size = path.stat().st_size
-    summary = {"bundle": str(path), "bytes": size, "run": str(out / loop.RUN_JSON)}
-    print(json.dumps(summary) if args.json else f"wrote {path}, {size:,} bytes")
+    size, told = path.stat().st_size, json.loads((out / loop.RUN_JSON).read_bytes())["validated"]
+    summary = {"bundle": str(path), "bytes": size, "run": str(out / loop.RUN_JSON), "validated": told}
+    print(json.dumps(summary) if args.json else "\n".join([*told, f"wrote {path}, {size:,} bytes"]))
     return 0
 
 
@@ -80,6 +87,7 @@ def evaluate(args: argparse.Namespace) -> int:
     from neurove_core.estimator import Estimator
     from neurove_core.evaluation import evaluate as evaluation
     from neurove_core.geometry import motion
+    from neurove_core.io.calibration import with_lens
     from neurove_core.io.formats.pose_files import read_truth
     from neurove_core.sources import open_source
 
@@ -88,7 +96,8 @@ def evaluate(args: argparse.Namespace) -> int:
     given = motion.twists(read_truth(args.truth)) if args.truth else None
     if args.plot:
         check_folder("evaluate", "--plot", args.plot)
-    sources = [(source, open_source(source, args.sensor, args.topic, args.time_unit)) for source in args.recordings]
+    opened = [(source, open_source(source, args.sensor, args.topic, args.time_unit)) for source in args.recordings]
+    sources = [(source, with_lens(one, args.calibration, args.height)) for source, one in opened]
     truths = [given or _truth(source, recording) for source, recording in sources]
     estimator.warm_up()
     evaluated = []
@@ -179,12 +188,12 @@ def add_train(parser: argparse.ArgumentParser) -> None:
     about = "initialise weights from BUNDLE, a file or `default`, instead of randomly"
     parser.add_argument("--start", metavar="BUNDLE", help=about)
     about = "number of devices that share each batch; default 1"
-    parser.add_argument("--devices", type=int, default=1, metavar="N", help=about)
+    parser.add_argument("--devices", type=count, default=1, metavar="N", help=about)
     about = "auto, cpu or cuda; default auto: GPUs if there are any"
     parser.add_argument("--device", default="auto", metavar="KIND", help=about)
     _add_workers(parser)
     about = "threads of each device's process; default 1"
-    parser.add_argument("--threads", type=int, default=1, metavar="N", help=about)
+    parser.add_argument("--threads", type=count, default=1, metavar="N", help=about)
     _add_calibration(parser, "; 0: no uncertainty")
 
 
@@ -209,12 +218,13 @@ def add_evaluate(parser: argparse.ArgumentParser) -> None:
     about = "poses of the camera, on the recording's clock; default: the truth in the recording"
     parser.add_argument("--truth", type=Path, metavar="FILE", help=about)
     add_recording_flags(parser)
+    add_lens_flags(parser)
     parser.add_argument("--plot", type=Path, metavar="DIR", help="draw truth and estimate over time into this folder")
 
 
 def _add_workers(parser: argparse.ArgumentParser) -> None:
     about = "number of processes that simulate; default 1"
-    parser.add_argument("--workers", type=int, default=1, metavar="N", help=about)
+    parser.add_argument("--workers", type=count, default=1, metavar="N", help=about)
 
 
 def _add_calibration(parser: argparse.ArgumentParser, none: str) -> None:

@@ -1,5 +1,6 @@
 """Tables for people: health, models, recordings; drawn with rich. The live table is in `board`."""
 
+import math
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Group, RenderableType
@@ -7,6 +8,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
+from neurove_protocol import CameraInfo
 from neurove_protocol.control import HealthReply, ModelsReply, StreamStatus
 from neurove_service.cli.board import OLD, VERDICT_STYLE, WIDTH, age_text
 
@@ -68,6 +70,7 @@ def survey_table(summary: "Summary") -> RenderableType:
     """The contents of a recording."""
     table = Table(show_header=False, **_PLAIN)
     table.add_row("sensor", str(summary.sensor))
+    table.add_row("lens", _lens_text(summary.lens))
     on = "" if summary.on_fraction is None else f", {100 * summary.on_fraction:.1f} % ON"
     table.add_row("events", f"{summary.events:,}{on}")
     if summary.first_us is not None and summary.last_us is not None:
@@ -96,6 +99,20 @@ def survey_table(summary: "Summary") -> RenderableType:
             if mean is not None and peak is not None:
                 table.add_row(f"  {what}", f"mean {mean:.3f}, peak {peak:.3f} {unit}")
     return Panel(table, title=summary.name, title_align="left", width=WIDTH)
+
+
+def _lens_text(lens: CameraInfo | None) -> str:
+    from neurove_core.geometry.camera import field_of_view_deg
+
+    if lens is None:
+        return "unknown: --calibration FILE gives it"
+    text = f"{lens.lens}, fx {lens.fx:.2f} fy {lens.fy:.2f} cx {lens.cx:.2f} cy {lens.cy:.2f} px"
+    bent = any(lens.distortion)
+    text += f", distortion {' '.join(f'{one:.4g}' for one in lens.distortion)}" if bent else ", no distortion"
+    x, y = field_of_view_deg(lens)
+    text += "" if math.isnan(x + y) else f"\nfield of view {x:.0f} x {y:.0f} deg"
+    height = f"{lens.height_m:g} m above the ground" if lens.height_m else "height unknown: --height M gives it"
+    return f"{text}\n{height}"
 
 
 def _spread(mean: tuple[float, ...], std: tuple[float, ...], unit: str) -> str:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from neurove_core.io import BrokenRecording, Recording
 from neurove_core.io.packets import Slice, slices
-from neurove_protocol import EventPacket, Events
+from neurove_protocol import CameraInfo, EventPacket, Events
 from neurove_protocol.camera import SCHEMA as CAMERA_SCHEMA
 from neurove_protocol.events import SCHEMA as EVENTS_SCHEMA
 from neurove_protocol.events import encode_packet
@@ -49,18 +49,21 @@ class Driver:
         stream: name of the stream.
         transport: an open session.
         keys: keys of the deployment.
+        lens: of the camera; by default that of the recording.
     """
 
-    def __init__(self, recording: Recording, stream: str, transport: Transport, keys: Keys) -> None:
-        self._recording, self._stream = recording, stream
+    def __init__(
+        self, recording: Recording, stream: str, transport: Transport, keys: Keys, lens: CameraInfo | None = None
+    ) -> None:
+        self._recording, self._stream, self._lens = recording, stream, lens
         self._transport, self._keys = transport, keys
         self._publisher = transport.publisher(keys.events(stream), EVENTS_SCHEMA)
         self._announce_camera()
 
     def _announce_camera(self) -> None:
-        camera = self._recording.camera(self._stream)
+        camera = self._lens or self._recording.camera(self._stream)
         if camera is not None:
-            payload = camera.encode()
+            payload = CameraInfo(**(camera.model_dump() | {"stream": self._stream})).encode()
             self._transport.answer(self._keys.camera(self._stream), lambda _: payload)
             self._transport.put(self._keys.camera(self._stream), payload, CAMERA_SCHEMA)
 

@@ -10,6 +10,7 @@ from neurove_core.io import BrokenRecording
 from neurove_core.io.formats.packet_log.reader import LIMITS, McapRecording, RecordedPacket
 from neurove_core.io.order import MAX_GAP_US
 from neurove_protocol.camera import SCHEMA as CAMERA_SCHEMA
+from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.events import SCHEMA as EVENTS_SCHEMA
 from neurove_protocol.events import EventPacket, decode_packet
@@ -56,16 +57,25 @@ class Replay:
         only: name of the stream to publish; None for all streams.
         transport: an open session.
         keys: keys of the deployment.
+        lens: announced for every stream instead of the recorded ones.
     """
 
-    def __init__(self, recording: McapRecording, only: str | None, transport: Transport, keys: Keys) -> None:
+    def __init__(
+        self,
+        recording: McapRecording,
+        only: str | None,
+        transport: Transport,
+        keys: Keys,
+        lens: CameraInfo | None = None,
+    ) -> None:
         self._recording, self._only = recording, only
         self._transport, self._keys = transport, keys
         names = [only] if only else recording.all_streams
         self._publishers: dict[str, Publisher] = {
             name: transport.publisher(keys.events(name), EVENTS_SCHEMA) for name in names
         }
-        for name, payload in recording.cameras().items():
+        cameras = recording.cameras() if lens is None else {name: _named(lens, name) for name in names}
+        for name, payload in cameras.items():
             if name in self._publishers:
                 self._announce(keys.camera(name), payload)
 
@@ -125,6 +135,10 @@ class Replay:
         except BrokenRecording as error:
             return sent._replace(broken=error)
         return sent
+
+
+def _named(lens: CameraInfo, stream: str) -> bytes:
+    return CameraInfo(**(lens.model_dump() | {"stream": stream})).encode()
 
 
 def _read(recorded: RecordedPacket) -> EventPacket | None:

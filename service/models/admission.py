@@ -4,8 +4,10 @@ import contextlib
 import math
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from torch import nn
 
 from neurove_core.estimator import Estimator
 from neurove_core.ingest.windows import Window
@@ -19,6 +21,17 @@ COPIES = 2
 TIMED_WINDOWS = 128
 _MAX_SLOW = TIMED_WINDOWS // 100 + 1
 """If more windows than this exceed a bound, the 99th percentile exceeds it whatever the other windows take."""
+
+_BUSY = 0.25
+"""Share of the cells of a busy window that have events."""
+
+_FASTEST_PER_S = 12e9
+"""Additions of a weight per second that are believed possible: four times those measured on a core with AVX2, 2.8e9."""
+
+_UPDATE = 4  # additions that the update of a neuron amounts to
+_COPIES_OF_STATE = 6  # currents, membranes and spikes of all layers during a window, and the state of a stream
+_HOPELESS = 3.0
+"""A model whose first windows take this many times the bound is refused without more of them."""
 
 _MEMINFO = Path("/proc/meminfo")
 _CGROUP = Path("/sys/fs/cgroup")
@@ -43,6 +56,56 @@ def free_bytes(meminfo: Path = _MEMINFO, cgroup: Path = _CGROUP) -> int | None:
 def weight_bytes(model: Bundle) -> int:
     """Size of a model's weights [bytes]."""
     return sum(tensor.numel() * tensor.element_size() for tensor in model.network.state_dict().values())
+
+
+class Cost(NamedTuple):
+    """What a window of a model costs at least, from the shapes of its network."""
+
+    additions: float
+    working_bytes: int
+
+
+def cost(model: Bundle) -> Cost:
+    """What a busy window costs at least, whatever the weights: events reach the first layer, neurons are updated."""
+    rows, columns = model.config.canonical.height, model.config.canonical.width
+    first, neurons = 0.0, 2 * model.config.window.bins * rows * columns
+    for layer in model.network.modules():
+        if isinstance(layer, nn.Conv2d):
+            rows, columns = -(-rows // layer.stride[0]), -(-columns // layer.stride[1])
+            neurons += layer.out_channels * rows * columns
+            first = first or _BUSY * layer.weight[0].numel() * layer.out_channels * rows * columns
+    return Cost(first + _UPDATE * neurons, 4 * _COPIES_OF_STATE * neurons)
+
+
+def check_cost(model: Bundle, free: int | None, share: float = 1.0) -> None:
+    """Refuse a model by its configuration alone, before anything of it runs.
+
+    Args:
+        model: not yet loaded into an engine.
+        free: free memory [bytes]; None passes.
+        share: bound of the time for a window, as a share of the window's duration.
+
+    Raises:
+        NoMemory: its weights and the state of a window might not fit into memory.
+        TooSlow: it would need a core four times as fast as the one that was measured; `p99_ms` is then an estimate.
+    """
+    least = cost(model)
+    check_memory(model.name, weight_bytes(model) + least.working_bytes // COPIES, free)
+    least_ms, bound_ms = 1e3 * least.additions / _FASTEST_PER_S, share * model.config.window.duration_us / 1e3
+    if least_ms > bound_ms:
+        raise TooSlow(model.name, least_ms, bound_ms)
+
+
+def check_first_windows(estimator: Estimator, share: float = 1.0) -> None:
+    """Refuse a model whose first windows take a multiple of the bound, before it is warmed up.
+
+    Raises:
+        TooSlow: the quicker one of two windows does.
+    """
+    bound_ms = share * estimator.config.window.duration_us / 1e3
+    least_ms = min(window_times_ms(estimator, windows=2))
+    if least_ms > _HOPELESS * bound_ms:
+        raise TooSlow(estimator.bundle.name, least_ms, bound_ms)
 
 
 def check_memory(name: str, model_bytes: int, free: int | None) -> None:

@@ -14,7 +14,7 @@ from neurove_core.estimator import Estimator
 from neurove_core.models.bundle import Bundle
 from neurove_protocol.errors import Conflict, InvalidField, NeuroVEError, NothingBefore
 from neurove_service import logs
-from neurove_service.models import admission, swap
+from neurove_service.models import admission, precompile, swap
 from neurove_service.models.library import MIN_DIGEST, Library
 from neurove_service.models.plan import Plan, SharedPlan
 from neurove_service.models.probation import OnTrial, Probation, no_trial
@@ -162,14 +162,19 @@ class Change:
 
     def _load(self, found: Bundle) -> Estimator:
         """Load a model, warm it up, and check its memory, its golden test and its speed."""
-        admission.check_memory(found.name, admission.weight_bytes(found), self._context.free_bytes())
+        free, share = self._context.free_bytes(), self._rules.warm_up_share
+        admission.check_cost(found, free, share)
+        if self._plan.shapes.need_child(found.config, free):
+            self._report("compiling", "code for a network of this shape, in a process of its own")
+            precompile.in_child(found.config, self._plan.closing)
         estimator = Estimator(found)
         self._report("loaded", f"{found.info.parameters:,} parameters")
+        admission.check_first_windows(estimator, share)
         estimator.warm_up()
+        self._plan.shapes.add(found.config)
         self_test.check(estimator)
-        p99_ms = admission.check_speed(estimator, self._rules.warm_up_share)
-        window_ms = estimator.config.window.duration_us / 1e3
-        self._report("warmed", f"p99 {p99_ms:.1f} ms for a window of {window_ms:g} ms")
+        p99_ms = admission.check_speed(estimator, share)
+        self._report("warmed", f"p99 {p99_ms:.1f} ms for a window of {found.config.window.duration_us / 1e3:g} ms")
         return estimator
 
     def _accept_trial(self) -> None:

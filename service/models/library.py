@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from neurove_core import models
+from neurove_core.files import Stamp, stamp, why_unreadable
 from neurove_core.models import bundle
 from neurove_core.models.bundle import Bundle
 from neurove_protocol.control import ModelInfo
@@ -21,7 +22,7 @@ class Available(NamedTuple):
     """Models that can be activated now."""
 
     models: tuple[ModelInfo, ...]
-    unreadable: dict[str, str]  # file name, or digest of a pushed model -> reason
+    unreadable: dict[str, str]  # file name, digest of a pushed model, or the folder of models -> reason
 
 
 class _Read(NamedTuple):
@@ -37,7 +38,7 @@ def nothing_pushed() -> dict[str, Path]:
 class Library:
     """The built-in models, the model given at the start, those of a folder and those that were pushed.
 
-    A file is read once, and again when its size or its modification time changes.
+    A file is read once, and again when it changes or another one replaces it.
 
     Args:
         models_dir: the operator's folder of bundles.
@@ -46,7 +47,7 @@ class Library:
 
     def __init__(self, models_dir: Path | None = None, pushed: Files = nothing_pushed) -> None:
         self._models_dir, self._pushed = models_dir, pushed
-        self._read: dict[tuple[Path, int, int], _Read] = {}
+        self._read: dict[Path, tuple[Stamp, _Read]] = {}
         self._given: Bundle | None = None
 
     def open(self, model: str) -> Bundle:
@@ -63,6 +64,8 @@ class Library:
         """All models, and the files that are no models."""
         found = {one.digest: one.info for one in self._in_memory()}
         unreadable = {}
+        if self._models_dir is not None and (why := why_unreadable(self._models_dir)):
+            unreadable[str(self._models_dir)] = why
         for name, path, digest in self._files():
             read = self._known(path, digest)
             if read.info is None:
@@ -116,15 +119,13 @@ class Library:
         ]
 
     def _known(self, path: Path, digest: str | None) -> _Read:
-        try:
-            about = path.stat()
-        except OSError as error:
-            return _Read(None, error.strerror or str(error))
-        key = (path, about.st_size, about.st_mtime_ns)
-        if key not in self._read:
-            self._read = {known: read for known, read in self._read.items() if known[0] != path}
-            self._read[key] = _read(path, digest)
-        return self._read[key]
+        found = stamp(path)
+        if found is None:
+            return _Read(None, "the file cannot be read")
+        known = self._read.get(path)
+        if known is None or known[0] != found:
+            known = self._read[path] = found, _read(path, digest)
+        return known[1]
 
 
 def _read(path: Path, digest: str | None) -> _Read:

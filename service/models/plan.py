@@ -10,6 +10,7 @@ from neurove_core.estimator import Estimator
 from neurove_core.models.bundle import Bundle
 from neurove_protocol.errors import Conflict
 from neurove_service import logs
+from neurove_service.models.precompile import Shapes
 from neurove_service.models.progress import OnProgress, Progress
 from neurove_service.streams.model_source import StreamView
 from neurove_service.streams.roles import Roles, Serving
@@ -77,6 +78,7 @@ class SharedPlan:
         self.rolled_back: Serving | None = None  # the newest model that was rolled back
         self.condition = threading.Condition()  # notified at each new plan
         self.passed: set[str] = set()  # digests of the models that need no probation any more
+        self.shapes = Shapes()
         self.closing = threading.Event()
         self._one_change = threading.Lock()
         self._streams: weakref.WeakSet[StreamView] = weakref.WeakSet()

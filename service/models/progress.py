@@ -7,6 +7,7 @@ Step = Literal[
     "fetching",
     "staged",
     "verified",
+    "compiling",
     "loaded",
     "warmed",
     "priming",

@@ -4,12 +4,10 @@ import hashlib
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from neurove_core.files import read_whole
+from neurove_core.files import Stamp, read_whole, stamp
 from neurove_core.models import bundle, manifest
 from neurove_protocol.errors import NeuroVEError
 from neurove_service.models.signatures import Signed, Verify
-
-_Stamp = tuple[int, int] | None
 
 
 class SignedFiles:
@@ -22,8 +20,8 @@ class SignedFiles:
 
     def __init__(self, paths: Callable[[], Iterable[Path]], verify: Verify) -> None:
         self._paths, self._verify = paths, verify
-        self._digests: dict[Path, tuple[_Stamp, str]] = {}
-        self._results: dict[Path, tuple[tuple[_Stamp, _Stamp], Signed | NeuroVEError]] = {}
+        self._digests: dict[Path, tuple[Stamp | None, str]] = {}
+        self._results: dict[Path, tuple[tuple[Stamp | None, Stamp | None], Signed | NeuroVEError]] = {}
 
     def signed(self, digest: str) -> Signed:
         """The signature state of a model; a model without a file, such as a built-in one, is unsigned.
@@ -38,7 +36,7 @@ class SignedFiles:
 
     def _signed(self, path: Path) -> Signed:
         signature = path.with_name(path.name + manifest.SUFFIX)
-        key = (_stamp(path), _stamp(signature))
+        key = (stamp(path), stamp(signature))
         known = self._results.get(path)
         if known is None or known[0] != key:
             result: Signed | NeuroVEError
@@ -52,22 +50,13 @@ class SignedFiles:
         return known[1]
 
     def _digest_of(self, path: Path) -> str | None:
-        stamp = _stamp(path)
-        if stamp is None or stamp[0] > bundle.MAX_BYTES:
+        stamped = stamp(path)
+        if stamped is None or stamped.size > bundle.MAX_BYTES:
             return None
         known = self._digests.get(path)
-        if known is None or known[0] != stamp:
+        if known is None or known[0] != stamped:
             try:
-                known = self._digests[path] = stamp, hashlib.sha256(read_whole(path)).hexdigest()
+                known = self._digests[path] = stamped, hashlib.sha256(read_whole(path)).hexdigest()
             except OSError:
                 return None
         return known[1]
-
-
-def _stamp(path: Path) -> _Stamp:
-    """Size and modification time of a file [bytes, ns]; None if it does not exist."""
-    try:
-        about = path.stat()
-    except OSError:
-        return None
-    return about.st_size, about.st_mtime_ns

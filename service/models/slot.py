@@ -63,6 +63,7 @@ class ModelSlot:
         log.info("compiling the kernels of the model; `ready` follows", model=name, takes=takes)
         estimator.warm_up()
         self._shared = SharedPlan(Serving(estimator, 0), previous)
+        self._shared.shapes.add(estimator.config)
         self._golden_fault = golden_fault(estimator)
         if self._golden_fault:
             log.error("golden test of the first model fails", why=self._golden_fault)

@@ -33,6 +33,9 @@ EVENTS = 400
 """Events per packet; one packet per window."""
 
 
+MAX_P99_MS = 100.0
+"""Bound of the 99th percentile of an estimate's age during changes [ms]."""
+
 PAUSE_S = 0.2
 """Pause between two changes [s]."""
 
@@ -115,6 +118,22 @@ def gaps(estimates: list[TwistEstimate]) -> list[Gap]:
     return found
 
 
+def ages_ms(estimates: list[TwistEstimate]) -> Any:
+    """How much later each estimate is published than the quickest one, by the time of its window [ms].
+
+    It includes what the driver, the link and the queue of the node add, because cameras send in the pace of windows.
+    """
+    late = np.array([one.trace.published_ns / 1e6 - one.end_us / 1e3 for one in estimates])
+    return late - late.min()
+
+
+def percentiles(ages: Any) -> dict[str, float]:
+    """Median, 99th percentile and largest value."""
+    return {"p50": round(float(np.median(ages)), 1), "p99": round(float(np.percentile(ages, 99)), 1)} | {
+        "most": round(float(ages.max()), 1)
+    }
+
+
 def follows(before: TwistEstimate, after: TwistEstimate) -> bool:
     """Whether every window between two estimates was answered once; an estimate that the listener missed has a seq."""
     return after.seq > before.seq and after.start_us - before.end_us == (after.seq - before.seq - 1) * WINDOW_US
@@ -175,6 +194,7 @@ def run(swaps: int, bad: int, streams: int, quiet_s: float = 5.0) -> dict[str, A
     found = [gap._replace(stream=name) for name, one in of.items() for gap in gaps(one[calm[name] :])]
     longest = sorted(found, reverse=True)[:8]
     without = max(gap.ms for name, one in of.items() for gap in gaps(one[skip[name] : calm[name]]))
+    ages = {name: ages_ms(one[skip[name] :]) for name, one in of.items()}
     model_kib = made.model_bytes >> 10
     quarter = resident[-max(2, len(resident) // 4) :]
     return {
@@ -184,6 +204,8 @@ def run(swaps: int, bad: int, streams: int, quiet_s: float = 5.0) -> dict[str, A
         "lost_or_doubled": sum(not follows(a, b) for one in of.values() for a, b in pairwise(one)),
         "not_received": sum(b.seq - a.seq - 1 for one in of.values() for a, b in pairwise(one) if follows(a, b)),
         "lost": {status.stream: status.lost.nonzero() for status in health.streams},
+        "age_ms_without": percentiles(np.concatenate([ages[n][: calm[n] - skip[n]] for n in names])),
+        "age_ms_with": percentiles(np.concatenate([ages[n][calm[n] - skip[n] :] for n in names])),
         "gap_ms_without": round(without, 1),
         "gap_ms_with": round(longest[0].ms, 1),
         "longest_gaps": [f"{gap.ms:.1f} ms ({gap.late_ms:.1f} here) at {marks.at(gap.at_ns)}" for gap in longest],
@@ -214,6 +236,7 @@ def broken(report: dict[str, Any]) -> list[str]:
         "no window lost or answered twice": not report["lost_or_doubled"] and not any(report["lost"].values()),
         "every bad bundle refused with its own reason": not report["not_refused"] and not report["wrong_reason"],
         "the active model is the one of the last change": not report["active_is_wrong"] and not report["rollbacks"],
+        "99 % of the estimates within 100 ms": report["age_ms_with"]["p99"] <= MAX_P99_MS,
         "a gap at most one window longer": report["gap_ms_with"] <= report["gap_ms_without"] + WINDOW_US / 1e3,
         "at most 1.5 models more": memory["grown_by_models"] <= 1.5,
         "flat over the last quarter": flat,

@@ -16,7 +16,7 @@ from typing import IO, Any, Final, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.files import atomic_path
+from neurove_core.files import atomic_path, write_errors
 from neurove_core.geometry.motion import Poses, Twists, twists
 from neurove_core.io.archive import BROKEN_ZIP, member
 from neurove_core.io.checked import Piece, cleaned, numbered
@@ -222,7 +222,7 @@ def write(
     """
     raw = path.with_name(path.name + ".events")
     try:
-        with raw.open("wb") as file:
+        with write_errors(path, raw), raw.open("wb") as file:
             n = sum(file.write(np.ascontiguousarray(part, RECORD).tobytes()) for part in events) // RECORD.itemsize
         small: dict[str, Any] = {
             "width": np.int64(sensor.width),

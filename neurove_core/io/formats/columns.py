@@ -99,7 +99,7 @@ def by_values(rows: NDArray[np.float64], noun: str = "column") -> Columns:
 
     The polarity is a column of 0 and 1 or of -1 and 1. The time is a column that does not decrease. The two others are
     x and y, in this order. `t x y p` is taken if it fits; otherwise one order must fit. If none fits, 1 % of the rows,
-    and at least one, may be exceptions.
+    and at least one, may be exceptions. If no column is ordered, the time is the one that has no pixels.
 
     Args:
         rows: (N, 4) the first rows of the table.
@@ -119,6 +119,9 @@ def by_values(rows: NDArray[np.float64], noun: str = "column") -> Columns:
             return orders[0]
         if orders:
             raise Unclear(_several(orders, noun))
+    orders = [order for order in faults.orders(allowed, ordered=False) if faults.pixel[order.t] > allowed]
+    if len(orders) == 1:  # the times are not ordered, but no other column can be the time
+        return orders[0]
     if min(faults.polarity) > allowed:
         raise Unclear(f"no {noun} is a polarity of 0 and 1 or of -1 and 1")
     if min(faults.time) > allowed:
@@ -141,12 +144,13 @@ class _Exceptions(NamedTuple):
         polarity = np.isin(rows, (-1.0, 0.0, 1.0))
         return cls(*(bad.sum(axis=0).tolist() for bad in (time, ~pixel, ~polarity)))
 
-    def orders(self, allowed: float) -> list[Columns]:
-        """All orders of the columns with at most so many exceptions in each."""
+    def orders(self, allowed: float, *, ordered: bool = True) -> list[Columns]:
+        """All orders of the columns with at most so many exceptions in each; in that of the times only if `ordered`."""
         found = []
         for t, p in permutations(range(4), 2):
             x, y = (i for i in range(4) if i not in (t, p))
-            if max(self.time[t], self.polarity[p], self.pixel[x], self.pixel[y]) <= allowed:
+            late = self.time[t] if ordered else 0
+            if max(late, self.polarity[p], self.pixel[x], self.pixel[y]) <= allowed:
                 found.append(Columns(t, x, y, p))
         return found
 

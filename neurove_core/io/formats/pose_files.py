@@ -12,6 +12,7 @@ from typing import Any, Final, TextIO
 import numpy as np
 from numpy.typing import NDArray
 
+from neurove_core.files import pointer_fault
 from neurove_core.geometry.motion import Poses
 from neurove_core.io.errors import UnknownSource
 from neurove_core.io.formats.hdf5 import file as hdf5
@@ -44,6 +45,10 @@ def read_poses(path: Path) -> Poses:
         if path.suffix.lower() in (".h5", ".hdf5"):
             with hdf5.opened(path) as file:
                 return _hdf5_poses(path, file)
+        with path.open("rb") as file:
+            fault = pointer_fault(file.read(64))
+        if fault:
+            raise UnknownSource(path, fault)
         with path.open(encoding="utf-8-sig", errors="backslashreplace") as text:
             return _text_poses(path, text)
     except OSError as error:

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neurove_core.config import CanonicalConfig
-from neurove_core.geometry.camera import OUTSIDE, distort, focal_px, lookup_table, undistort
+from neurove_core.geometry.camera import OUTSIDE, distort, field_of_view_deg, focal_px, lookup_table, undistort
 from neurove_protocol import CameraInfo, Sensor
 from neurove_protocol.errors import InvalidField
 
@@ -219,3 +219,11 @@ def test_camera_info_of_another_sensor_is_refused_with_both_sizes(sensor):
         lookup_table(CANONICAL, sensor, ECD)
     assert "240x180" in refused.value.message
     assert str(sensor) in refused.value.message
+
+
+def test_the_field_of_view_of_a_lens_is_that_of_its_outer_pixels():
+    camera = CameraInfo(stream="c", width=101, height=51, lens="pinhole", fx=50.0, fy=25.0, cx=50.0, cy=25.0)
+    assert field_of_view_deg(camera) == pytest.approx((90, 90))
+    fisheye = camera.model_copy(update={"lens": "equidistant", "fx": 100 / math.pi})
+    assert field_of_view_deg(fisheye)[1] == pytest.approx(math.degrees(2.0), abs=1e-3)
+    assert math.isnan(field_of_view_deg(fisheye)[0])  # 180 deg and more: no ray in front of the camera

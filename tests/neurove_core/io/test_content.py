@@ -4,6 +4,7 @@ import bz2
 import contextlib
 import gzip
 import os
+import resource
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,11 +13,16 @@ import lz4.frame
 import pytest
 import zstandard
 
+from neurove_core.files import LFS_POINTER
 from neurove_core.io import BrokenRecording, RecordingError, UnknownSource
+from neurove_core.io.calibration import read_calibration
+from neurove_core.io.formats.pose_files import read_poses
 from neurove_core.io.spool import plain_file
 from neurove_core.io.unpack import FREE_BYTES, MAX_RATIO
-from neurove_core.sources import LFS_POINTER, open_source
+from neurove_core.models.container import read_container
+from neurove_core.sources import open_source
 from neurove_protocol import Events
+from neurove_protocol.errors import NeuroVEError
 from tests import ros_bags
 from tests.builders import SENSOR, make_events
 from tests.builders_evt import HEADER_EVT2, HEADER_EVT3, write_evt2, write_evt3
@@ -234,3 +240,58 @@ def test_a_file_of_zeros_raises_a_declared_error_or_gives_no_event(suffix, tmp_p
     except RecordingError:
         events = Events.empty()
     assert events.n == 0
+
+
+def test_a_pointer_among_the_files_of_a_recording_is_named(tmp_path):
+    pointer = LFS_POINTER + b"v1\noid sha256:" + b"ab" * 32 + b"\nsize 6144209\n"
+    for name, folder in (("run_0.db3", "bag"), ("events.txt", "ecd"), ("events.h5", "dsec")):
+        (tmp_path / folder).mkdir()
+        path = put(tmp_path / folder, name, pointer)
+        with pytest.raises(UnknownSource, match="Git LFS pointer") as caught:
+            open_source(path if folder == "dsec" else str(tmp_path / folder))
+        assert caught.value.details["value"] == path
+
+
+def test_a_pointer_in_place_of_poses_a_lens_or_a_model_is_named(tmp_path):
+    pointer = put(tmp_path, "file", LFS_POINTER + b"v1\noid sha256:" + b"ab" * 32 + b"\nsize 6144209\n")
+    for read_ in (
+        read_poses,
+        lambda path: read_calibration(str(path), SENSOR),
+        lambda path: read_container(path.read_bytes(), "m"),
+    ):
+        with pytest.raises(NeuroVEError, match="Git LFS pointer"):
+            read_(Path(pointer))
+
+
+# --- temporary copies ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def temporary(tmp_path, monkeypatch):
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(folder))
+    return folder
+
+
+def test_a_copy_of_what_is_no_recording_is_removed(temporary, tmp_path):
+    with pytest.raises(UnknownSource):
+        open_source(put(tmp_path, "a.raw.gz", gzip.compress(b"no recording")))
+    with pipe(tmp_path / "pipe", gzip.compress(raw())) as source:
+        open_source(source)
+    assert [path.name for path in temporary.glob("*/*")] == ["pipe"]  # the decompressed one
+
+
+def test_without_a_temporary_folder_or_space_the_error_is_declared(temporary, tmp_path):
+    path = put(tmp_path, "a.raw.gz", gzip.compress(raw() * 1000))
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))  # Python ignores the signal: writing fails
+    try:
+        with pytest.raises(UnknownSource, match="no temporary copy can be made in .*temporary.*: File too large"):
+            open_source(path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not list(temporary.iterdir())
+    temporary.rmdir()
+    with pytest.raises(UnknownSource, match="No such file or directory: .*temporary"):
+        open_source(path)

@@ -126,6 +126,14 @@ def test_the_order_of_columns_is_guessed_although_a_few_events_are_late(order, s
     assert columns.order == tuple(order.index(name) for name in "txyp")
 
 
+@pytest.mark.parametrize("order", ["txyp", "xypt", "xytp"])
+def test_times_without_order_are_recognised_because_they_are_no_pixels(order):
+    events = make_events(1000, seed=1, start_us=1_000_000)
+    times = np.random.default_rng(0).permutation(events.t)
+    table = np.stack([{"t": times, "x": events.x, "y": events.y, "p": events.p}[name] for name in order], axis=1)
+    assert by_values(table.astype(np.float64)).order == tuple(order.index(name) for name in "txyp")
+
+
 def test_random_bytes_and_lines_give_declared_errors_and_valid_events(tmp_path):
     rng = np.random.default_rng(0)
     texts = list(DIALECTS.values())

@@ -74,8 +74,15 @@ def test_a_run_called_from_python_leaves_the_same_files_and_weights_as_the_comma
 def test_progress_is_reported_for_each_task_up_to_its_last_step(trained):
     _, reported = trained
     last = {task: (done, of) for task, done, of, _ in reported}
-    assert list(last) == ["simulated", "trained", "simulated to calibrate"]
-    assert last == {"simulated": (2, 2), "trained": (8, 8), "simulated to calibrate": (16, 16)}
+    assert list(last) == ["simulated", "simulated to validate", "trained", "simulated to calibrate"]
+    assert last == {
+        "simulated": (2, 2),
+        "simulated to validate": (8, 8),
+        "trained": (8, 8),
+        "simulated to calibrate": (16, 16),
+    }
+    details = [detail for task, _, _, detail in reported if task == "trained"]
+    assert all(" m/s " in detail and ", validation " in detail for detail in details)
 
 
 def test_existing_sequences_are_not_simulated_again(trained):

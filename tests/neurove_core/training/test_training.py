@@ -433,7 +433,7 @@ def test_the_configurations_of_the_default_model_share_one_network():
         ("name = 'a b'", "name='a b': String should match"),
         ("[recipe]\nsteps = 0", "recipe.steps=0: Input should be greater than or equal to 1"),
         ("[recipe]\nsegment_windows = 30", "chunks of 8"),
-        ("[data]\nseconds = 0.5", "a sequence has 10 windows"),
+        ("[data]\nseconds = 0.5", "data.seconds=0.5 has 10 windows"),
         ("[data]\nheight_m = [2.0, 1.0]", "lower value must come first"),
         ("unknown = 1", "unknown"),
         ("= 1", "not TOML"),

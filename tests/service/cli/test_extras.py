@@ -13,7 +13,7 @@ from neurove_service.cli.commands import COMMANDS
 from neurove_service.cli.extras import EXTRAS, missing_extra
 
 ROOT = Path(__file__).parents[3]
-MODULE_OF = {"pillow": "PIL"}
+MODULE_OF = {"ruamel.yaml": "ruamel", "pillow": "PIL"}
 NOWHERE = "tcp/127.0.0.1:9"  # the discard port: nothing listens there
 
 BASE_INSTALL = f"""

@@ -97,6 +97,17 @@ def test_a_signal_ends_a_command_like_control_c(run, monkeypatch, number):
     assert cleaned == [True]
 
 
+def test_a_signal_while_a_named_tuple_is_made_ends_the_command_just_after(signals_as_before):
+    """numba makes one at the end of a compiled loop and does not survive an exception there."""
+    where = {"__name__": "namedtuple_Found", "kill": os.kill, "pid": os.getpid(), "number": signal.SIGTERM}
+    interrupt_on_signals()
+    exec("def make():\n    kill(pid, number)\n    return 'made'", where)
+    made = where["make"]()
+    with pytest.raises(Terminated) as ended:
+        signal.pause()
+    assert (made, ended.value.number) == ("made", signal.SIGTERM)
+
+
 def test_a_hangup_that_is_ignored_stays_ignored(signals_as_before):
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     interrupt_on_signals()

@@ -63,6 +63,32 @@ def test_a_file_that_exists_is_replaced_only_with_force(run, tmp_path, arguments
     assert (code, out.read_bytes()[1:5]) == (0, b"MCAP")
 
 
+LENS = """image_width: 64
+image_height: 48
+distortion_model: plumb_bob
+camera_matrix: {rows: 3, cols: 3, data: [32, 0, 31.5, 0, 24, 23.5, 0, 0, 1]}
+distortion_coefficients: {rows: 1, cols: 4, data: [-0.1, 0, 0, 0]}
+"""
+
+
+def test_info_shows_the_lens_and_the_height(run, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
+    pytest.importorskip("ruamel.yaml")
+    (tmp_path / "events.txt").write_bytes(ecd_text(make_events(2000)))
+    (tmp_path / "lens.yaml").write_text(LENS)
+    code, found, _ = run("info", tmp_path, "--sensor", "64x48")
+    assert (code, "unknown: --calibration FILE gives it" in found) == (0, True)
+    given = ("--calibration", tmp_path / "lens.yaml", "--height", 0.4)
+    code, found, _ = run("info", tmp_path, "--sensor", "64x48", *given)
+    assert code == 0
+    for words in ("pinhole, fx 32.00 fy 24.00 cx 31.50 cy 23.50 px", "-0.1 0 0 0", "field of view", "0.4 m above"):
+        assert words in found
+    lens = json.loads(run("info", tmp_path, "--sensor", "64x48", *given, "--json")[1])["lens"]
+    assert (lens["lens"], lens["fx"], lens["height_m"]) == ("pinhole", 32, 0.4)
+    code, _, err = run("info", tmp_path, "--sensor", "64x50", *given)
+    assert (code, "image size='64x48': the events' sensor is 64x50" in err) == (2, True)
+
+
 def test_convert_keeps_the_triggers_of_a_real_bag(run, tmp_path):
     bag = shared("rosbag/test_events_1")
     assert run("convert", bag, tmp_path / "a.mcap", "--topic", "/event_camera/events")[0] == 0

@@ -58,13 +58,30 @@ def test_training_writes_a_bundle_a_checkpoint_and_a_summary(trained):
     assert about["curve"][-1]["step"] == 8
 
 
+def test_training_tells_the_error_on_scenes_that_it_did_not_train_on(trained, run):
+    arguments = ("train", trained / "tiny.toml", "--out", trained / "out", "--resume", "--calibration-sequences", "0")
+    _, text, _ = run(*arguments)
+    assert text.startswith("error on simulated scenes: linear ")
+    _, text, _ = run(*arguments, "--json")
+    assert json.loads(text)["validated"][0].startswith("error on simulated scenes: linear ")
+    curve = json.loads((trained / "out" / "run.json").read_text())["validation"]
+    assert (curve[0]["step"], curve[-1]["step"]) == (0, 8)
+
+
+@pytest.mark.parametrize("flag", ["--workers", "--threads", "--devices"])
+def test_counts_of_a_run_are_above_0(run, capsys, flag):
+    with pytest.raises(SystemExit):
+        run("train", "default", flag, "0")
+    assert "give a whole number above 0" in capsys.readouterr().err
+
+
 def test_a_finished_run_resumed_gives_the_same_model(trained, run):
     path = trained / "out" / "tiny.safetensors"
     weights = bundle.load(path).network.state_dict()
     code, out, err = run(
         "train", str(trained / "tiny.toml"), "--out", str(trained / "out"), "--resume", "--calibration-sequences", "16"
     )
-    assert (code, out.startswith("wrote ")) == (0, True)
+    assert (code, out.splitlines()[-1].startswith("wrote ")) == (0, True)
     assert "simulated" not in err
     again = bundle.load(path).network.state_dict()
     assert all((tensor == again[name]).all() for name, tensor in weights.items())

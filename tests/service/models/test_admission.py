@@ -1,5 +1,10 @@
 import pytest
+import torch
 
+from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
+from neurove_core.models import bundle
+from neurove_core.models.bundle import Bundle
+from neurove_core.networks.neurove import NeuroVE
 from neurove_protocol.errors import NoMemory, TooSlow
 from neurove_service.models import admission
 
@@ -33,6 +38,46 @@ def test_a_model_needs_twice_its_size():
     admission.check_memory("one", 500, 1000)
     with pytest.raises(NoMemory, match="model one: free_bytes=1000: a model change needs 1002 bytes"):
         admission.check_memory("one", 501, 1000)
+
+
+def of_shape(width, height, channels, duration_us=50_000):
+    """A model without weights in memory."""
+    config = ModelConfig(
+        window=WindowConfig(duration_us=duration_us),
+        canonical=CanonicalConfig(width=width, height=height),
+        network=NetworkConfig(channels=channels, features=1, hidden=1),
+    )
+    with torch.device("meta"):
+        network = NeuroVE(config)
+    return Bundle("huge", True, "a test", config, network, torch.zeros(6), torch.ones(6))
+
+
+def test_the_cost_of_a_window_follows_from_the_shapes():
+    neurons = 10 * 64 * 32 + 3 * 32 * 16 + 2 * 16 * 8
+    assert admission.cost(of_shape(64, 32, (3, 2))) == (
+        0.25 * 10 * 9 * 3 * 32 * 16 + 4 * neurons,
+        4 * 6 * neurons,
+    )
+
+
+@pytest.mark.parametrize("kind", ["neurove", "ann", "snn-ang"])
+def test_a_model_of_usual_size_passes_by_its_configuration(kind):
+    config = ModelConfig(kind=kind)
+    admission.check_cost(bundle.untrained(config=config), free=1 << 30)
+
+
+def test_a_huge_network_is_refused_by_its_configuration_before_anything_runs():
+    with pytest.raises(TooSlow, match="a window may take at most 50.0 ms here"):
+        admission.check_cost(of_shape(1024, 1024, (256, 256)), free=None)
+    with pytest.raises(NoMemory, match="free_bytes=134217728: a model change needs"):
+        admission.check_cost(of_shape(1024, 1024, (16, 16)), free=128 << 20)
+
+
+def test_a_model_far_above_the_bound_is_refused_after_two_windows(slot):
+    estimator = slot.active.estimator
+    admission.check_first_windows(estimator, share=1e6)
+    with pytest.raises(TooSlow, match="p99_ms="):
+        admission.check_first_windows(estimator, share=1e-9)
 
 
 def test_this_machine_reports_its_memory():

@@ -25,6 +25,7 @@ from neurove_protocol.errors import (
     NoStore,
     NothingBefore,
     UnknownModel,
+    Untrained,
 )
 from neurove_service.models.active_file import Active, ActiveFile
 from neurove_service.models.change import Rules
@@ -222,6 +223,39 @@ def test_an_older_release_is_neither_stored_nor_activated_unless_a_trusted_signa
     changed = ActivateReply.decode(handlers.activate(ActivateRequest(model="eight").encode()))
     assert (changed.active.name, changed.active.signature) == ("eight", "trusted")
     assert ActivateReply.decode(handlers.rollback(RollbackRequest().encode())).active.name == "one"
+
+
+def test_after_a_signed_release_the_built_in_model_may_serve_and_an_untrained_one_may_not(storing):
+    handlers = storing(highest_release=7)
+    with pytest.raises(Downgrade, match="model untrained"):
+        handlers.activate(ActivateRequest(model="untrained").encode())
+    assert ActivateReply.decode(handlers.activate(ActivateRequest(model="default").encode())).active.name == "default"
+
+
+def test_a_node_for_trained_models_stores_no_untrained_one(models_dir, tmp_path, progress):
+    store = ModelStore(tmp_path, models_dir)
+    slot = ModelSlot("one", models_dir, pushed=store.files, trained_only=True)
+    handlers = Handlers("edge", slot, list, lambda: 0, store)
+    request, pull = push_of("eight")
+    with pytest.raises(Untrained, match="model eight: it is untrained"):
+        handlers.push(request, progress, pull, RUNS)
+    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
+
+
+def test_health_is_not_ok_while_an_untrained_model_answers(slot, handlers):
+    assert ask_health(handlers).ok
+    slot.activate("untrained")
+    health = ask_health(handlers)
+    assert (health.ok, health.why) == (False, "model untrained is untrained: its estimates have no meaning")
+    slot.rollback()
+    assert ask_health(handlers).ok
+
+
+def test_activating_the_active_model_is_answered_as_unchanged(handlers):
+    handlers.activate(ActivateRequest(model="two").encode())
+    again = ActivateReply.decode(handlers.activate(ActivateRequest(model="two").encode()))
+    assert (again.changed, again.active, again.epoch) == (False, again.previous, 1)
+    assert ModelsReply.decode(handlers.models(ModelsRequest().encode())).previous.name == "one"
 
 
 def test_a_refusal_is_the_last_reported_step(handlers, progress):

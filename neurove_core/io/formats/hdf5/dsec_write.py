@@ -6,9 +6,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from neurove_core.files import atomic_path
-from neurove_core.io.formats.hdf5 import file as hdf5
 from neurove_core.io.formats.hdf5.dsec import LENS_FIELDS
+from neurove_core.io.formats.hdf5.sink import Sink, write_file
 from neurove_core.io.recording import Recording
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events
@@ -51,14 +50,21 @@ def write_dsec(recording: Recording, path: Path, progress: Callable[[int], None]
     """
     if recording.endless:
         raise InvalidField("write_dsec", "recording", recording.name, "must not be endless")
-    h5py = hdf5.library()
-    with atomic_path(path) as part, h5py.File(part, "w") as file:
-        n = _write_events(recording, file, progress)
+
+    def write(file: Any, sink: Sink) -> Written:
+        def written(events: int) -> None:
+            sink.check()
+            if progress is not None:
+                progress(events)
+
+        n = _write_events(recording, file, written)
         streams = ("events", *_write_truth(recording, file), *_write_imu(recording, file))
-    return Written(n, streams, tuple(stream for stream in recording.streams if stream not in streams))
+        return Written(n, streams, tuple(stream for stream in recording.streams if stream not in streams))
+
+    return write_file(path, write)
 
 
-def _write_events(recording: Recording, file: Any, progress: Callable[[int], None] | None) -> int:
+def _write_events(recording: Recording, file: Any, progress: Callable[[int], None]) -> int:
     """Write the groups `events`, `ms_to_idx`, `t_offset` and `camera`; return the number of events."""
     group = file.create_group("events")
     group.attrs["width"], group.attrs["height"] = recording.sensor.width, recording.sensor.height
@@ -82,8 +88,7 @@ def _write_events(recording: Recording, file: Any, progress: Callable[[int], Non
         for entries in _index_entries(shifted, n, int(index.shape[0])):
             _append(index, entries)
         n += chunk.n
-        if progress is not None:
-            progress(n)
+        progress(n)
     file["t_offset"] = np.int64(offset_us)
     return n
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.extras import MissingExtra
+from neurove_core.files import pointer_fault
 from neurove_core.io.errors import BrokenRecording, MissingFilter, UnknownSource
 from neurove_core.io.unpack import FREE_BYTES, MAX_RATIO
 
@@ -36,7 +37,10 @@ def opened(path: Path) -> Iterator[Any]:
     """
     h5py = library()
     with path.open("rb") as file:
-        head = file.read(len(_MAGIC))
+        head = file.read(64)
+    if fault := pointer_fault(head):
+        raise UnknownSource(path, fault)
+    head = head[: len(_MAGIC)]
     if not head or not _MAGIC.startswith(head):
         raise UnknownSource(path, "the file does not start with the HDF5 signature")
     try:
