@@ -11,7 +11,17 @@ from neurove_protocol.events import Sensor
 SCHEMA = "application/msgpack;neurove.camera.1"
 """Zenoh Encoding of a CameraInfo."""
 
-Positive = Annotated[float, Field(gt=0)]
+MAX_CAMERA_BYTES = 8192
+"""Cap of a CameraInfo."""
+
+MAX_FOCAL_PX = 1e6
+MAX_HEIGHT_M = 1e4
+"""Bounds of a focal length [px] and of the height above the ground [m]."""
+
+Focal = Annotated[float, Field(ge=1, le=MAX_FOCAL_PX)]
+Centre = Annotated[float, Field(ge=-MAX_FOCAL_PX, le=MAX_FOCAL_PX)]
+Coefficient = Annotated[float, Field(ge=-MAX_FOCAL_PX, le=MAX_FOCAL_PX)]
+Height = Annotated[float, Field(ge=1e-3, le=MAX_HEIGHT_M)]
 
 
 class CameraInfo(Message):
@@ -22,17 +32,18 @@ class CameraInfo(Message):
     """
 
     what: ClassVar[str] = "camera info"
+    max_bytes: ClassVar[int] = MAX_CAMERA_BYTES
 
     stream: Name
     width: Annotated[int, Field(ge=1, le=1 << 15)]
     height: Annotated[int, Field(ge=1, le=1 << 15)]
     lens: Literal["pinhole", "equidistant"]
-    fx: Positive
-    fy: Positive
-    cx: float
-    cy: float
-    distortion: Annotated[tuple[float, ...], Field(strict=False)] = ()
-    height_m: Positive | None = None  # height of the camera above the ground plane [m], if known
+    fx: Focal
+    fy: Focal
+    cx: Centre
+    cy: Centre
+    distortion: Annotated[tuple[Coefficient, ...], Field(strict=False)] = ()
+    height_m: Height | None = None  # height of the camera above the ground plane [m], if known
 
     @model_validator(mode="after")
     def _distortion_fits_the_lens(self) -> Self:

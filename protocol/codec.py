@@ -15,8 +15,11 @@ PROTOCOL_VERSION: Final = 1
 
 MAX_STRING_BYTES = 4096
 MAX_ITEMS = 4096
+MAX_MAPS = 8192
+"""Cap of the maps in one message, nested ones too."""
+
 MAX_MESSAGE_BYTES = 1 << 20
-"""Cap of every message except the event packet, which has its own (events.PacketLimits)."""
+"""Cap of a message that has no cap of its own; the one of an event packet is in events.PacketLimits."""
 
 
 def _name(value: str) -> str:
@@ -43,6 +46,7 @@ class Message(Part):
     """A message on the wire: a part with a protocol version."""
 
     what: ClassVar[str] = "message"
+    max_bytes: ClassVar[int] = MAX_MESSAGE_BYTES
     v: Literal[1] = PROTOCOL_VERSION
 
     def encode(self) -> bytes:
@@ -56,7 +60,7 @@ class Message(Part):
         Raises:
             Malformed, UnsupportedVersion, InvalidField: for the first error; never any other exception.
         """
-        return validate(cls, unpack(data, cls.what))
+        return validate(cls, unpack(data, cls.what, cls.max_bytes))
 
 
 MessageT = TypeVar("MessageT", bound=Message)
@@ -82,7 +86,7 @@ def unpack(data: bytes, what: str, max_bytes: int = MAX_MESSAGE_BYTES) -> dict[s
     try:
         fields = msgpack.unpackb(
             data,
-            object_pairs_hook=_map_without_duplicates,
+            object_pairs_hook=_Maps(),
             max_str_len=MAX_STRING_BYTES,
             max_bin_len=max_bytes,
             max_array_len=MAX_ITEMS,
@@ -99,10 +103,19 @@ def unpack(data: bytes, what: str, max_bytes: int = MAX_MESSAGE_BYTES) -> dict[s
     return fields
 
 
-def _map_without_duplicates(pairs: list[tuple[Any, Any]]) -> dict[str, Any]:
-    fields = dict(pairs)
-    if not all(isinstance(key, str) for key in fields):
-        raise ValueError("a key of a map is not a string")
-    if len(fields) != len(pairs):
-        raise ValueError("duplicate key in a map")
-    return fields
+class _Maps:
+    """Builds the maps of one message: their keys are strings, no key occurs twice, and their number is bounded."""
+
+    def __init__(self) -> None:
+        self._left = MAX_MAPS
+
+    def __call__(self, pairs: list[tuple[Any, Any]]) -> dict[str, Any]:
+        self._left -= 1
+        if self._left < 0:
+            raise ValueError(f"more than {MAX_MAPS} maps")
+        fields = dict(pairs)
+        if not all(isinstance(key, str) for key in fields):
+            raise ValueError("a key of a map is not a string")
+        if len(fields) != len(pairs):
+            raise ValueError("duplicate key in a map")
+        return fields

@@ -24,6 +24,11 @@ CHUNK_SCHEMA = "application/octet-stream"
 
 MAX_CHUNK_BYTES = 1 << 20
 MAX_SIGNATURE_BYTES = 1 << 16
+MAX_REQUEST_BYTES = 1 << 17
+"""Cap of a request."""
+
+MAX_HEALTH_BYTES = 1 << 22
+"""Cap of a HealthReply, which has the status of every stream."""
 
 Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 """sha256 of a bundle, hexadecimal."""
@@ -37,6 +42,8 @@ SignatureState = Literal["unsigned", "unchecked", "trusted", "untrusted"]
 
 class Request(Message):
     """A request. Unknown fields are refused, so that a misspelt field is not ignored silently."""
+
+    max_bytes: ClassVar[int] = MAX_REQUEST_BYTES
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 
@@ -170,6 +177,7 @@ class HealthReply(Message):
     """The health of a node: `ok` is the verdict, `why` is the reason if it is not ok."""
 
     what: ClassVar[str] = "health reply"
+    max_bytes: ClassVar[int] = MAX_HEALTH_BYTES
 
     node: Name
     ok: bool

@@ -13,6 +13,7 @@ from pydantic import Field
 
 from neurove_protocol.codec import Count, Message, Name, unpack, validate
 from neurove_protocol.errors import BlobLength, EventOutsideSensor, InvalidField, TimeBackwards, UnknownFormat
+from neurove_protocol.header import header_bytes
 
 EVENT_DTYPE = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "u1")])
 """One event as a record, for files and tables: t sensor clock [us], x and y [px], p polarity (1 ON, 0 OFF)."""
@@ -22,6 +23,9 @@ FORMATS = ("soa6", "soa8")
 
 SCHEMA = "application/msgpack;neurove.events.1"
 """Zenoh Encoding of an event packet."""
+
+MAX_HEADER_BYTES = 1024
+"""Cap of a packet's fields without its events."""
 
 _Y_MASK = np.uint16((1 << 15) - 1)
 
@@ -225,10 +229,11 @@ class PacketLimits:
     @property
     def max_bytes(self) -> int:
         """Largest packet on the wire: the largest blob and its header."""
-        return self.max_events * 8 + 1024
+        return self.max_events * 8 + MAX_HEADER_BYTES
 
 
 DEFAULT_LIMITS = PacketLimits()
+_BLOB_KEY = b"\xa4data"
 
 Packet = EventPacket | WirePacket
 
@@ -306,6 +311,11 @@ def open_packet(data: bytes, limits: PacketLimits = DEFAULT_LIMITS) -> WirePacke
     Raises:
         NeuroVEError: as decode_packet, except for EventOutsideSensor and TimeBackwards.
     """
+    if len(data) <= limits.max_bytes:
+        size = header_bytes(data, _BLOB_KEY, MAX_HEADER_BYTES)
+        if size > MAX_HEADER_BYTES:
+            why = f"the fields without the events have at most {MAX_HEADER_BYTES} bytes"
+            raise InvalidField(_Header.what, "header", size, why)
     header = validate(_Header, unpack(data, _Header.what, limits.max_bytes))
     for name, value, bound in (
         ("n", header.n, limits.max_events),

@@ -102,6 +102,10 @@ class Faults:
         tally = self._tallies[stream] = Tally(stream)
         return tally
 
+    def of(self, stream: str) -> Tally:
+        """The tally of the newest pass over a stream."""
+        return self._tallies.get(stream) or self.begin(stream)
+
     @property
     def found(self) -> tuple[Fault, ...]:
         """All faults so far."""

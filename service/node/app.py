@@ -213,12 +213,14 @@ class Service:
 
     def _save_trial(self, tried: Bundle | None, proven: Bundle) -> None:
         """Save a model whose probation waits for windows, next to the model before it; None: it waits no more."""
-        before = self._active_file.active
-        same = before is not None and before.digest == proven.digest
+        before, previous = self._active_file.active, None
+        if before is not None:
+            ways_back = {before.digest: before.previous, before.trial: before.digest}
+            previous = ways_back.get(proven.digest)
         self._active_file.keep(
             Active(
                 digest=proven.digest,
-                previous=before.previous if before is not None and same else None,
+                previous=previous,
                 configured=self._config.model,
                 highest_release=self._active_file.highest_release,
                 trial=tried.digest if tried is not None else None,

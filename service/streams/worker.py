@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 from neurove_core.ingest.wire import read_packet
 from neurove_protocol import CameraInfo
-from neurove_protocol.errors import NeuroVEError
+from neurove_protocol.camera import MAX_CAMERA_BYTES
+from neurove_protocol.errors import InvalidField, NeuroVEError
 from neurove_protocol.events import PacketLimits
 from neurove_protocol.velocity import TwistEstimate
 from neurove_service import logs
@@ -27,6 +28,7 @@ _REST_S = 0.01  # pause of the loop after an error in it
 _RETRY_STANDBY_S = 0.002
 _MAX_PAUSE_S = 0.02
 _SAMPLE_BYTES = 256
+_MAX_CAMERAS = 16  # CameraInfo messages that wait for the worker
 
 
 class Sample(NamedTuple):
@@ -44,24 +46,36 @@ class Sample(NamedTuple):
 
 
 class Inbox:
-    """A queue between Zenoh's thread and a worker, bounded in age and bytes; it drops and counts the oldest samples.
+    """A queue between Zenoh's thread and a worker, bounded in age and bytes; it drops and counts the oldest packets.
+
+    A CameraInfo has a place of its own: it is not dropped with the packets, and packets are not dropped for it.
 
     The age bound matters most. A worker that falls behind for a moment catches up in a fraction of it, because a window
     costs a tenth of its own duration. A worker that stays behind answers with data no older than this (decision 6).
 
     Args:
-        max_age_s: a sample that is older than this is dropped when the next one arrives [s].
-        max_bytes: maximum memory of all samples [bytes].
+        max_age_s: a packet that is older than this is dropped when the next one arrives [s].
+        max_bytes: maximum memory of all packets [bytes].
     """
 
     def __init__(self, max_age_s: float, max_bytes: int) -> None:
         self._samples: deque[Sample] = deque()
         self.max_age_s, self._max_age_ns, self._max_bytes = max_age_s, max_age_s * 1e9, max_bytes
+        self._cameras: deque[tuple[int, Sample]] = deque()  # each with the number of packets that precede it
         self._bytes = self._dropped = 0
         self._changed = threading.Condition()
 
+    def put_camera(self, sample: Sample) -> bool:
+        """Append a CameraInfo; False if too many wait."""
+        with self._changed:
+            if len(self._cameras) >= _MAX_CAMERAS:
+                return False
+            self._cameras.append((self._dropped + len(self._samples), sample))
+            self._changed.notify()
+            return True
+
     def put(self, sample: Sample) -> None:
-        """Append a sample; does not wait for the worker."""
+        """Append a packet; does not wait for the worker."""
         with self._changed:
             waited = not self._samples
             self._samples.append(sample)
@@ -83,10 +97,13 @@ class Inbox:
     def take_all(self, timeout_s: float) -> tuple[deque[Sample], int]:
         """All samples, oldest first, or none after the timeout; and how many were dropped since the last call."""
         with self._changed:
-            if not self._samples:
+            if not self._samples and not self._cameras:
                 self._changed.wait(timeout_s)
             dropped, self._dropped = self._dropped, 0
             samples, self._samples = self._samples, deque()
+            for before, camera in reversed(self._cameras):
+                samples.insert(max(0, before - dropped), camera)
+            self._cameras.clear()
             self._bytes = 0
             return samples, dropped
 
@@ -122,6 +139,8 @@ class StreamWorker:
     ) -> None:
         self.stream = stream
         self.beat_ns = time.monotonic_ns()
+        self.lost_cameras = 0  # not queued: too large, or too many; counted by the thread that puts them
+        self._told_cameras = 0  # of them, counted as refused
         self._inbox = inbox
         self._open_outlet, self._limits = open_outlet, limits
         self._standby_slots = standby_slots or threading.Semaphore()
@@ -139,7 +158,8 @@ class StreamWorker:
 
     def put_camera(self, payload: bytes, received_ns: int) -> None:
         """Queue a CameraInfo."""
-        self._inbox.put(Sample(payload, received_ns, is_camera=True))
+        if len(payload) > MAX_CAMERA_BYTES or not self._inbox.put_camera(Sample(payload, received_ns, is_camera=True)):
+            self.lost_cameras += 1
 
     def stop(self) -> None:
         """Ask the thread to end; queued samples are not processed."""
@@ -192,6 +212,9 @@ class StreamWorker:
         self._pending.extend(samples)
         if dropped:
             self.stream.overloaded(dropped)
+        while self._told_cameras < self.lost_cameras:
+            self._told_cameras += 1
+            self._refused_camera(f"a camera info has at most {MAX_CAMERA_BYTES} bytes, and at most {_MAX_CAMERAS} wait")
 
     def _work_next(self, outlet: Outlet) -> None:
         now_ns = time.monotonic_ns()
@@ -269,10 +292,17 @@ class StreamWorker:
 
     def _set_camera(self, get: Callable[[], CameraInfo | None]) -> None:
         try:
-            camera = get()
+            camera, name = get(), self.stream.name
+            if camera is not None and camera.stream != name:
+                raise InvalidField("camera info", "stream", camera.stream, f"received on the key of stream {name!r}")
         except NeuroVEError as error:
-            log.warning("camera info refused", stream=self.stream.name, why=error.message)
-            self.stream.refused_camera(error.message)
+            self._refused_camera(error.message)
             return
         if camera is not None:
             self.stream.set_camera(camera)
+
+    def _refused_camera(self, why: str) -> None:
+        self.stream.refused_camera(why)
+        total = self.stream.counters.refused_cameras
+        if total & (total - 1) == 0:
+            log.warning("camera info refused", stream=self.stream.name, why=why, total=total)

@@ -282,7 +282,8 @@ def dotted(path: Path) -> str:
 counts = st.integers(0, 2**63 - 1)
 int64s = st.integers(-(2**63), 2**63 - 1)
 floats = st.floats(allow_nan=False, allow_infinity=False)
-positives = floats.filter(lambda value: value > 0)
+focals, heights = st.floats(1, 1e6), st.floats(1e-3, 1e4)
+centres = st.floats(-1e6, 1e6)
 sentences = st.text(st.characters(exclude_categories=["Cs"]), max_size=40)
 names = st.from_regex(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}", fullmatch=True)
 digests = st.from_regex(r"[0-9a-f]{64}", fullmatch=True)
@@ -324,12 +325,12 @@ def cameras(draw: st.DrawFn) -> Fields:
         "width": draw(st.integers(1, 1 << 15)),
         "height": draw(st.integers(1, 1 << 15)),
         "lens": lens,
-        "fx": draw(positives),
-        "fy": draw(positives),
-        "cx": draw(floats),
-        "cy": draw(floats),
-        "distortion": draw(st.lists(floats, min_size=terms, max_size=terms)),
-        "height_m": draw(st.none() | positives),
+        "fx": draw(focals),
+        "fy": draw(focals),
+        "cx": draw(centres),
+        "cy": draw(centres),
+        "distortion": draw(st.lists(centres, min_size=terms, max_size=terms)),
+        "height_m": draw(st.none() | heights),
     }
 
 

@@ -129,7 +129,7 @@ def test_the_blob_of_one_format_under_the_name_of_the_other_is_refused(wide: boo
         decode_packet(pack(fields_of(EVENTS, wide=wide, format="soa6" if wide else "soa8")))
 
 
-@pytest.mark.parametrize("name", ["evt3", "", "SOA6", "soa6 ", "aedat4", "\u4e8b" * 1_000])
+@pytest.mark.parametrize("name", ["evt3", "", "SOA6", "soa6 ", "aedat4", "\u4e8b" * 250])
 def test_an_unknown_format_is_refused_and_the_known_ones_are_named(name: str) -> None:
     with pytest.raises(UnknownFormat) as caught:
         decode_packet(pack(fields_of(EVENTS, format=name)))

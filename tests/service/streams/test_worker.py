@@ -40,6 +40,26 @@ def test_an_inbox_drops_and_counts_the_samples_that_waited_too_long():
     assert drain(inbox) == (list(range(89, 100)), 89)
 
 
+def test_a_camera_info_keeps_its_place_whatever_is_dropped():
+    inbox = Inbox(max_age_s=0.01, max_bytes=1 << 20)
+    for number in range(100):
+        if number in (0, 50, 95):
+            assert inbox.put_camera(Sample(bytes([200 + number // 10]), 0, is_camera=True))
+        inbox.put(sample(number, received_ns=number * 1_000_000))
+    kept, dropped = drain(inbox)
+    assert kept == [200, 205, *range(89, 95), 209, *range(95, 100)]
+    assert dropped == 89
+    assert drain(inbox) == ([], 0)
+
+
+def test_many_camera_infos_displace_no_packet():
+    inbox = Inbox(max_age_s=60, max_bytes=10_000)
+    inbox.put(sample(1))
+    queued = [inbox.put_camera(Sample(bytes(8000), 0, is_camera=True)) for _ in range(100)]
+    assert 0 < sum(queued) < 100
+    assert drain(inbox) == ([1, *[0] * sum(queued)], 0)
+
+
 def test_an_inbox_never_exceeds_its_maximum_size():
     inbox = Inbox(max_age_s=1, max_bytes=10_000)
     for number in range(20):
@@ -154,6 +174,22 @@ def test_an_unreadable_camera_info_is_refused_and_the_stream_continues(slot):
     worker.stop()
     worker.join(5)
     assert published.closed.is_set()
+
+
+@pytest.mark.parametrize(
+    ("payload", "why"),
+    [
+        (b"garbage", "camera info: not a valid message"),
+        (bytes(1_000_000), "at most 8192 bytes"),
+        (CameraInfo(stream="cam1", width=64, height=48, lens="pinhole", fx=40, fy=40, cx=32, cy=24).encode(), "cam1"),
+    ],
+    ids=["garbage", "a megabyte", "of another stream"],
+)
+def test_a_camera_info_that_is_refused_is_counted_with_its_reason(worker, payload, why):
+    worker.put_camera(payload, time.monotonic_ns())
+    wait_until(lambda: worker.stream.counters.refused_cameras == 1)
+    assert why in worker.stream.activity.refusal
+    assert worker.stream.camera is None
 
 
 def test_packets_that_wait_together_give_the_same_estimates_as_one_by_one(slot):
