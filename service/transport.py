@@ -4,6 +4,7 @@ The settings follow measurements with eclipse-zenoh 1.10: multicast and shared m
 callbacks that only append, every query answered, every session closed.
 """
 
+import atexit
 import contextlib
 import json
 import re
@@ -93,8 +94,18 @@ class Publisher:
         self._publisher.undeclare()  # type: ignore[no-untyped-call]  # gap in Zenoh's stubs
 
 
+_OPEN: dict[int, "Transport"] = {}  # by identity, until closed: Zenoh's threads hold a session anyway
+
+
+@atexit.register
+def _close_all() -> None:
+    """Close what a program leaves open: at the end of the interpreter an open session hangs or aborts the process."""
+    for transport in list(_OPEN.values()):
+        transport.close()
+
+
 class Transport:
-    """One Zenoh session. Use it in a `with` block or close it: an open session keeps the process alive.
+    """One Zenoh session. Use it in a `with` block or close it; one that is left open is closed when the process ends.
 
     Args:
         session: opened.
@@ -105,6 +116,7 @@ class Transport:
         self._session, self._guard = session, guard or Guard()
         self._answering: list[tuple[Any, threading.Thread]] = []
         self._kept: list[Any] = []  # Zenoh undeclares what is garbage collected
+        _OPEN[id(self)] = self
 
     def __enter__(self) -> Self:
         return self
@@ -115,7 +127,9 @@ class Transport:
         self.close()
 
     def close(self) -> None:
-        """Undeclare everything and close the session."""
+        """Undeclare everything and close the session; a second call does nothing."""
+        if _OPEN.pop(id(self), None) is None:
+            return
         for queryable, thread in self._answering:
             queryable.undeclare()
             thread.join(timeout=1)
