@@ -124,7 +124,6 @@ class Estimator:
             camera: its lens; by default the recording's own.
 
         Raises:
-            BrokenRecording: the recording cannot be read to its end; estimates before that are yielded.
             InvalidField: the camera info belongs to another sensor.
         """
         state = self.initial_state(recording.sensor, camera or recording.camera(_STREAM))

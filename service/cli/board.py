@@ -154,6 +154,13 @@ class Board:
         with self._lock:
             self._streams.setdefault(status.stream, Received()).status = status
 
+    def at_newest(self) -> "Board":
+        """A board that shows what this one showed when the newest estimate arrived."""
+        shown = Board(self._keep, self._truth, clock=lambda: now)
+        shown._streams = self.streams()
+        now = max((one.last_at for one in shown._streams.values()), default=0.0)
+        return shown
+
     def of(self, stream: str) -> Received:
         """What was received of one stream; empty if nothing was."""
         with self._lock:
@@ -213,7 +220,7 @@ def legend(streams: dict[str, Received]) -> str:
     return f"vx vy vz in m/s, wx wy wz in rad/s; {frame}x right, y down, z forward. {SIGMA}"
 
 
-SIGMA = "±: sigma, one standard deviation by the model's calibration; 90 % of errors are within 1.64 sigma."
+SIGMA = "±: sigma, one standard deviation; on simulated scenes 90 % of the errors are within 1.64 sigma."
 
 
 def notes(name: str, received: Received) -> Iterator[str]:

@@ -80,6 +80,17 @@ def test_an_hdf5_file_of_few_bytes_and_many_rows_is_refused(tmp_path):
     assert "more than 250 times" in recording.faults.unread[0].why
 
 
+@pytest.mark.parametrize(("at", "size", "why"), [(0, 1 << 20, "past the end"), (2, 3985, "free space")])
+def test_a_damaged_heap_of_texts_is_refused_because_the_library_does_not_return(at, size, why, tmp_path):
+    data = bytearray(WRITTEN["m3ed.h5"](tmp_path))
+    place = data.index(b"GCOL\x01\0\0\0") + 16
+    for _ in range(at):
+        place += 16 + -(-struct.unpack_from("<Q", data, place + 8)[0] // 8) * 8
+    struct.pack_into("<Q", data, place + 8, size)
+    with pytest.raises(BrokenRecording, match=why):
+        open_source(put(tmp_path, "a.h5", bytes(data)), SENSOR)
+
+
 def test_many_poses_are_read_in_blocks(tmp_path):
     rows = 200_000
     with h5py.File(tmp_path / "gt.h5", "w") as file:

@@ -1,6 +1,9 @@
 """The live table: what is shown, in which order, and what is grey because it is old."""
 
+import html
 import io
+import re
+from pathlib import Path
 
 import pytest
 from rich.console import Console
@@ -236,3 +239,22 @@ def test_notices_tell_the_legend_once_and_the_begin_and_end_of_a_silence(estimat
     assert silence.startswith("cam0: no estimate since ")
     assert list(notices.silent()) == []
     assert list(notices.arrived(steady[2])) == ["cam0: estimates again"]
+
+
+def test_a_picture_of_the_newest_table_shows_a_live_stream(estimates):
+    clock = Clock()
+    board = live_board(estimates, clock)
+    clock.now += 60
+    assert "no estimate since" in drawn(board)
+    assert "no estimate since" not in drawn(board.at_newest())
+
+
+def test_the_picture_in_the_readme_shows_the_table_of_today(estimates):
+    picture = Path(__file__).parents[3] / "service/pictures/demo.svg"
+    words = html.unescape(" ".join(re.findall(r">([^<>]+)</text>", picture.read_text(encoding="utf-8"))))
+    shown = words.replace("\xa0", " ").split()
+    today = drawn(live_board(estimates[:1], truth=lambda one: one.twist), width=100)
+    legend = today[today.index("vx vy vz in") :].split("cam0")[0].split()
+    assert " ".join(legend) in " ".join(shown)
+    for word in ("estimate", "truth", "error", "m/s", "rad/s", "estimates/s,", "ok", "lost:", "flags:"):
+        assert word in shown
