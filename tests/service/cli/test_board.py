@@ -193,6 +193,17 @@ def test_a_stream_whose_packets_are_refused_shows_the_reason(stream):
     assert "events outside the sensor" in drawn(board)
 
 
+def test_a_status_that_is_old_is_grey_and_says_since_when(stream):
+    clock = Clock()
+    board = Board(clock=clock)
+    stream.refused(1_000_000, "events outside the sensor")
+    board.on_status(stream_status("n1", stream))
+    assert "no status since" not in drawn(board)
+    clock.now += 20
+    assert "no status since" in drawn(board)
+    assert drawn(board, width=60).splitlines()[1].endswith("20 s ago")
+
+
 def test_truth_stands_next_to_the_estimate_with_the_error(estimates):
     last = estimates[-1]
     board = live_board(estimates, truth=lambda one: one.twist._replace(vx=one.twist.vx - 0.25))
