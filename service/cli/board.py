@@ -44,8 +44,8 @@ _LEAST_NAME, _MOST_NAME = 8, 30
 _NUMBERS = 52  # columns of a line after the name: six numbers and the state
 _STATUS_OLD_S = 3.0  # a node publishes the status of a stream every second, unless it is configured otherwise
 _NODES = 8  # that are remembered per stream
-_NO_LENS = "the lens is unknown: `neurove drive --calibration FILE --height M`, or publish its CameraInfo"
-_NO_HEIGHT = "the height is unknown, 1 m is assumed: `neurove drive --height M`, or set CameraInfo.height_m"
+_NO_LENS = "no lens: `drive --calibration FILE`, or a CameraInfo"
+_NO_HEIGHT = "no height, 1 m assumed: `drive --height M`, or in CameraInfo"
 
 TruthOf = Callable[[TwistEstimate], Twist | None]
 """The true twist at the end of a window; None where it is unknown."""
@@ -268,7 +268,8 @@ def _legend(streams: dict[str, Received], *, lines: bool) -> Text:
 def _one_line(name: str, received: Received, now: float, room: int) -> Text:
     """A stream in one line: name, newest twist, and its verdict, or since when it is silent."""
     silent_s = received.silent_s(now)
-    shown = name if len(name) < room else f"{name[: room - 2]}…"
+    kept = room - 2  # of a long name the begin and the end: cameras often differ in the last word
+    shown = name if len(name) < room else f"{name[: kept // 2]}…{name[-(kept - kept // 2) :]}"
     numbers = "".join(_six(value) for value in received.last.twist) if received.last is not None else f"{'-':>42}"
     grey = not received.is_live(now)
     line = Text(f"{shown:{room}}{numbers} ", style=OLD if grey else "default", no_wrap=True, overflow="crop")
