@@ -2,8 +2,9 @@
 
 import argparse
 import json
+import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -144,17 +145,38 @@ def estimate(args: argparse.Namespace) -> int:
     offline = Offline(estimator, camera, getattr(recording, "stream", _STREAM))
     told = _Told(estimator, recording)
     with event_count(recording.name) as show, estimate_file(path) as add:
-        for elapsed_us, found in estimates_of(recording, offline, as_published=args.sensor is None):
-            if args.seconds is not None and elapsed_us > args.seconds * 1e6:
+        found = estimates_of(recording, offline, as_published=args.sensor is None)
+        broken = _write(found, told, add, args.seconds, lambda: show(offline.stream.counters.events_received))
+    broken = broken or next(map(str, recording.faults.unread), None)
+    summary = told.summary(path, offline) | {"broken": broken}
+    print(json.dumps(summary) if args.json else "\n".join(_lines(summary)))
+    if broken and not recording.faults.unread:
+        print(f"neurove: {broken}", file=sys.stderr)
+    tell_faults(recording)
+    return EXIT_FAILURE if broken or not told.estimates else 0
+
+
+def _write(
+    found: Iterator[tuple[int, list[TwistEstimate]]],
+    told: "_Told",
+    add: Callable[[TwistEstimate], None],
+    seconds: float | None,
+    show: Callable[[], None],
+) -> str | None:
+    """Write estimates up to the end of the recording; returns where and why it is broken, if it is."""
+    from neurove_core.io import BrokenRecording
+
+    try:
+        for elapsed_us, estimates in found:
+            if seconds is not None and elapsed_us > seconds * 1e6:
                 break
-            for one in found:
+            for one in estimates:
                 add(one)
                 told.add(one)
-            show(offline.stream.counters.events_received)
-    summary = told.summary(path, offline)
-    print(json.dumps(summary) if args.json else "\n".join(_lines(summary)))
-    tell_faults(recording)
-    return EXIT_FAILURE if recording.faults.unread or not told.estimates else 0
+            show()
+    except BrokenRecording as error:
+        return error.message
+    return None
 
 
 class _Told:

@@ -6,6 +6,7 @@ import json
 import math
 import sys
 import threading
+from collections.abc import Callable
 from typing import Any
 
 from neurove_protocol.errors import EXIT_FAILURE, InvalidField
@@ -26,6 +27,7 @@ from neurove_service.cli.parser import Parser
 from neurove_service.cli.waiting import Wait, add_wait
 from neurove_service.config import ServiceConfig, load
 from neurove_service.lifecycle import stop_on_signals
+from neurove_service.limits import check_limits
 
 DEFAULT_SOURCE = "sim://"
 _DEFAULT_DEMO_S = 20.0
@@ -34,19 +36,27 @@ _AT_ONCE_S = 1.0  # a service that runs subscribes to a new session within this 
 
 
 def serve(args: argparse.Namespace) -> int:
-    """Run the service until SIGINT or SIGTERM."""
-    stop = stop_on_signals(with_parent=args.with_parent)
+    """Run the service until SIGINT or SIGTERM; SIGHUP reloads the log level and lists the models again."""
+    reloads: list[Callable[[], None]] = []  # filled as soon as there is something to reload
+    stop = stop_on_signals(with_parent=args.with_parent, on_hangup=lambda: [reload() for reload in reloads])
+
+    def read() -> ServiceConfig:
+        return load(ServiceConfig, flags(args, ServiceConfig), args.config)[0]
+
     logs.configure()  # what the settings say while they are read
-    config, _ = load(ServiceConfig, flags(args, ServiceConfig), args.config)
+    config = read()
     logs.configure(config.log_level)
+    check_limits()
 
     import torch
 
     from neurove_service.node.app import Service
+    from neurove_service.node.reload import Reload
 
     torch.set_num_threads(1)
     sys.setswitchinterval(0.0005)  # Zenoh's threads wait for ours: the default of 5 ms is a packet's period
     service = Service(config, stop)
+    reloads.append(Reload(config, read, service.available))
     gc.collect()
     gc.freeze()  # the collector would traverse all of torch at each run, with all threads stopped
     service.run()

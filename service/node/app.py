@@ -12,11 +12,13 @@ from neurove_service.guard import Guard
 from neurove_service.lifecycle import notify
 from neurove_service.models.active_file import Active, ActiveFile
 from neurove_service.models.change import Rules
+from neurove_service.models.library import Available
 from neurove_service.models.signatures import verifier
 from neurove_service.models.slot import ModelSlot
 from neurove_service.models.store import ModelStore
 from neurove_service.node import memory
 from neurove_service.node.condition import Watch
+from neurove_service.node.folders import check_folders
 from neurove_service.node.handlers import Handlers
 from neurove_service.node.housekeeping import Housekeeping
 from neurove_service.node.outlets import open_outlet, route
@@ -62,11 +64,13 @@ class Service:
         stop: set it to end the service.
 
     Raises:
+        ConfigError: a configured folder is no folder, or cannot be read.
         BadModel, UnknownModel: the configured model cannot be loaded.
     """
 
     def __init__(self, config: ServiceConfig, stop: threading.Event) -> None:
         self._config, self._stop = config, stop
+        check_folders(config)
         self._guard = Guard()
         self._keys = config.keys
         self._active_file = ActiveFile(config.state_folder)
@@ -86,6 +90,10 @@ class Service:
             on_trial=self._save_trial,
         )
         self._slot.resume()
+
+    def available(self) -> Available:
+        """The models that can be activated now."""
+        return self._slot.available()
 
     def run(self) -> None:
         """Serve until the stop event is set, then end everything in order.

@@ -102,10 +102,15 @@ def test_a_signal_while_a_named_tuple_is_made_ends_the_command_just_after(signal
     where = {"__name__": "namedtuple_Found", "kill": os.kill, "pid": os.getpid(), "number": signal.SIGTERM}
     interrupt_on_signals()
     exec("def make():\n    kill(pid, number)\n    return 'made'", where)
-    made = where["make"]()
-    with pytest.raises(Terminated) as ended:
+    made = []
+
+    def make_and_wait():
+        made.append(where["make"]())
         signal.pause()
-    assert (made, ended.value.number) == ("made", signal.SIGTERM)
+
+    with pytest.raises(Terminated) as ended:
+        make_and_wait()
+    assert (made, ended.value.number) == (["made"], signal.SIGTERM)
 
 
 def test_a_hangup_that_is_ignored_stays_ignored(signals_as_before):
