@@ -1,6 +1,7 @@
 """Small files of every format, and how they are damaged: for the gate and for `tests.long.fuzz`."""
 
 import gzip
+import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
@@ -15,7 +16,17 @@ from neurove_protocol.events import check_events
 from tests import datasets, ros_bags
 from tests.builders import SENSOR, make_events
 from tests.builders_evt import HEADER_EVT2, HEADER_EVT3, write_evt2, write_evt3
-from tests.neurove_core.io import test_aedat2, test_carla, test_ecd, test_evbench, test_eventstream, test_hdf5_layouts
+from tests.neurove_core.io import (
+    test_aedat2,
+    test_aedat3,
+    test_carla,
+    test_ecd,
+    test_evbench,
+    test_eventstream,
+    test_evt_vectors,
+    test_hdf5_layouts,
+    test_npy,
+)
 from tests.neurove_core.io.test_prophesee import dat
 from tests.neurove_core.io.test_rosbag import imu_and_pose, in_packets
 from tests.recordings import aedat4, ecd_text, put
@@ -57,9 +68,20 @@ def _at(path: str) -> bytes:
     return Path(path).read_bytes()
 
 
+def _npy(_: Path) -> bytes:
+    out = io.BytesIO()
+    np.save(out, np.stack([EVENTS.t, EVENTS.x, EVENTS.y, EVENTS.p], axis=1))
+    return out.getvalue()
+
+
 WRITTEN: Final[dict[str, Callable[[Path], bytes]]] = {
     "evt2.raw": lambda _: HEADER_EVT2 + write_evt2(EVENTS).words.tobytes(),
     "evt3.raw": lambda _: HEADER_EVT3 + write_evt3(EVENTS).words.tobytes(),
+    "evt21.raw": lambda _: test_evt_vectors.HEADERS["EVT21"] + test_evt_vectors.WRITE["EVT21"](EVENTS).words.tobytes(),
+    "evt4.raw": lambda _: test_evt_vectors.HEADERS["EVT4"] + test_evt_vectors.WRITE["EVT4"](EVENTS).words.tobytes(),
+    "aedat3.aedat": lambda _: test_aedat3.DAVIS240 + test_aedat3.polarity(EVENTS),
+    "a.bin": lambda _: test_npy.atis(test_npy.DIGIT),
+    "a.npy": _npy,
     "a.dat": lambda _: dat(EVENTS),
     "a.es": lambda _: test_eventstream.header() + b"".join(test_eventstream.write(EVENTS)),
     "a.aedat": lambda _: aedat2(),
