@@ -8,7 +8,7 @@ JOBS ?= 2
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: run test format clean
+.PHONY: run test format picture clean
 
 run: $(VENV)/installed
 	@$(BIN)/neurove demo
@@ -19,6 +19,9 @@ test: $(VENV)/installed-dev
 	MYPYPATH=$(VENV)/packages $(BIN)/mypy
 	$(BIN)/python tests/wheel.py
 	$(BIN)/pytest --numprocesses $(JOBS) --dist loadgroup --no-loadscope-reorder --cov --cov-report=term
+
+picture: $(VENV)/installed  # the picture in README, of a simulated street with its truth
+	@$(BIN)/neurove demo "sim://street?seed=7&seconds=8" --screenshot service/pictures/demo.svg
 
 format: $(VENV)/installed-dev
 	$(BIN)/ruff format .

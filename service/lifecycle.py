@@ -60,7 +60,7 @@ def _makes_tuple(frame: FrameType | None) -> bool:
     return False
 
 
-def stop_on_signals(*, with_parent: bool = False, on_hangup: Callable[[], None] | None = None) -> threading.Event:
+def stop_on_signals(*, with_parent: bool = False, on_hangup: Callable[[], object] | None = None) -> threading.Event:
     """An event that SIGINT, SIGTERM and SIGHUP set; with `with_parent` also the death of the parent process.
 
     Call it on the main thread.
@@ -88,7 +88,7 @@ def stop_on_signals(*, with_parent: bool = False, on_hangup: Callable[[], None] 
     return stop
 
 
-def _call_on_hangup(on_hangup: Callable[[], None]) -> None:
+def _call_on_hangup(on_hangup: Callable[[], object]) -> None:
     one_at_once = threading.Lock()
 
     def call() -> None:

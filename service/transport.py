@@ -4,6 +4,7 @@ The settings follow measurements with eclipse-zenoh 1.10: multicast and shared m
 callbacks that only append, every query answered, every session closed.
 """
 
+import atexit
 import contextlib
 import json
 import re
@@ -28,7 +29,9 @@ _SETTINGS = {
     "scouting/multicast/enabled": False,
     "transport/shared_memory/enabled": False,  # leaks 17 MiB per publisher restart in this version
     "transport/link/rx/max_message_size": 32 << 20,
-    "transport/link/tx/queue/size/data": 16,  # batches of 64 KiB: a burst of packets fits
+    # What waits on the sender's side of a slow link is old when it arrives: 5 Mbit/s take 0.6 s for these two.
+    "transport/link/tx/queue/size/data": 4,  # batches of 64 KiB
+    "transport/link/tcp/so_sndbuf": 1 << 16,  # bytes; Linux takes twice as many
     "transport/link/tx/queue/size/data_high": 16,  # 2 by default, and an estimate, being express, fills one alone
     "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 20_000,  # us: ride out a stall of the receiver
 }
@@ -91,8 +94,18 @@ class Publisher:
         self._publisher.undeclare()  # type: ignore[no-untyped-call]  # gap in Zenoh's stubs
 
 
+_OPEN: dict[int, "Transport"] = {}  # by identity, until closed: Zenoh's threads hold a session anyway
+
+
+@atexit.register
+def _close_all() -> None:
+    """Close what a program leaves open: at the end of the interpreter an open session hangs or aborts the process."""
+    for transport in list(_OPEN.values()):
+        transport.close()
+
+
 class Transport:
-    """One Zenoh session. Use it in a `with` block or close it: an open session keeps the process alive.
+    """One Zenoh session. Use it in a `with` block or close it; one that is left open is closed when the process ends.
 
     Args:
         session: opened.
@@ -103,6 +116,7 @@ class Transport:
         self._session, self._guard = session, guard or Guard()
         self._answering: list[tuple[Any, threading.Thread]] = []
         self._kept: list[Any] = []  # Zenoh undeclares what is garbage collected
+        _OPEN[id(self)] = self
 
     def __enter__(self) -> Self:
         return self
@@ -113,11 +127,16 @@ class Transport:
         self.close()
 
     def close(self) -> None:
-        """Undeclare everything and close the session."""
+        """Undeclare everything and close the session; a second call does nothing."""
+        if _OPEN.pop(id(self), None) is None:
+            return
         for queryable, thread in self._answering:
             queryable.undeclare()
             thread.join(timeout=1)
-        self._session.close()  # type: ignore[no-untyped-call]  # gap in Zenoh's stubs
+        try:
+            self._session.close()  # type: ignore[no-untyped-call]  # gap in Zenoh's stubs
+        except zenoh.ZError as error:  # a link that cannot deliver what waits
+            log.warning("the session did not close in order", why=_reason(error))
 
     def publisher(self, key: str, schema: str, *, urgent: bool = False) -> Publisher:
         """Declare a publisher.

@@ -1,6 +1,7 @@
 """Small files of every format, and how they are damaged: for the gate and for `tests.long.fuzz`."""
 
 import gzip
+import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import Final
@@ -34,6 +35,7 @@ from tests.neurove_core.io import (
     test_evbench,
     test_eventstream,
     test_hdf5_layouts,
+    test_npy,
 )
 from tests.neurove_core.io.test_prophesee import dat
 from tests.neurove_core.io.test_rosbag import imu_and_pose, in_packets
@@ -94,6 +96,12 @@ def _at(path: str) -> bytes:
     return Path(path).read_bytes()
 
 
+def _npy(_: Path) -> bytes:
+    out = io.BytesIO()
+    np.save(out, np.stack([EVENTS.t, EVENTS.x, EVENTS.y, EVENTS.p], axis=1))
+    return out.getvalue()
+
+
 WRITTEN: Final[dict[str, Callable[[Path], bytes]]] = {
     "evt2.raw": lambda _: HEADER_EVT2 + write_evt2(EVENTS).words.tobytes(),
     "evt3.raw": lambda _: HEADER_EVT3 + write_evt3(EVENTS).words.tobytes(),
@@ -101,6 +109,8 @@ WRITTEN: Final[dict[str, Callable[[Path], bytes]]] = {
     "legacy.raw": lambda _: HEADER_EVT21 + legacy(write_evt21(EVENTS).words).tobytes(),
     "evt4.raw": lambda _: HEADER_EVT4 + write_evt4(EVENTS).words.tobytes(),
     "evt4.raw.zst": lambda _: zstandard.compress(HEADER_EVT4 + write_evt4(EVENTS).words.tobytes()),
+    "a.bin": lambda _: test_npy.atis(test_npy.DIGIT),
+    "a.npy": _npy,
     "a.dat": lambda _: dat(EVENTS),
     "a.es": lambda _: test_eventstream.header() + b"".join(test_eventstream.write(EVENTS)),
     "a.aedat": lambda _: aedat2(),

@@ -78,7 +78,7 @@ def estimate_recording(
         on_events: called after each packet with the number of events so far.
 
     Raises:
-        BrokenRecording: the recording cannot be read to its end. InvalidField: the lens belongs to another sensor.
+        InvalidField: the lens belongs to another sensor.
     """
     camera = camera or recording.camera(_STREAM)
     state = estimator.initial_state(recording.sensor, camera)

@@ -1,14 +1,16 @@
 """Make valid chunks of the events that a reader decodes, and count what is not valid."""
 
 from collections.abc import Iterator
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
+from neurove_core.geometry.motion import Poses, Twists
 from neurove_core.io.errors import BrokenRecording
 from neurove_core.io.faults import Reason, Tally
 from neurove_core.io.order import Order, T, Where
-from neurove_core.io.recording import CHUNK_EVENTS, in_chunks
+from neurove_core.io.recording import CHUNK_EVENTS, Imu, Recording, in_chunks
+from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
 
 V = TypeVar("V")
@@ -59,8 +61,8 @@ def cleaned(pieces: Iterator[Piece], sensor: Sensor, tally: Tally, note: str = "
 def ordered(pieces: Iterator[tuple[str | Where, T]], tally: Tally) -> Iterator[T]:
     """The samples of all pieces ordered by time, in batches that are not empty; for streams other than the events.
 
-    What is late is left out and counted, and so is everything after a restart of the clock; see `Order`. An error that
-    ends the pieces is counted as `UNREAD` and not raised.
+    What is late is left out and counted, and so are inertial samples that are not finite, and everything after a
+    restart of the clock; see `Order`. An error that ends the pieces is counted as `UNREAD` and not raised.
 
     Args:
         pieces: for each its place, as in `cleaned`, and its samples.
@@ -69,10 +71,40 @@ def ordered(pieces: Iterator[tuple[str | Where, T]], tally: Tally) -> Iterator[T
     order: Order[T] = Order(tally, restart=False)
     try:
         for where, rows in pieces:
-            yield from order.push(rows, _where(where))
+            place = _where(where)
+            if isinstance(rows, Imu):
+                kept, place = _finite(rows, place, tally)
+                yield from order.push(cast("T", kept), place)
+            else:
+                yield from order.push(rows, place)
     except BrokenRecording as error:
         unread(tally, error)
     yield from order.finish()
+
+
+def _finite(imu: Imu, where: Where, tally: Tally) -> tuple[Imu, Where]:
+    """The samples that are finite, and their places."""
+    finite = np.isfinite(imu.accel_m_s2).all(axis=1) & np.isfinite(imu.gyro_rad_s).all(axis=1)
+    if finite.all():
+        return imu, where
+    kept, first = np.flatnonzero(finite), int(finite.argmin())
+    tally.add(Reason.INVALID, where(first), "the sample is not finite", finite.size - kept.size)
+    return Imu(imu.t[kept], imu.accel_m_s2[kept], imu.gyro_rad_s[kept]), lambda i: where(int(kept[i]))
+
+
+def truth(recording: Recording) -> tuple[Poses | None, Twists | None]:
+    """Poses and twists of a recording; None for one that cannot be read or is not valid, which is counted."""
+    found: list[Any] = []
+    for kind, read in (("poses", recording.poses), ("twists", recording.twists)):
+        try:
+            found.append(read())
+        except BrokenRecording as error:
+            unread(recording.faults.of(kind), error)
+            found.append(None)
+        except InvalidField as error:
+            recording.faults.of(kind).add(Reason.UNREAD, kind, error.message)
+            found.append(None)
+    return found[0], found[1]
 
 
 def until_broken(items: Iterator[V], tally: Tally) -> Iterator[V]:

@@ -20,6 +20,8 @@ class Reason(StrEnum):
     UNREAD = "unread"  # the recording cannot be read beyond this place
 
 
+_MAX_TEXT = 300  # characters
+
 _TEXTS = {
     Reason.OUTSIDE: "outside the sensor, skipped",
     Reason.LATE: "late, discarded",
@@ -54,6 +56,16 @@ class Fault:
         return {name: getattr(self, name) for name in names}
 
 
+def _line(text: str) -> str:
+    r"""A short text in one line without control characters: it may hold parts of a damaged file.
+
+    >>> _line("a\n\x1b[31m")
+    'a\\n\\x1b[31m'
+    """
+    text = text[:_MAX_TEXT] + ("..." if len(text) > _MAX_TEXT else "")
+    return "".join(one if one.isprintable() else repr(one)[1:-1] for one in text)
+
+
 class Tally:
     """The faults that one pass over one stream finds.
 
@@ -80,7 +92,7 @@ class Tally:
         """
         if count:
             found = self._found.get(reason)
-            more = Fault(self.stream, reason, count, where, why)
+            more = Fault(self.stream, reason, count, _line(where), _line(why))
             self._found[reason] = more if found is None else replace(found, count=found.count + count)
 
     @property
@@ -101,6 +113,10 @@ class Faults:
         """The tally of a new pass over a stream; it takes the place of the pass before."""
         tally = self._tallies[stream] = Tally(stream)
         return tally
+
+    def of(self, stream: str) -> Tally:
+        """The tally of the newest pass over a stream."""
+        return self._tallies.get(stream) or self.begin(stream)
 
     @property
     def found(self) -> tuple[Fault, ...]:

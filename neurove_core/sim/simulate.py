@@ -60,6 +60,11 @@ class Step(NamedTuple):
         return Step(self.start_us + shift_us, self.stop_us + shift_us, events, twists, self.renders)  # type: ignore[arg-type]
 
 
+def stop_us(trajectory: CameraPath) -> int:
+    """End of the last whole interval of a trajectory, where an endless simulation goes on with the next one [us]."""
+    return math.floor(trajectory.duration_s * 1e6) // INTERVAL_US * INTERVAL_US
+
+
 class View(NamedTuple):
     """The image of the camera at one instant; see `Simulation.view`."""
 
@@ -132,10 +137,10 @@ class Simulation(EventsOnly):
             return
         shift_us, trajectory = 0, self.trajectory
         for number in itertools.count(1):
-            stop_us = math.floor(trajectory.duration_s * 1e6) // INTERVAL_US * INTERVAL_US
-            for step in _Playback(self, trajectory, self.seed + number - 1).run(0, stop_us * 1e-6):
+            end_us = stop_us(trajectory)
+            for step in _Playback(self, trajectory, self.seed + number - 1).run(0, end_us * 1e-6):
                 yield step.shifted(shift_us)
-            shift_us, trajectory = shift_us + stop_us, self.next_trajectory(number)
+            shift_us, trajectory = shift_us + end_us, self.next_trajectory(number)
 
     def view(self, t_s: float) -> View:
         """Render the image at a time, with the pixels in the order of `rays_of`."""

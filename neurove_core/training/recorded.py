@@ -63,7 +63,6 @@ class RecordedSequences:
         """Split the missing recordings into sequences, and yield the name of each one when it is done.
 
         Raises:
-            BrokenRecording: a recording cannot be read to its end; its sequences are not used.
             InvalidField: truth and events of a recording do not overlap long enough for a segment.
         """
         for found in self._found:

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,8 @@ from rich.console import Console
 from rich.live import Live
 
 from neurove_core.files import write_atomically
-from neurove_protocol import Flag
+from neurove_core.sim.truth import Truth
+from neurove_protocol import Flag, Twist, TwistEstimate
 from neurove_protocol.control import StreamStatus
 from neurove_protocol.errors import EXIT_FAILURE, NeuroVEError
 from neurove_service.cli.board import Board
@@ -45,35 +46,23 @@ class DemoFailed(NeuroVEError):
 def run(
     source: str,
     *,
-    sensor: str | None,
-    topic: str | None,
-    calibration: str | None = None,
-    height_m: float | None = None,
-    time_unit: str | None = None,
-    speed: str,
-    loop: bool,
-    duration_s: float,
+    playing: Sequence[str],
     model: str | None,
     stop: threading.Event,
     console: Console,
     screenshot: str | None = None,
+    truth: Truth | None = None,
 ) -> dict[str, Any]:
     """Run driver, service and consumer on any source, and return a summary.
 
     Args:
         source: as sources.open_source.
-        sensor: WIDTHxHEIGHT, if the source lacks it.
-        topic: as sources.open_source.
-        calibration: as `neurove drive --calibration`.
-        height_m: height of the camera above the ground [m], if the source lacks it.
-        time_unit: as sources.open_source.
-        speed: as `neurove drive --speed`.
-        loop: start again at the end.
-        duration_s: sensor time to play [s]; infinity: until the source ends or the stop event.
+        playing: flags of `neurove drive` that say how to read and to play the source.
         model: as `neurove serve --model`.
         stop: ends the demo early.
         console: receives the live table, if it is a terminal.
-        screenshot: SVG file to write the last table to.
+        screenshot: SVG file to write the last live table to.
+        truth: of a simulated source; the table and the summary compare the estimates with it.
 
     Returns:
         counts, losses, latency and model, as `neurove demo --json` prints them.
@@ -83,27 +72,61 @@ def run(
     """
     endpoint = f"tcp/127.0.0.1:{_free_port()}"
     config = ClientConfig(connect=(endpoint,))
-    board = Board()
+    comparison = Comparison(truth)
+    board = Board(truth=None if truth is None else comparison.truth_of)
     serve = ["serve", "--listen", endpoint, "--node", "demo", *(["--model", model] if model else [])]
-    drive = ["drive", source, "--connect", endpoint, "--stream", STREAM, "--speed", speed, "--wait", "10", "--json"]
-    drive += ["--sensor", sensor] if sensor else []
-    drive += ["--topic", topic] if topic else []
-    drive += ["--calibration", calibration] if calibration else []
-    drive += ["--height", str(height_m)] if height_m else []
-    drive += ["--time-unit", time_unit] if time_unit else []
-    drive += ["--loop"] if loop else []
-    drive += ["--seconds", str(duration_s)] if math.isfinite(duration_s) else []
+    drive = ["drive", source, "--connect", endpoint, "--stream", STREAM, "--wait", "10", "--json", *playing]
     with _process(*serve) as service, _session(config, service, stop, console) as transport:
-        ask.listen(transport, config, board.on_estimate, board.on_status)
+
+        def on_estimate(estimate: TwistEstimate) -> None:
+            board.on_estimate(estimate)
+            comparison.add(estimate)
+
+        ask.listen(transport, config, on_estimate, board.on_status)
         with _process(*drive, stdout=subprocess.PIPE) as driver:
             _show(board, console, lambda: driver.poll() is None and service.poll() is None, stop)
+            if screenshot:
+                _draw(board.at_newest(), screenshot)
             if service.poll() is not None:
                 raise DemoFailed(f"the service ended with exit code {service.returncode}")
             sent = _sent(driver, stop)
         status = _drained(transport, config, sent, stop)
-    if screenshot:
-        _draw(board, screenshot)
-    return _summary(source, sent, status, board)
+    return _summary(source, sent, status, board) | {"error": comparison.error}
+
+
+class Comparison:
+    """The estimates of a simulated source against its truth.
+
+    Args:
+        truth: of the source; None if it is unknown.
+    """
+
+    def __init__(self, truth: Truth | None) -> None:
+        self._truth = truth
+        self._squares, self._count = [0.0, 0.0], 0
+
+    def truth_of(self, estimate: TwistEstimate) -> Twist | None:
+        """The true twist in the middle of the last bin of a window."""
+        bins = (estimate.start_us, *estimate.bin_end_us)
+        true = self._truth.at((bins[-2] + bins[-1]) // 2) if self._truth is not None else None
+        return None if true is None else Twist(*true.tolist())
+
+    def add(self, estimate: TwistEstimate) -> None:
+        """Compare an estimate, unless its state is not settled yet."""
+        true = self.truth_of(estimate)
+        if true is None or Flag.SETTLING in estimate.flags or Flag.RESET in estimate.flags:
+            return
+        squares = [(a - b) ** 2 for a, b in zip(estimate.twist, true, strict=True)]
+        self._squares = [self._squares[0] + sum(squares[:3]), self._squares[1] + sum(squares[3:])]
+        self._count += 1
+
+    @property
+    def error(self) -> dict[str, float] | None:
+        """Root mean square of the error vectors of both parts; None without a truth."""
+        if not self._count:
+            return None
+        linear, angular = (math.sqrt(total / self._count) for total in self._squares)
+        return {"linear_m_s": round(linear, 4), "angular_rad_s": round(angular, 5)}
 
 
 def _free_port() -> int:
@@ -144,7 +167,11 @@ def _session(
     config: ClientConfig, service: subprocess.Popen[str], stop: threading.Event, console: Console
 ) -> Iterator[Transport]:
     """A session with the service, once it answers."""
-    with console.status("starting the service") if console.is_terminal else contextlib.nullcontext():
+    with (
+        console.status("starting the service; its first start compiles for up to 30 s")
+        if console.is_terminal
+        else contextlib.nullcontext()
+    ):
         transport = _connected(config, service, stop)
     with transport:
         yield transport
@@ -184,7 +211,7 @@ def _sent(driver: subprocess.Popen[str], stop: threading.Event) -> dict[str, Any
         return dict(json.loads(out))
     except ValueError:
         if stop.is_set():
-            return {"sensor": None, "packets": 0, "events": 0, "broken": None}
+            return {"sensor": None, "packets": 0, "events": 0, "broken": None, "behind_s": 0.0}
         raise DemoFailed(f"the driver ended with exit code {driver.returncode}") from None
 
 
@@ -237,6 +264,7 @@ def _summary(source: str, sent: dict[str, Any], status: StreamStatus | None, boa
         "model_digest": received.last.digest if received.last else None,
         "trained": bool(received.last and Flag.UNTRAINED not in received.last.flags),
         "broken": sent["broken"],
+        "behind_s": sent["behind_s"],
     }
 
 

@@ -2,8 +2,10 @@
 
 import argparse
 import json
+import math
+import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,8 +17,8 @@ from neurove_service.cli.arguments import (
     add_lens_flags,
     add_recording_flags,
     command,
+    duration,
     refuse_existing,
-    seconds,
     tell_faults,
 )
 from neurove_service.cli.bars import event_count
@@ -135,7 +137,7 @@ def estimate(args: argparse.Namespace) -> int:
     if path.suffix not in WRITERS:
         raise InvalidField("estimate", "--out", str(path), f"its name must end in {', '.join(WRITERS)}")
     recording = open_source(args.source, args.sensor, args.topic, args.time_unit)
-    if recording.endless and args.seconds is None:
+    if recording.endless and args.seconds in (None, math.inf):
         raise InvalidField("estimate", "RECORDING", args.source, "it never ends: give --seconds S")
     refuse_existing("estimate", "--out", path, args.source, force=args.force)
     camera = lens_of(recording, args.calibration, args.height)
@@ -144,17 +146,38 @@ def estimate(args: argparse.Namespace) -> int:
     offline = Offline(estimator, camera, getattr(recording, "stream", _STREAM))
     told = _Told(estimator, recording)
     with event_count(recording.name) as show, estimate_file(path) as add:
-        for elapsed_us, found in estimates_of(recording, offline, as_published=args.sensor is None):
-            if args.seconds is not None and elapsed_us > args.seconds * 1e6:
+        found = estimates_of(recording, offline, as_published=args.sensor is None)
+        broken = _write(found, told, add, args.seconds, lambda: show(offline.stream.counters.events_received))
+    broken = broken or next(map(str, recording.faults.unread), None)
+    summary = told.summary(path, offline) | {"broken": broken}
+    print(json.dumps(summary) if args.json else "\n".join(_lines(summary)))
+    if broken and not recording.faults.unread:
+        print(f"neurove: {broken}", file=sys.stderr)
+    tell_faults(recording)
+    return EXIT_FAILURE if broken or not told.estimates else 0
+
+
+def _write(
+    found: Iterator[tuple[int, list[TwistEstimate]]],
+    told: "_Told",
+    add: Callable[[TwistEstimate], None],
+    seconds: float | None,
+    show: Callable[[], None],
+) -> str | None:
+    """Write estimates up to the end of the recording; returns where and why it is broken, if it is."""
+    from neurove_core.io import BrokenRecording
+
+    try:
+        for elapsed_us, estimates in found:
+            if seconds is not None and elapsed_us > seconds * 1e6:
                 break
-            for one in found:
+            for one in estimates:
                 add(one)
                 told.add(one)
-            show(offline.stream.counters.events_received)
-    summary = told.summary(path, offline)
-    print(json.dumps(summary) if args.json else "\n".join(_lines(summary)))
-    tell_faults(recording)
-    return EXIT_FAILURE if recording.faults.unread or not told.estimates else 0
+            show()
+    except BrokenRecording as error:
+        return error.message
+    return None
 
 
 class _Told:
@@ -215,5 +238,5 @@ def add_estimate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--model", default="default", metavar="BUNDLE", help=about)
     add_lens_flags(parser)
     add_recording_flags(parser)
-    parser.add_argument("--seconds", type=seconds, metavar="S", help="seconds of the recording to read; default: all")
+    parser.add_argument("--seconds", type=duration, metavar="S", help="seconds of the recording to read; default: all")
     parser.add_argument("--force", action="store_true", help="replace FILE if it exists")

@@ -44,6 +44,9 @@ def _run(words: list[str], chosen: str) -> int:
         return 128 + getattr(ended, "number", signal.SIGINT)
     except BrokenPipeError:  # the reader of our output has closed it, such as `| head`
         return 0
+    except MemoryError:  # there may be none left to import what follows
+        print("neurove: not enough memory: free some, or raise the limit of the address space", file=sys.stderr)
+        return 1
     except Exception as error:
         from neurove_service.cli.failures import failure
 

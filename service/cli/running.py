@@ -6,6 +6,7 @@ import json
 import math
 import sys
 import threading
+from collections.abc import Callable
 from typing import Any
 
 from neurove_protocol.errors import EXIT_FAILURE, InvalidField
@@ -26,6 +27,7 @@ from neurove_service.cli.parser import Parser
 from neurove_service.cli.waiting import Wait, add_wait
 from neurove_service.config import ServiceConfig, load
 from neurove_service.lifecycle import stop_on_signals
+from neurove_service.limits import check_limits
 
 DEFAULT_SOURCE = "sim://"
 _DEFAULT_DEMO_S = 20.0
@@ -34,19 +36,27 @@ _AT_ONCE_S = 1.0  # a service that runs subscribes to a new session within this 
 
 
 def serve(args: argparse.Namespace) -> int:
-    """Run the service until SIGINT or SIGTERM."""
-    stop = stop_on_signals(with_parent=args.with_parent)
+    """Run the service until SIGINT or SIGTERM; SIGHUP reloads the log level and lists the models again."""
+    reloads: list[Callable[[], None]] = []  # filled as soon as there is something to reload
+    stop = stop_on_signals(with_parent=args.with_parent, on_hangup=lambda: [reload() for reload in reloads])
+
+    def read() -> ServiceConfig:
+        return load(ServiceConfig, flags(args, ServiceConfig), args.config)[0]
+
     logs.configure()  # what the settings say while they are read
-    config, _ = load(ServiceConfig, flags(args, ServiceConfig), args.config)
+    config = read()
     logs.configure(config.log_level)
+    check_limits()
 
     import torch
 
     from neurove_service.node.app import Service
+    from neurove_service.node.reload import Reload
 
     torch.set_num_threads(1)
     sys.setswitchinterval(0.0005)  # Zenoh's threads wait for ours: the default of 5 ms is a packet's period
     service = Service(config, stop)
+    reloads.append(Reload(config, read, service.available))
     gc.collect()
     gc.freeze()  # the collector would traverse all of torch at each run, with all threads stopped
     service.run()
@@ -59,6 +69,7 @@ def drive(args: argparse.Namespace) -> int:
     from neurove_core.io.calibration import lens_of
     from neurove_core.sources import open_source
     from neurove_service.clients import ask
+    from neurove_service.clients.pace import BEHIND_S
 
     stop = stop_on_signals(with_parent=args.with_parent)
     config = client_config(args)
@@ -71,21 +82,30 @@ def drive(args: argparse.Namespace) -> int:
             hint = "; if one runs, does it accept this certificate?" if config.zenoh_config else ""
             raise ask.NoService(f"no service subscribed to stream {player.label} within {args.wait:g} s{hint}")
         duration_s = math.inf if args.seconds is None else args.seconds
-        sent = player.play(stop, speed=args.speed, loop=args.loop, duration_s=duration_s)
+        how = {"speed": args.speed, "loop": args.loop, "duration_s": duration_s}
+        sent = player.play(stop, **how, **({} if args.json else {"on_behind": _tell_behind}))
     faults = recording.faults
     broken = sent.broken.message if sent.broken else next(map(str, faults.unread), None)
     if args.json:
         sensor = {"width": recording.sensor.width, "height": recording.sensor.height}
         found = [fault.as_json() for fault in faults.found]
         played = {"packets": sent.packets, "events": sent.events, "broken": broken, "faults": found}
-        print(json.dumps({"sensor": sensor, **played}))
+        print(json.dumps({"sensor": sensor, **played, "behind_s": round(sent.behind_s, 3)}))
     else:
         about = f"{recording.name} ({recording.sensor})"
-        print(f"{player.label}: {sent.packets:,} packets, {sent.events:,} events of {about}")
+        late = f", up to {sent.behind_s:.1f} s behind real time" if sent.behind_s > BEHIND_S else ""
+        print(f"{player.label}: {sent.packets:,} packets, {sent.events:,} events of {about}{late}")
     if sent.broken:
         print(f"neurove: {broken}", file=sys.stderr)
     tell_faults(recording)
     return EXIT_FAILURE if broken else 0
+
+
+def _tell_behind(behind_s: float, elapsed_s: float) -> None:
+    """Print to stderr that the source is slower than real time."""
+    where = f"{behind_s:.1f} s behind after {elapsed_s:.1f} s of the source"
+    cure = "its events arrive late; a smaller --speed, or a recording of the source, keeps up"
+    print(f"neurove: cannot keep up with real time: {where}; {cure}", file=sys.stderr, flush=True)
 
 
 def _listened_to(player: Any, wait: Wait, stop: threading.Event) -> bool:
@@ -120,6 +140,7 @@ def _player(args: argparse.Namespace, recording: Any, lens: Any, transport: Any,
 def demo(args: argparse.Namespace) -> int:
     """Run driver, service and consumer on any source, then print a summary."""
     from neurove_core.io.calibration import with_lens
+    from neurove_core.sim.truth import truth_of
     from neurove_core.sources import open_source
     from neurove_service.cli.console import console
     from neurove_service.cli.demo import run
@@ -135,29 +156,43 @@ def demo(args: argparse.Namespace) -> int:
         duration_s = _DEFAULT_DEMO_S if endless and not shown.is_terminal else math.inf
     summary = run(
         args.source,
-        sensor=str(args.sensor) if args.sensor else None,
-        topic=args.topic,
-        calibration=args.calibration,
-        height_m=args.height,
-        time_unit=args.time_unit,
-        speed="max" if math.isinf(args.speed) else str(args.speed),
-        loop=args.loop,
-        duration_s=duration_s,
+        playing=_playing(args, duration_s),
         model=args.model,
         stop=stop,
         console=shown,
         screenshot=args.screenshot,
+        truth=None if args.loop else truth_of(opened),  # a repeated source has other times than its truth
     )
     print(json.dumps(summary) if args.json else _summary_text(summary))
     return EXIT_FAILURE if summary["broken"] else 0
 
 
+def _playing(args: argparse.Namespace, duration_s: float) -> list[str]:
+    """The flags of `neurove drive` for the source of a demo."""
+    given = {
+        "--sensor": args.sensor,
+        "--topic": args.topic,
+        "--time-unit": args.time_unit,
+        "--calibration": args.calibration,
+        "--height": args.height,
+        "--speed": "max" if math.isinf(args.speed) else args.speed,
+        "--seconds": duration_s if math.isfinite(duration_s) else None,
+    }
+    words = [word for flag, value in given.items() if value is not None for word in (flag, str(value))]
+    return [*words, "--loop"] if args.loop else words
+
+
 def _summary_text(summary: dict[str, Any]) -> str:
+    from neurove_service.clients.pace import BEHIND_S
+
     sensor, numbers = summary["sensor"], summary["latency_ms"]
     if sensor is None:
         return "stopped before the driver had started"
     lost = ", ".join(f"{name} {count}" for name, count in summary["lost"].items()) or "nothing"
     latency = f"p50 {numbers['p50']:.1f} ms, p99 {numbers['p99']:.1f} ms" if numbers else "no estimate"
+    error = summary["error"]
+    off = error and f"{error['linear_m_s']:.2f} m/s, {math.degrees(error['angular_rad_s']):.1f} deg/s against the truth"
+    slow = f"the source was up to {summary['behind_s']:.1f} s behind real time: this machine cannot play it live"
     model = summary["model"] if summary["trained"] else f"{summary['model']}, UNTRAINED: the estimates have no meaning"
     lines = (
         f"source     {summary['source']} ({sensor['width']}x{sensor['height']})",
@@ -166,6 +201,8 @@ def _summary_text(summary: dict[str, Any]) -> str:
         f"estimates  {summary['estimates']:,} of {summary['windows']:,} windows, {summary['rate_hz']:.1f} per second",
         f"latency    {latency}",
         f"lost       {lost}",
+        *([f"error      {off} (RMS)"] if off else []),
+        *([f"slow       {slow}"] if summary["behind_s"] > BEHIND_S else []),
         f"model      {model}",
         *([f"broken     {summary['broken']}"] if summary["broken"] else []),
     )
@@ -194,7 +231,7 @@ def add_demo(parser: argparse.ArgumentParser) -> None:
     add_playback_flags(parser, f"seconds of the source to play; default: until its end or Ctrl-C, {most}")
     about = "bundle to serve, or the name of a built-in model; default `default`"
     parser.add_argument("--model", metavar="BUNDLE", help=about)
-    parser.add_argument("--screenshot", metavar="FILE", help="write the last table as SVG")
+    parser.add_argument("--screenshot", metavar="FILE", help="write the last live table as SVG")
 
 
 def add_serve(parser: argparse.ArgumentParser) -> None:

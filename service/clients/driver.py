@@ -13,6 +13,7 @@ from neurove_protocol.camera import SCHEMA as CAMERA_SCHEMA
 from neurove_protocol.events import SCHEMA as EVENTS_SCHEMA
 from neurove_protocol.events import encode_packet
 from neurove_protocol.keys import Keys
+from neurove_service.clients.pace import Lag, OnBehind, ignore_behind
 from neurove_service.transport import Transport
 
 POLL_S = 0.02
@@ -26,6 +27,7 @@ class PlaySummary(NamedTuple):
     first_us: int | None  # sensor clock; None before the first packet
     last_us: int | None  # of the newest event
     broken: BrokenRecording | None  # where and why the recording ended early; None if it did not
+    behind_s: float = 0.0  # the latest packet was published that long after it was due
 
 
 def repeated(recording: Recording) -> Iterator[Events]:
@@ -91,6 +93,7 @@ class Driver:
         speed: float = 1.0,
         loop: bool = False,
         duration_s: float = math.inf,
+        on_behind: OnBehind = ignore_behind,
     ) -> PlaySummary:
         """Publish the recording until its end, the duration, or the stop event.
 
@@ -99,7 +102,9 @@ class Driver:
             speed: sensor seconds per second; infinity publishes as fast as the recording is read.
             loop: start again at the end.
             duration_s: sensor time to play [s].
+            on_behind: called once if the source or this machine cannot keep up.
         """
+        lag = Lag(speed, on_behind)
         chunks = repeated(self._recording) if loop and not self._recording.endless else self._recording.chunks()
         sent = PlaySummary(0, 0, None, None, None)
         began = 0.0
@@ -112,8 +117,10 @@ class Driver:
                 if elapsed_s > duration_s or _stopped(stop, began + elapsed_s / speed):
                     break
                 self._send(sent.packets, piece)
+                lag.sent(began + elapsed_s / speed, elapsed_s)
                 last_us = int(piece.events.t[-1]) if piece.events.n else sent.last_us
-                sent = PlaySummary(sent.packets + 1, sent.events + piece.events.n, first_us, last_us, None)
+                events = sent.events + piece.events.n
+                sent = PlaySummary(sent.packets + 1, events, first_us, last_us, None, lag.most_s)
         except BrokenRecording as error:
             return sent._replace(broken=error)
         return sent

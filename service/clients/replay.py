@@ -16,6 +16,7 @@ from neurove_protocol.events import SCHEMA as EVENTS_SCHEMA
 from neurove_protocol.events import EventPacket, decode_packet
 from neurove_protocol.keys import Keys
 from neurove_service.clients.driver import POLL_S, PlaySummary
+from neurove_service.clients.pace import Lag, OnBehind, ignore_behind
 from neurove_service.transport import Publisher, Transport
 
 log = logging.getLogger(__name__)
@@ -101,7 +102,13 @@ class Replay:
         return True
 
     def play(
-        self, stop: threading.Event, *, speed: float = 1.0, loop: bool = False, duration_s: float = math.inf
+        self,
+        stop: threading.Event,
+        *,
+        speed: float = 1.0,
+        loop: bool = False,
+        duration_s: float = math.inf,
+        on_behind: OnBehind = ignore_behind,
     ) -> PlaySummary:
         """Publish the packets until the end, the duration, or the stop event.
 
@@ -112,6 +119,7 @@ class Replay:
             speed: sensor seconds per second; infinity publishes as fast as the recording is read.
             loop: must be False, because sequence numbers and times would repeat.
             duration_s: sensor time to play [s].
+            on_behind: called once if this machine cannot keep up.
 
         Raises:
             ValueError: `loop` is true.
@@ -119,7 +127,7 @@ class Replay:
         if loop:
             raise ValueError("a replay cannot loop")
         sent = PlaySummary(0, 0, None, None, None)
-        pace = Pace(speed)
+        pace, lag = Pace(speed), Lag(speed, on_behind)
         try:
             for recorded in self._recording.packets(self._only):
                 packet = _read(recorded)
@@ -130,8 +138,9 @@ class Replay:
                     first_us = packet.t0_us if sent.first_us is None else sent.first_us
                     last_us = int(packet.events.t[-1]) if packet.events.n else sent.last_us
                     sent = sent._replace(events=sent.events + packet.events.n, first_us=first_us, last_us=last_us)
+                    lag.sent(due, elapsed_s)
                 self._publishers[recorded.stream].put(recorded.payload, sent_us=time.monotonic_ns() // 1000)
-                sent = sent._replace(packets=sent.packets + 1)
+                sent = sent._replace(packets=sent.packets + 1, behind_s=lag.most_s)
         except BrokenRecording as error:
             return sent._replace(broken=error)
         return sent

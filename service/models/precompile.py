@@ -87,7 +87,9 @@ def in_child(config: ModelConfig, stop: threading.Event, timeout_s: float = TIME
 def _shape(config: ModelConfig) -> tuple[object, ...]:
     """What the types and constants of compiled code depend on."""
     cells = config.canonical.width * config.canonical.height * 2 * config.window.bins
-    return config.kind, config.network, config.window.bins, cells > _WIDE_CELLS
+    net = config.network
+    widths = net.encoding, net.precision, net.channels, net.features, net.hidden, net.cells
+    return config.kind, widths, config.window.bins, cells > _WIDE_CELLS
 
 
 def main() -> None:

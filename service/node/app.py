@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Callable
 
+from neurove_core.geometry.tables import TABLES
 from neurove_core.models.bundle import Bundle
 from neurove_protocol.control import STATUS_SCHEMA, ChunkRequest
 from neurove_protocol.errors import NeuroVEError
@@ -12,11 +13,13 @@ from neurove_service.guard import Guard
 from neurove_service.lifecycle import notify
 from neurove_service.models.active_file import Active, ActiveFile
 from neurove_service.models.change import Rules
+from neurove_service.models.library import Available
 from neurove_service.models.signatures import verifier
 from neurove_service.models.slot import ModelSlot
 from neurove_service.models.store import ModelStore
 from neurove_service.node import memory
 from neurove_service.node.condition import Watch
+from neurove_service.node.folders import check_folders
 from neurove_service.node.handlers import Handlers
 from neurove_service.node.housekeeping import Housekeeping
 from neurove_service.node.outlets import open_outlet, route
@@ -62,11 +65,14 @@ class Service:
         stop: set it to end the service.
 
     Raises:
+        ConfigError: a configured folder is no folder, or cannot be read.
         BadModel, UnknownModel: the configured model cannot be loaded.
     """
 
     def __init__(self, config: ServiceConfig, stop: threading.Event) -> None:
         self._config, self._stop = config, stop
+        check_folders(config)
+        TABLES.max_bytes = config.tables_mib << 20
         self._guard = Guard()
         self._keys = config.keys
         self._active_file = ActiveFile(config.state_folder)
@@ -86,6 +92,10 @@ class Service:
             on_trial=self._save_trial,
         )
         self._slot.resume()
+
+    def available(self) -> Available:
+        """The models that can be activated now."""
+        return self._slot.available()
 
     def run(self) -> None:
         """Serve until the stop event is set, then end everything in order.
@@ -213,12 +223,14 @@ class Service:
 
     def _save_trial(self, tried: Bundle | None, proven: Bundle) -> None:
         """Save a model whose probation waits for windows, next to the model before it; None: it waits no more."""
-        before = self._active_file.active
-        same = before is not None and before.digest == proven.digest
+        before, previous = self._active_file.active, None
+        if before is not None:
+            ways_back = {before.digest: before.previous, before.trial: before.digest}
+            previous = ways_back.get(proven.digest)
         self._active_file.keep(
             Active(
                 digest=proven.digest,
-                previous=before.previous if before is not None and same else None,
+                previous=previous,
                 configured=self._config.model,
                 highest_release=self._active_file.highest_release,
                 trial=tried.digest if tried is not None else None,

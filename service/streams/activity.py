@@ -65,6 +65,7 @@ class Activity:
         self.reset_ns: deque[int] = deque(maxlen=_RESETS)  # times of the newest resets
         self.newest_ns: dict[str, int] = {}  # counter or flag -> when it last grew
         self.certain_ns = self.last_estimate_ns  # newest estimate that was neither uncertain nor settling
+        self.unit_hint = ""  # why the clock of the stream does not seem to count microseconds
         self.refusal = ""  # why the newest packet or CameraInfo was refused
         self._now_ns = now_ns
 
@@ -92,6 +93,11 @@ class Activity:
     def grew_within(self, name: str, seconds: float, now_ns: int) -> bool:
         """Whether a counter grew in the last seconds."""
         return name in self.newest_ns and now_ns - self.newest_ns[name] < seconds * 1e9
+
+    def tell_unit(self, hint: str) -> None:
+        """Record that the clock of the stream does not count microseconds."""
+        self.unit_hint = hint
+        self.newest_ns["unit_hint"] = self._now_ns()
 
     def was_reset(self) -> None:
         """Count a reset of the recurrent state."""

@@ -8,6 +8,7 @@ from neurove_protocol.events import Packet, WireEvents, WirePacket
 from neurove_service import logs
 from neurove_service.streams.activity import Activity
 from neurove_service.streams.age import Ages, newest_us
+from neurove_service.streams.clock_unit import ClockUnit
 from neurove_service.streams.flags import Flags
 from neurove_service.streams.repetition import Repetition
 from neurove_service.streams.sequence import Order, Sequence
@@ -45,6 +46,7 @@ class Intake:
         self._max_age_ns = max_age_s * 1e9
         self._sequence = Sequence()
         self._repetition = Repetition()
+        self._unit = ClockUnit()
         self._delay_ns = 0  # of the newest packet, see Ages.learn
         self._shed = False  # windows were left out before the next packet
 
@@ -92,6 +94,8 @@ class Intake:
 
     def is_stale(self, packet: Packet, arrival: Arrival, packets: int = 1) -> bool:
         """Learn from the times of a packet, or a run of packets, in order; whether it is too old to be processed."""
+        if arrival.sent_us is None and self._unit.learn(newest_us(packet), arrival.received_ns):
+            self._activity.tell_unit(self._unit.hint)
         self._delay_ns = self.ages.learn(
             newest_us(packet) if arrival.sent_us is None else arrival.sent_us, arrival.received_ns
         )

@@ -90,6 +90,8 @@ def judge(activity: Activity, now_ns: int) -> Judgement:
 def _cause(activity: Activity, now_ns: int) -> str:
     if activity.grew_within("malformed_packets", LOSSY_S, now_ns) and activity.refusal:
         return f"; packets are refused: {activity.refusal}"
+    if activity.grew_within("unit_hint", LOSSY_S, now_ns):
+        return f"; {activity.unit_hint}"
     if activity.grew_within("stale_packets", LOSSY_S, now_ns):
         return "; packets are older than max_age_s: the link, the driver or the clock of the camera is too slow"
     return ""
@@ -98,6 +100,8 @@ def _cause(activity: Activity, now_ns: int) -> str:
 def _unstable(activity: Activity, now_ns: int) -> str:
     if activity.grew_within("foreign_packets", LOSSY_S, now_ns):
         return f"two drivers publish on this stream: {activity.counters.foreign_packets} packets of the second one"
+    if activity.grew_within("unit_hint", LOSSY_S, now_ns):
+        return activity.unit_hint
     if activity.grew_within("frozen", LOSSY_S, now_ns):
         return "the camera repeats the same events"
     if activity.grew_within("uncounted_packets", LOSSY_S, now_ns):

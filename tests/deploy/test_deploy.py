@@ -129,6 +129,13 @@ class TestUnits:
         assert service["Restart"] == "on-failure"
         assert service["DynamicUser"] == "yes"
 
+    @pytest.mark.parametrize("name", ["neurove.service", "zenoh-router.service"])
+    def test_a_unit_bounds_memory_and_tasks(self, name):
+        assert {"MemoryMax", "TasksMax"} <= unit(name)["Service"].keys()
+
+    def test_the_unit_reloads_by_the_signal_that_the_service_handles(self):
+        assert unit("neurove.service")["Service"]["ExecReload"] == "/bin/kill -HUP $MAINPID"
+
     def test_the_unit_makes_the_folders_that_settings_and_numba_use(self):
         text = (DEPLOY / "neurove.service").read_text(encoding="utf-8")
         service = unit("neurove.service")["Service"]

@@ -125,7 +125,7 @@ _SPOILT: dict[str, Callable[[bytes], bytes]] = {
 
 REASONS = {
     "truncated": ("bad_model", "incomplete"),
-    "flipped-bit": ("bad_model", "header"),
+    "flipped-bit": ("bad_model", "dtype="),
     "wrong-shape": ("bad_model", "needs torch.float32 ("),
     "wrong-dtype": ("bad_model", "torch.float64"),
     "nan": ("bad_model", "not finite"),

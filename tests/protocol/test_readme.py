@@ -9,6 +9,8 @@ import importlib
 import inspect
 import json
 import re
+import shutil
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, get_args
@@ -33,7 +35,8 @@ from neurove_protocol import (
 )
 from neurove_protocol.codec import PROTOCOL_VERSION
 from neurove_protocol.control import Latency, Losses, ModelInfo, Verdict
-from neurove_protocol.events import FORMATS, decode_packet, encode_packet
+from neurove_protocol.errors import InvalidField
+from neurove_protocol.events import DEFAULT_LIMITS, FORMATS, PacketLimits, decode_packet, encode_packet
 from neurove_protocol.keys import Keys
 from neurove_protocol.velocity import AXES
 from neurove_service.models.progress import Step
@@ -231,6 +234,37 @@ def test_the_picture_names_only_files_and_keys_that_exist() -> None:
     table_of_keys = {re.sub(r"[<>]", "", key) for key in column(table("key"))}
     assert len(drawn) >= 8
     assert drawn <= table_of_keys
+
+
+# --- the driver in C
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+def test_the_driver_in_c_compiles_without_a_warning_and_writes_the_packet_of_the_first_dump(tmp_path: Path) -> None:
+    (source,) = re.findall(r"```c\n(.*?)```", README, re.DOTALL)
+    (tmp_path / "packet.c").write_text(source)
+    flags = ["-std=c99", "-pedantic", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-o", str(tmp_path / "packet")]
+    made = subprocess.run(["cc", *flags, str(tmp_path / "packet.c")], capture_output=True, text=True, check=False)
+    assert (made.returncode, made.stderr) == (0, "")
+    data = subprocess.run([tmp_path / "packet"], capture_output=True, check=True).stdout
+    said = json.loads(DUMPS[0][2])
+    assert_same_packet(decode_packet(data), packet_of(said))
+    told = msgpack.unpackb(data)
+    assert list(told) == list(msgpack.unpackb(bytes_of(DUMPS[0][1])))  # the same fields
+    assert told == msgpack.unpackb(bytes_of(DUMPS[0][1]))
+
+
+def test_the_answers_quote_what_the_code_says() -> None:
+    answers = " ".join(section("## Questions of a driver author").split())
+    assert (
+        f"`max_packet_events` ({DEFAULT_LIMITS.max_events:,}) and `max_side_px` ({DEFAULT_LIMITS.max_side_px})"
+        in answers
+    )
+    packet = EventPacket("cam0", 0, Sensor(8, 8), 0, Events.from_columns(*([[0] * 3] * 4)))
+    with pytest.raises(InvalidField) as refused:
+        decode_packet(encode_packet(packet), PacketLimits(max_events=2))
+    shape = refused.value.message.replace("n=3", "n=2000000").replace("cap is 2", "cap is 1000000")
+    assert f"`{shape}`" in answers
 
 
 # --- the examples

@@ -105,19 +105,40 @@ def test_the_clock_is_unwrapped(tmp_path):
 @pytest.mark.parametrize(
     ("last", "t", "why"),
     [
-        (200 << 22, 9, "outside the sensor"),
+        (200 << 22, 9, "y=-21 lies outside the sensor 240x180"),
         (1 << 22 | 300 << 12, 9, "outside the sensor"),
         (1 << 22, 2, "after t=3 us"),
     ],
 )
-def test_a_bad_pair_ends_the_recording_and_the_error_names_its_byte(last, t, why, tmp_path):
+def test_a_bad_pair_is_skipped_and_counted_with_its_byte(last, t, why, tmp_path):
     head = header(b"DAVIS240C")
-    data = head + pairs(np.array([1 << 22, 1 << 31, last]), np.array([3, 4, t]))
+    data = head + pairs(np.array([1 << 22, 1 << 31, last, 1 << 22]), np.array([3, 4, t, 20]))
     events, error = read_broken(open_source(put(tmp_path, "a.aedat", data)))
-    assert events.n == 1
+    assert events.t.tolist() == [3, 20]
     assert error is not None
     assert error.details["where"] == f"byte {len(head) + 16}"
     assert why in error.message
+
+
+def test_old_events_before_the_clock_of_the_recording_are_discarded(tmp_path):
+    n = 400
+    t = np.arange(n) * 100
+    t[:10] += 500_000_000
+    recording = open_source(put(tmp_path, "a.aedat", header(b"DAVIS240C") + pairs(np.full(n, 1 << 22), t)))
+    assert read(recording).t.tolist() == t[10:].tolist()
+    (fault,) = recording.faults.found
+    assert (fault.reason, fault.count) == ("stale_start", 10)
+
+
+def test_without_a_chip_in_the_header_the_sensor_selects_the_layout(tmp_path):
+    sensor = Sensor(346, 260)
+    events = make_events(100, seed=2, sensor=sensor)
+    path = put(tmp_path, "a.aedat", b"#!AER-DAT2.0\r\n# tick is 1 us\r\n" + pairs(davis(events, sensor), events.t))
+    assert_same(read(open_source(path, sensor)), events)
+    with pytest.raises(UnknownSource, match="give --sensor WIDTHxHEIGHT: the size selects the chip: DAVIS240 240x180"):
+        open_source(path)
+    with pytest.raises(UnknownSource, match="--sensor 640x480 is none of them"):
+        open_source(path, Sensor(640, 480))
 
 
 def test_a_truncated_pair_is_reported_after_the_complete_pairs(tmp_path):

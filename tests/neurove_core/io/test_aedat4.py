@@ -181,7 +181,7 @@ def test_an_aedat4_file_without_an_event_stream_or_a_size_is_refused(tmp_path):
         open_source(without_size)
     assert_same(read(open_source(without_size, SENSOR)), EVENTS)
     with pytest.raises(UnknownSource, match="does not begin with the AEDAT4 signature"):
-        open_source(put(tmp_path, "a.aedat4", b"#!AER-DAT3.1\r\n"))
+        open_source(put(tmp_path, "a.aedat4", b"#!AER-DAT5.0\r\n"))
 
 
 def test_the_first_of_several_event_streams_is_read_and_named(tmp_path):

@@ -97,6 +97,23 @@ def test_a_truncated_file_gives_its_complete_records_and_then_names_the_byte(mis
         assert error.details["where"] == f"byte {len(HEADER) + 2 + 8 * got.n}"
 
 
+@pytest.mark.parametrize("version", ["1", "3"])
+def test_another_version_of_the_records_is_refused(version, tmp_path):
+    data = dat(make_events(5)).replace(b"% Version 2", b"% Version " + version.encode())
+    with pytest.raises(UnknownSource, match=f"version {version}; the supported version is 2"):
+        open_source(put(tmp_path, "a.dat", data))
+
+
+def test_a_large_step_of_the_clock_that_is_no_wrap_adds_no_hour(tmp_path):
+    t = np.concatenate([np.arange(300) + (3 << 29), np.arange(300)])
+    rows = np.zeros(600, RECORD)
+    rows["t"] = t
+    recording = open_source(put(tmp_path, "a.dat", HEADER + b"\x00\x08" + rows.tobytes()))
+    events = read(recording)
+    assert events.t[-1] - events.t[0] == 299 + 1_000_000 + 299
+    assert [fault.reason for fault in recording.faults.found] == ["new_clock"]
+
+
 def test_an_incomplete_header_is_refused(tmp_path):
     with pytest.raises(MissingGeometry, match="--sensor"):
         open_source(put(tmp_path, "a.dat", b"% Version 2\n\x00\x08"))

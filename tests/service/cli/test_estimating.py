@@ -1,7 +1,6 @@
 """neurove estimate: its files hold what the service gives for the same packets."""
 
 import csv
-import itertools
 import json
 
 import numpy as np
@@ -14,14 +13,15 @@ from neurove_core.io.formats.packet_log.writer import PacketWriter
 from neurove_core.io.formats.pose_files import read_poses
 from neurove_core.models import bundle
 from neurove_core.sources import open_source
-from neurove_protocol import CameraInfo, Twist, TwistEstimate
+from neurove_protocol import CameraInfo, Events, Twist, TwistEstimate
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import encode_packet, open_packet
 from neurove_protocol.velocity import Trace
+from neurove_service.streams.intake import Arrival
 from neurove_service.streams.stream import Stream
 from tests.builders import SENSOR, make_packets
 from tests.recordings import ecd_text
-from tests.service.conftest import SMALL, arrived
+from tests.service.conftest import SMALL
 
 CAMERA = CameraInfo(
     stream="left", width=SENSOR.width, height=SENSOR.height, lens="pinhole", fx=40.0, fy=40.0, cx=31.5, cy=23.5
@@ -30,11 +30,10 @@ PACKETS = make_packets(100, stream="left")
 LOST = PACKETS[:30] + PACKETS[31:60] + [PACKETS[59]] + PACKETS[60:]  # one is lost, one comes twice
 
 
-@pytest.fixture(scope="module")
-def model(tmp_path_factory):
-    path = tmp_path_factory.mktemp("model") / "one.safetensors"
-    bundle.save(bundle.untrained(1, SMALL, "one"), path)
-    return path
+@pytest.fixture
+def model(models_dir):
+    """The model that `slot` serves."""
+    return models_dir / "one.safetensors"
 
 
 @pytest.fixture
@@ -57,11 +56,15 @@ def rows(path):
 
 
 def served(slot, packets, camera):
-    """What the stream of a service gives for the bytes of these packets."""
-    stream = Stream("left", slot)
+    """What the stream of a service gives for the bytes of these packets, each received when it is sent."""
+    now_ns = 10**12
+    stream = Stream("left", slot, lambda: now_ns)
     stream.set_camera(camera)
-    received = (open_packet(encode_packet(packet)) for packet in packets)
-    return list(itertools.chain.from_iterable(stream.accept(packet, arrived()) for packet in received))
+    found = []
+    for packet in packets:
+        now_ns = 10**12 + (packet.t0_us + 4000) * 1000
+        found += stream.accept(open_packet(encode_packet(packet)), Arrival(now_ns, now_ns))
+    return found
 
 
 def test_the_estimates_are_those_of_the_service_for_the_same_packets(run, slot, model, log, tmp_path):
@@ -74,8 +77,9 @@ def test_the_estimates_are_those_of_the_service_for_the_same_packets(run, slot, 
     assert len(expected) == 7
     assert [one.start_us for one in expected if "gap" in one.flags] == [100_000]
     assert not any("unscaled" in one.flags for one in expected)
-    assert json.loads(text)["lost"] == {"gap_packets": 1, "duplicate_packets": 1}
-    assert json.loads(text)["flags"]["gap"] == 1
+    summary = json.loads(text.splitlines()[-1])  # the slot has printed that it compiles
+    assert summary["lost"] == {"gap_packets": 1, "duplicate_packets": 1}
+    assert summary["flags"]["gap"] == 1
 
 
 def test_a_csv_file_has_a_row_for_each_bin(run, model, log, tmp_path):
@@ -173,6 +177,44 @@ def test_what_cannot_be_estimated_is_one_line_and_leaves_no_file(run, tmp_path, 
     code, _, err = run("estimate", *arguments, "--model", "untrained")
     assert (code, why in err, err.count("\n")) == (2, True, 1), err
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_truncated_recording_gives_the_estimates_up_to_its_end_and_exits_with_1(run, model, log, tmp_path):
+    whole, cut = tmp_path / "whole.csv", tmp_path / "cut.mcap"
+    cut.write_bytes(log.read_bytes()[:-2000])  # the end of its packets is in one chunk before the index
+    assert run("estimate", log, "--out", whole, "--model", model)[0] == 0
+    code, text, err = run("estimate", cut, "--out", tmp_path / "cut.csv", "--model", model, "--json")
+    assert (code, "the file ends within" in err) == (1, True), err
+    assert json.loads(text)["broken"]
+    assert rows(tmp_path / "cut.csv") == rows(whole)[: len(rows(tmp_path / "cut.csv"))]
+
+
+def test_a_damaged_packet_of_a_log_is_counted_and_flags_its_window(run, model, tmp_path):
+    path = tmp_path / "bad.mcap"
+    with PacketWriter(path) as writer:
+        for number, packet in enumerate(PACKETS):
+            payload = encode_packet(packet)
+            writer.write("left", payload[:50] if number == 30 else payload, number * 4_000_000)
+    code, text, _ = run("estimate", path, "--out", tmp_path / "a.mcap", "--model", model, "--json")
+    found = json.loads(text)
+    assert (code, found["lost"]) == (0, {"malformed_packets": 1})
+    assert [one.start_us for one in messages(tmp_path / "a.mcap") if "gap" in one.flags] == [100_000]
+
+
+def test_a_lens_from_a_file_is_used(run, model, tmp_path):
+    (tmp_path / "events.txt").write_bytes(ecd_text(Events.join([packet.events for packet in PACKETS])))
+    (tmp_path / "lens.yaml").write_text(
+        "image_width: 64\nimage_height: 48\ndistortion_model: plumb_bob\n"
+        "camera_matrix: {rows: 3, cols: 3, data: [40.0, 0, 31.5, 0, 40.0, 23.5, 0, 0, 1]}\n"
+        "distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}\n"
+    )
+    arguments = ("estimate", tmp_path / "events.txt", "--sensor", "64x48", "--model", model, "--json", "--out")
+    _, without, _ = run(*arguments, tmp_path / "a.csv")
+    lens = ("--calibration", tmp_path / "lens.yaml", "--height", 2)
+    code, text, err = run(*arguments, tmp_path / "b.csv", *lens)
+    assert code == 0, err
+    assert {"uncalibrated", "unscaled"} <= json.loads(without)["flags"].keys()
+    assert not {"uncalibrated", "unscaled"} & json.loads(text)["flags"].keys()
 
 
 def test_a_height_without_a_lens_is_refused(run, tmp_path):

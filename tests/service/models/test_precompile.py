@@ -12,7 +12,8 @@ def test_only_a_network_of_a_new_shape_needs_a_child():
     shapes.add(SMALL)
     same = SMALL.model_copy(update={"window": WindowConfig(duration_us=20_000), "settle_windows": 3})
     wider = SMALL.model_copy(update={"canonical": CanonicalConfig(width=30, height=16)})
-    assert not any(shapes.need_child(one, None) for one in (SMALL, same, wider))
+    other = SMALL.model_copy(update={"network": SMALL.network.model_copy(update={"decay": 0.7, "surrogate": "arctan"})})
+    assert not any(shapes.need_child(one, None) for one in (SMALL, same, wider, other))
     for changed in (
         {"network": NetworkConfig(channels=(4,), hidden=4, precision="int8")},
         {"window": WindowConfig(bins=2)},

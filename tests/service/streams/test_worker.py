@@ -108,7 +108,7 @@ def published():
 
 @pytest.fixture
 def worker(slot, published):
-    worker = StreamWorker(Stream("cam0", slot), published.open, Inbox(60, 1 << 26), PacketLimits())
+    worker = StreamWorker(Stream("cam0", slot, max_age_s=60), published.open, Inbox(60, 1 << 26), PacketLimits())
     yield worker
     worker.stop()
     worker.join(5)
@@ -164,7 +164,7 @@ def test_an_unreadable_camera_info_is_refused_and_the_stream_continues(slot):
         raise Malformed("camera info", "planted")
 
     published = Published(broken)
-    worker = StreamWorker(Stream("cam0", slot), published.open, Inbox(60, 1 << 26), PacketLimits())
+    worker = StreamWorker(Stream("cam0", slot, max_age_s=60), published.open, Inbox(60, 1 << 26), PacketLimits())
     worker.put_camera(b"garbage", time.monotonic_ns())
     good = CameraInfo(stream="cam0", width=64, height=48, lens="pinhole", fx=40, fy=40, cx=32, cy=24)
     worker.put_camera(good.encode(), time.monotonic_ns())
@@ -208,7 +208,7 @@ def test_packets_that_wait_together_give_the_same_estimates_as_one_by_one(slot):
     published = Published()
     gate = threading.Event()
     worker = StreamWorker(
-        Stream("cam0", slot),
+        Stream("cam0", slot, max_age_s=60),
         lambda: published.open() if gate.wait(20) else None,
         Inbox(60, 1 << 26),
         PacketLimits(),

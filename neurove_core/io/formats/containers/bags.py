@@ -154,7 +154,7 @@ class SqliteBag:
                         damaged(tally, error.where, error.why)
                     if not isinstance(row[0], int):
                         raise BrokenRecording(self.path, f"the message after message {last}", "it has no number")
-                    if row[0] <= last:  # damaged pages can form a circle
+                    if row[0] <= last:  # damaged pages can repeat
                         why = f"message {row[0]} follows message {last}: the numbers must increase"
                         raise BrokenRecording(self.path, f"the message after message {last}", why)
                     last, step, error, found = row[0], 1, None, True
@@ -186,7 +186,7 @@ class _ReadConnection:
 
 
 class _Work:
-    """Interrupts SQLite where it searches a row for too long: damaged pages can form a circle.
+    """Interrupts SQLite where it searches a row for too long: damaged pages can repeat.
 
     Args:
         connection: the connection to watch.

@@ -6,6 +6,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from neurove_core.io.checked import truth
 from neurove_core.io.formats.hdf5.dsec import LENS_FIELDS
 from neurove_core.io.formats.hdf5.sink import Sink, write_file
 from neurove_core.io.recording import Recording
@@ -45,7 +46,7 @@ def write_dsec(recording: Recording, path: Path, progress: Callable[[int], None]
 
     Raises:
         InvalidField: the recording is endless, or its times span more than MAX_SPAN_S.
-        BrokenRecording: the recording could not be read to its end; nothing is written.
+        BrokenRecording: the recording raises it; nothing is written.
         MissingExtra: h5py or hdf5plugin is not installed. OSError: the file cannot be written.
     """
     if recording.endless:
@@ -109,7 +110,7 @@ def _index_entries(events: Events, first: int, ms: int) -> Iterator[np.ndarray[A
 
 def _write_truth(recording: Recording, file: Any) -> Iterator[str]:
     """Write the groups `poses` and `twists`; yield their names."""
-    poses, twists = recording.poses(), recording.twists()
+    poses, twists = truth(recording)
     if poses is not None:
         _write_group(file, "poses", t=poses.t, position=poses.position_m, orientation=poses.orientation)
         yield "poses"

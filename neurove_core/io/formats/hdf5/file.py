@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from neurove_core.extras import MissingExtra
 from neurove_core.files import pointer_fault
 from neurove_core.io.errors import BrokenRecording, MissingFilter, UnknownSource
+from neurove_core.io.formats.hdf5.heap import heap_fault
 from neurove_core.io.unpack import FREE_BYTES, MAX_RATIO
 
 MAX_CHUNK_BYTES: Final = 64 << 20
@@ -43,6 +44,9 @@ def opened(path: Path) -> Iterator[Any]:
     head = head[: len(_MAGIC)]
     if not head or not _MAGIC.startswith(head):
         raise UnknownSource(path, "the file does not start with the HDF5 signature")
+    heap = heap_fault(path)
+    if heap is not None:
+        raise BrokenRecording(path, f"byte {heap[0]}", f"its texts cannot be read: {heap[1]}")
     try:
         opened_file = h5py.File(path, "r", rdcc_nbytes=_CACHE_BYTES, locking="best-effort")
     except FAULTS as error:

@@ -10,6 +10,7 @@ from typing import Any, Final, Self
 import numpy as np
 
 from neurove_core.extras import MissingExtra
+from neurove_core.io.checked import truth
 from neurove_core.io.formats.packet_log import layout
 from neurove_core.io.packets import slices
 from neurove_core.io.recording import Recording
@@ -170,7 +171,7 @@ def write_mcap(recording: Recording, path: Path, stream: str = "cam0", progress:
 
     Raises:
         InvalidField: the recording is endless, or the file cannot be written.
-        BrokenRecording: the recording is damaged; no new file is left at the path.
+        BrokenRecording: the recording raises it; no new file is left at the path.
     """
     if recording.endless:
         raise InvalidField("recording", "source", recording.name, "it has no end")
@@ -195,7 +196,7 @@ def _write_other_data(recording: Recording, stream: str, writer: PacketWriter) -
         _write_rows(writer, stream, "imu", imu)
     for triggers in recording.triggers():
         _write_rows(writer, stream, "triggers", triggers)
-    poses, twists = recording.poses(), recording.twists()
+    poses, twists = truth(recording)
     if poses is not None:
         _write_rows(writer, stream, "poses", poses)
     if twists is not None:

@@ -304,7 +304,8 @@ def _poses(found: Iterator[tuple[str, messages.PoseSample]], offset_us: int, tal
     samples: list[messages.PoseSample] = []
     try:
         for where, sample in found:
-            length = float(np.linalg.norm(sample.orientation))
+            with np.errstate(all="ignore"):  # a number that is too large is not a pose
+                length = float(np.linalg.norm(sample.orientation))
             if not (abs(length - 1) < 1e-2 and np.isfinite(sample.position_m).all()):  # this form rejects NaN
                 why = f"position {sample.position_m} and orientation {sample.orientation} are not a pose"
                 tally.add(Reason.INVALID, where, why)
