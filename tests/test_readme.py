@@ -1,5 +1,6 @@
 """README and the other pages: the library example runs, links lead somewhere, and every command exists as written."""
 
+import json
 import re
 import shlex
 import subprocess
@@ -48,6 +49,22 @@ def test_the_library_example_has_six_lines_and_prints_velocities() -> None:
         end_us, *twist = line.split()
         assert int(end_us) % 50_000 == 0
         assert len([float(number) for number in twist]) == 6
+
+
+def test_the_first_example_of_evaluate_is_better_than_every_constant(run) -> None:
+    examples = [command for command in commands(README) if command.startswith("neurove evaluate")]
+    words = shlex.split(examples[0])[1:]
+    code, out, _ = run(*words, "--json")
+    report = json.loads(out)
+    assert code == 0
+    for name in ("rmse_v_l_m_s", "rmse_v_a_deg_s"):
+        assert report[name] < min(report["mean"][name], report["zero"][name])
+
+
+def test_the_second_block_of_commands_starts_one_service() -> None:
+    block = re.findall(r"```sh\n(.*?)```", README, re.DOTALL)[1]
+    assert block.count("neurove serve") == 1
+    assert sum(command.startswith("neurove serve") for command in commands(README)) == 1
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

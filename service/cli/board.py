@@ -42,9 +42,10 @@ _HISTORY_WITH_SIGMA = 19
 _PANEL_LINES = 10
 _LEAST_NAME, _MOST_NAME = 8, 30
 _NUMBERS = 52  # columns of a line after the name: six numbers and the state
+_STATUS_OLD_S = 3.0  # a node publishes the status of a stream every second, unless it is configured otherwise
 _NODES = 8  # that are remembered per stream
-_NO_LENS = "the lens is unknown: `neurove drive --calibration FILE --height M`, or publish its CameraInfo"
-_NO_HEIGHT = "the height is unknown, 1 m is assumed: `neurove drive --height M`, or set CameraInfo.height_m"
+_NO_LENS = "no lens: `drive --calibration FILE`, or a CameraInfo"
+_NO_HEIGHT = "no height, 1 m assumed: `drive --height M`, or in CameraInfo"
 
 TruthOf = Callable[[TwistEstimate], Twist | None]
 """The true twist at the end of a window; None where it is unknown."""
@@ -65,6 +66,8 @@ class Received:
     first_at: float = 0.0
     last_at: float = 0.0  # monotonic clock [s]
     last_wall: float = 0.0  # the same on the wall clock, to say since when
+    status_at: float = 0.0
+    status_wall: float = 0.0
 
     def copied(self) -> "Received":
         """A copy that does not change while it is drawn, with the newest latencies only."""
@@ -98,6 +101,11 @@ class Received:
             return None
         silent_s = now - self.last_at
         return silent_s if silent_s > 2 * self.period_s else None
+
+    def status_silent_s(self, now: float) -> float | None:
+        """Time since the newest status [s], if the node has left out several; None otherwise."""
+        silent_s = now - self.status_at
+        return silent_s if self.status is not None and silent_s > _STATUS_OLD_S else None
 
     def is_live(self, now: float) -> bool:
         """Whether an estimate arrived within the last two windows."""
@@ -151,8 +159,10 @@ class Board:
 
     def on_status(self, status: StreamStatus) -> None:
         """Replace the status of a stream."""
+        now = self._clock()
         with self._lock:
-            self._streams.setdefault(status.stream, Received()).status = status
+            received = self._streams.setdefault(status.stream, Received())
+            received.status, received.status_at, received.status_wall = status, now, time.time()
 
     def at_newest(self) -> "Board":
         """A board that shows what this one showed when the newest estimate arrived."""
@@ -188,7 +198,9 @@ class Board:
             yield Text(f"{'stream':{room}}{heads} state", style="dim", no_wrap=True, overflow="crop")
             yield from (_one_line(name, one, now, room) for name, one in streams.items())
         yield _legend(streams, lines=not fits)
-        yield from (Text(note, style="yellow") for name, one in streams.items() for note in notes(name, one))
+        for name, one in streams.items():
+            style = "yellow" if one.status_silent_s(now) is None else OLD
+            yield from (Text(note, style=style) for note in notes(name, one))
 
 
 def age_text(age_s: float) -> str:
@@ -231,12 +243,21 @@ def notes(name: str, received: Received) -> Iterator[str]:
         yield f"{name}: {_NO_LENS}"
     elif Flag.UNSCALED in flags:
         yield f"{name}: {_NO_HEIGHT}"
-    if status is not None and status.verdict != "ok":
-        yield f"{name}: {status.verdict}: {status.why}"
-    if status is not None and status.refusal and status.refusal not in status.why:
-        yield f"{name}: refused: {status.refusal}"
+    if status is not None:
+        yield from status_notes(status)
     if len(received.nodes) > 1:
         yield f"{name}: {len(received.nodes)} nodes answer this stream: {', '.join(received.nodes)}"
+
+
+def status_notes(status: StreamStatus) -> Iterator[str]:
+    """One line for each thing that is not as usual on a stream: the reason of its verdict, and what was refused."""
+    if status.verdict != "ok":
+        yield f"{status.stream}: {status.verdict}: {status.why}"
+    if status.refusal and status.refusal not in status.why:
+        yield f"{status.stream}: refused: {status.refusal}"
+    if status.uncounted_packets:
+        count = f"{status.uncounted_packets:,} packets have the sequence number 0"
+        yield f"{status.stream}: {count}, so losses on the way to the node are not counted"
 
 
 def _legend(streams: dict[str, Received], *, lines: bool) -> Text:
@@ -247,7 +268,8 @@ def _legend(streams: dict[str, Received], *, lines: bool) -> Text:
 def _one_line(name: str, received: Received, now: float, room: int) -> Text:
     """A stream in one line: name, newest twist, and its verdict, or since when it is silent."""
     silent_s = received.silent_s(now)
-    shown = name if len(name) < room else f"{name[: room - 2]}…"
+    kept = room - 2  # of a long name the begin and the end: cameras often differ in the last word
+    shown = name if len(name) < room else f"{name[: kept // 2]}…{name[-(kept - kept // 2) :]}"
     numbers = "".join(_six(value) for value in received.last.twist) if received.last is not None else f"{'-':>42}"
     grey = not received.is_live(now)
     line = Text(f"{shown:{room}}{numbers} ", style=OLD if grey else "default", no_wrap=True, overflow="crop")
@@ -255,6 +277,9 @@ def _one_line(name: str, received: Received, now: float, room: int) -> Text:
         return line.append(age_text(silent_s), style=OLD)
     if received.late_s is not None:
         return line.append(age_text(received.late_s), style="yellow")
+    status_s = received.status_silent_s(now)
+    if received.last is None and status_s is not None:
+        return line.append(age_text(status_s), style=OLD)
     verdict = received.status.verdict if received.status is not None else "-"
     return line.append(verdict, style=VERDICT_STYLE.get(verdict, "default"))
 
@@ -336,6 +361,9 @@ def _title(name: str, received: Received, now: float) -> Text:
     silent_s = received.silent_s(now)
     if silent_s is not None:
         title.append(f"{since(received, silent_s)}  ", style="bold yellow")
+    elif status is not None and received.status_silent_s(now) is not None:
+        at = time.strftime("%H:%M:%S", time.localtime(received.status_wall))
+        title.append(f"no status since {at}  ", style="bold yellow")
     elif status is not None:
         title.append(f"{status.verdict}  ", style=VERDICT_STYLE[status.verdict])
     if status is not None:

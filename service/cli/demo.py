@@ -167,7 +167,11 @@ def _session(
     config: ClientConfig, service: subprocess.Popen[str], stop: threading.Event, console: Console
 ) -> Iterator[Transport]:
     """A session with the service, once it answers."""
-    with console.status("starting the service") if console.is_terminal else contextlib.nullcontext():
+    with (
+        console.status("starting the service; its first start compiles for up to 30 s")
+        if console.is_terminal
+        else contextlib.nullcontext()
+    ):
         transport = _connected(config, service, stop)
     with transport:
         yield transport

@@ -10,7 +10,7 @@ from rich.text import Text
 
 from neurove_protocol import CameraInfo
 from neurove_protocol.control import HealthReply, ModelsReply, StreamStatus
-from neurove_service.cli.board import OLD, VERDICT_STYLE, WIDTH, age_text
+from neurove_service.cli.board import OLD, VERDICT_STYLE, WIDTH, age_text, status_notes
 
 if TYPE_CHECKING:
     from neurove_core.io.summary import Summary
@@ -31,13 +31,22 @@ def health_table(replies: list[HealthReply]) -> RenderableType:
             parts.append(Text("not ready: the node shuts down", style="yellow"))
         if reply.change:
             parts.append(Text(f"model change: {reply.change}. Automatic rollbacks: {reply.rollbacks}", style="dim"))
+        if reply.internal_errors:
+            errors = ", ".join(f"{place} {count}" for place, count in reply.internal_errors.items())
+            parts.append(
+                Text(f"internal errors since the start: {errors}; the log has the tracebacks", style="bold red")
+            )
+        if reply.refused_streams:
+            parts.append(
+                Text(f"streams refused, because max_streams is reached: {reply.refused_streams}", style="yellow")
+            )
+        if reply.dropped_log_lines:
+            parts.append(
+                Text(f"lines of the log that were not read in time: {reply.dropped_log_lines}", style="yellow")
+            )
         if reply.streams:
             parts.append(_streams_table(reply.streams))
-            parts.extend(
-                Text(f"{status.stream}: refused: {status.refusal}", style="yellow")
-                for status in reply.streams
-                if status.refusal
-            )
+            parts.extend(Text(note, style="yellow") for status in reply.streams for note in status_notes(status))
     return Group(*parts)
 
 

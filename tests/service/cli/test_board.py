@@ -147,7 +147,7 @@ def test_a_terminal_of_60_columns_shows_one_line_per_stream(estimates):
     text = drawn(board, width=60)
     rows = text.splitlines()
     assert all(len(row) <= 60 for row in rows)
-    assert [row.split()[0] for row in rows[:3]] == ["stream", "a_came…", "b"]
+    assert [row.split()[0] for row in rows[:3]] == ["stream", "a_c…ame", "b"]
     newest = estimates[-1].twist
     assert [float(word) for word in rows[2].split()[1:7]] == pytest.approx(list(newest), abs=6e-3)
     clock.now += 75
@@ -179,10 +179,11 @@ def test_the_legend_names_the_frame_the_units_and_sigma(estimates):
 def test_a_stream_without_lens_or_height_says_in_one_line_what_to_do(estimates):
     assert Flag.UNCALIBRATED in estimates[-1].flags
     (note,) = [row for row in drawn(live_board(estimates)).splitlines() if "--calibration" in row]
-    assert note.startswith("cam0: the lens is unknown")
+    assert note.startswith("cam0: no lens: ")
     unscaled = live_board([named(estimates[-1], "cam0", flags=("unscaled",))])
     (note,) = [row for row in drawn(unscaled).splitlines() if "--height" in row]
-    assert note.startswith("cam0: the height is unknown")
+    assert note.startswith("cam0: no height, 1 m assumed: ")
+    assert len(note) <= 72
     assert "--height" not in drawn(live_board([named(estimates[-1], "cam0", flags=())]))
 
 
@@ -191,6 +192,17 @@ def test_a_stream_whose_packets_are_refused_shows_the_reason(stream):
     stream.refused(1_000_000, "events outside the sensor")
     board.on_status(stream_status("n1", stream))
     assert "events outside the sensor" in drawn(board)
+
+
+def test_a_status_that_is_old_is_grey_and_says_since_when(stream):
+    clock = Clock()
+    board = Board(clock=clock)
+    stream.refused(1_000_000, "events outside the sensor")
+    board.on_status(stream_status("n1", stream))
+    assert "no status since" not in drawn(board)
+    clock.now += 20
+    assert "no status since" in drawn(board)
+    assert drawn(board, width=60).splitlines()[1].endswith("20 s ago")
 
 
 def test_truth_stands_next_to_the_estimate_with_the_error(estimates):
@@ -230,7 +242,7 @@ def test_notices_tell_the_legend_once_and_the_begin_and_end_of_a_silence(estimat
     steady = [named(one, "cam0", flags=("uncalibrated",)) for one in estimates]
     first = list(notices.arrived(steady[0]))
     assert "camera_optical" in first[0]
-    assert first[1].startswith("cam0: the lens is unknown")
+    assert first[1].startswith("cam0: no lens: ")
     assert list(notices.arrived(steady[1])) == []
     clock.now += 0.9
     assert list(notices.silent()) == []

@@ -34,9 +34,11 @@ def test_health_shows_verdict_reason_and_streams(stream):
         version="1",
         model=INFO,
         epoch=2,
-        refused_streams=0,
+        refused_streams=4,
         streams=(status,),
         ready=False,
+        internal_errors={"housekeeping": 2},
+        dropped_log_lines=9,
         change="two was rolled back: stream cam0: not finite",
         rollbacks=3,
     )
@@ -49,6 +51,10 @@ def test_health_shows_verdict_reason_and_streams(stream):
         "not ready",
         "not finite",
         "rollbacks: 3",
+        "housekeeping 2",
+        "not read in time: 9",
+        "max_streams is reached: 4",
+        "cam0: lossy: ",
     ):
         assert word in text
 
