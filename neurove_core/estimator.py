@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.engine.runner import runner_of
-from neurove_core.geometry.camera import lookup_table
+from neurove_core.geometry.tables import TABLES
 from neurove_core.ingest import windows
 from neurove_core.ingest.windows import Pushed, Window, WindowsState
 from neurove_core.ingest.wire import read_packet
@@ -108,9 +108,9 @@ class Estimator:
             camera: its lens, where known.
 
         Raises:
-            InvalidField: the camera info belongs to another sensor.
+            InvalidField: the camera info belongs to another sensor. NoTable: no memory for its look-up table.
         """
-        lut = lookup_table(self.config.canonical, sensor, camera)
+        lut = TABLES.of(self.config.canonical, sensor, camera)
         per_pixel = self.config.low_activity_per_pixel * np.count_nonzero(lut >= 0)
         least = max(float(self.config.low_activity_events), float(per_pixel))
         network = self.network.initial_state()

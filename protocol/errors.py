@@ -7,6 +7,7 @@ the same parts as `details` for machines, and the exit code of a command that fa
     +- InternalError
     +- InputError                    a message, a field or an event is refused
     |  +- Malformed, UnsupportedVersion, InvalidField, UnknownFormat, BlobLength, EventOutsideSensor, TimeBackwards
+    |  +- NoTable
     +- ModelError                    a model is refused, or a model change failed
     |  +- UnknownModel, BadModel, Untrusted, Untrained, Downgrade
     |  +- NoMemory, TooSlow, Diverged, RolledBack, NothingBefore
@@ -136,6 +137,24 @@ class InvalidField(InputError):
     def __init__(self, what: str, field: str, value: object, bound: str) -> None:
         field = field if len(field) <= 80 else field[:77] + "..."  # a peer may send a field name of any length
         super().__init__(f"{what}: {field}={shown(value)}: {bound}", field=field, value=shown(value), bound=bound)
+
+
+class NoTable(InputError):
+    """The look-up tables of a service take their maximum memory; this sensor needs another one."""
+
+    code = "no_table"
+
+    def __init__(self, sensor: str, need_bytes: int, used_bytes: int, max_bytes: int) -> None:
+        need, used, most = (round(size / (1 << 20), 1) for size in (need_bytes, used_bytes, max_bytes))
+        super().__init__(
+            f"sensor={sensor}: its look-up table takes {need} MiB, the tables in use take {used} MiB, "
+            f"and tables_mib={most} is their maximum",
+            field="sensor",
+            value=sensor,
+            need_mib=need,
+            used_mib=used,
+            bound=most,
+        )
 
 
 class UnknownFormat(InputError):

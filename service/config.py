@@ -142,6 +142,13 @@ class ServiceConfig(_Settings):
         16, ge=1, le=1024, description="Maximum number of streams; further ones are refused and counted."
     )
     max_packet_events: int = Field(1_000_000, ge=1, le=16_000_000, description="Larger packets are refused.")
+    tables_mib: int = Field(
+        512,
+        ge=1,
+        le=1 << 16,
+        description="Maximum memory of the look-up tables of all sensors, 4 bytes a pixel; further sensors are "
+        "refused [MiB].",
+    )
     max_side_px: int = Field(4096, ge=16, le=32768, description="Larger sensors are refused.")
     idle_evict_s: float = Field(
         30.0, gt=0, le=86_400, description="A stream without packets for this time is evicted [s]."

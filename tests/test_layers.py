@@ -60,14 +60,18 @@ MAY_IMPORT = {
     "neurove_service.config": "core:files endpoints",
     "neurove_service.guard": "logs",
     "neurove_service.transport": "logs guard",
-    "neurove_service.streams": "core:ingest core:networks core:models core:estimator logs guard",
+    "neurove_service.streams": (
+        "core:config core:geometry core:ingest core:networks core:models core:estimator logs guard"
+    ),
     "neurove_service.models": (
         "core:config core:files core:ingest core:networks core:models core:estimator core:self_test logs streams"
     ),
     "neurove_service.clients": (
         "core:config core:geometry core:ingest core:io core:io.formats core:bench logs config transport"
     ),
-    "neurove_service.node": "core:files core:models logs guard lifecycle latency config transport streams models",
+    "neurove_service.node": (
+        "core:files core:geometry core:models logs guard lifecycle latency config transport streams models"
+    ),
     "neurove_service": "",
     "neurove_service.cli": "*",
     "neurove_protocol": "",

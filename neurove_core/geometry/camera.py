@@ -12,6 +12,9 @@ from neurove_protocol.errors import InvalidField
 OUTSIDE = -1
 """Entry of a look-up table for a pixel outside the canonical camera's field of view."""
 
+PIECE_PX = 1 << 17
+"""Pixels of a table that are computed at once: each temporary array has 1 MiB."""
+
 _ITERATIONS = 20  # most iterations of undistortion
 _TOLERANCE = 1e-7  # undistortion stops below this error or step (in focal lengths or radians)
 
@@ -43,20 +46,36 @@ def lookup_table(canonical: CanonicalConfig, sensor: Sensor, camera: CameraInfo 
         InvalidField: the camera info describes a sensor of another size.
     """
     if camera is None:
-        columns = np.arange(sensor.width) * canonical.width // sensor.width
-        rows = np.arange(sensor.height) * canonical.height // sensor.height
-        return (rows[:, None] * canonical.width + columns).astype(np.int32)
+        columns = (np.arange(sensor.width) * canonical.width // sensor.width).astype(np.int32)
+        rows = (np.arange(sensor.height) * canonical.height // sensor.height).astype(np.int32)
+        return rows[:, None] * np.int32(canonical.width) + columns
     if camera.sensor != sensor:
         raise InvalidField("camera info", "width x height", str(camera.sensor), f"the events' sensor is {sensor}")
-    u, v = np.meshgrid(np.arange(sensor.width, dtype=np.float64), np.arange(sensor.height, dtype=np.float64))
-    x, y = undistort((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, camera)
+    table = np.empty((sensor.height, sensor.width), np.int32)
+    step = max(1, PIECE_PX // sensor.width)
+    pieces = [slice(first, first + step) for first in range(0, sensor.height, step)]
+    took = [_fill(table, piece, canonical, camera, None) for piece in pieces]
+    for piece, steps in zip(pieces, took, strict=True):
+        if steps < max(took):  # as many steps everywhere as the slowest pixel needs: the pieces leave no trace
+            _fill(table, piece, canonical, camera, max(took))
+    return table
+
+
+def _fill(
+    table: NDArray[np.int32], piece: slice, canonical: CanonicalConfig, camera: CameraInfo, steps: int | None
+) -> int:
+    """Fill some rows of a table; return the steps of undistortion, at most `steps` where given."""
+    u = np.arange(table.shape[1], dtype=np.float64)
+    v = np.arange(table.shape[0], dtype=np.float64)[piece, None]
+    xd, yd = np.broadcast_arrays((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
+    x, y, steps = _undistort(xd, yd, camera, steps)
     focal = focal_px(canonical)
-    with np.errstate(invalid="ignore"):  # a pixel without a ray is nan, and nan is outside
+    with np.errstate(invalid="ignore", over="ignore"):  # a pixel without a ray is nan, and nan is outside
         column = np.floor(x * focal + canonical.width / 2)
         row = np.floor(y * focal + canonical.height / 2)
         inside = (column >= 0) & (column < canonical.width) & (row >= 0) & (row < canonical.height)
-        cells = np.where(inside, row * canonical.width + column, OUTSIDE)
-    return cells.astype(np.int32)
+        table[piece] = np.where(inside, row * canonical.width + column, OUTSIDE)
+    return steps
 
 
 def field_of_view_deg(camera: CameraInfo) -> tuple[float, float]:
@@ -88,9 +107,17 @@ def undistort(
     Returns:
         x/z and y/z of the rays; nan where the lens model has no ray in front of the camera for the point.
     """
+    x, y, _ = _undistort(xd, yd, camera, None)
+    return x, y
+
+
+def _undistort(
+    xd: NDArray[np.float64], yd: NDArray[np.float64], camera: CameraInfo, steps: int | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
+    """As undistort, in exactly so many steps where given; also returns their number."""
     if camera.lens == "equidistant":
-        return _undistort_equidistant(xd, yd, camera.distortion)
-    return _undistort_pinhole(xd, yd, camera.distortion)
+        return _undistort_equidistant(xd, yd, camera.distortion, steps)
+    return _undistort_pinhole(xd, yd, camera.distortion, steps)
 
 
 def distort(
@@ -116,22 +143,24 @@ def _radial_tangential(
 
 
 def _undistort_pinhole(
-    xd: NDArray[np.float64], yd: NDArray[np.float64], distortion: tuple[float, ...]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    xd: NDArray[np.float64], yd: NDArray[np.float64], distortion: tuple[float, ...], steps: int | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
     x, y = xd.copy(), yd.copy()
     if not any(distortion):
-        return x, y
-    error = np.zeros_like(x)
+        return x, y, 0
+    error, taken = np.zeros_like(x), 0
     with np.errstate(all="ignore"):  # far outside the model's range the iteration may overflow; see `lost`
-        for _ in range(_ITERATIONS):
+        for taken in range(_ITERATIONS):
             radial, dx, dy = _radial_tangential(x, y, distortion)
             error = np.hypot(x * radial + dx - xd, y * radial + dy - yd)
-            if not (error >= _TOLERANCE).any():
+            if taken == steps or (steps is None and not (error >= _TOLERANCE).any()):
                 break
             x, y = (xd - dx) / radial, (yd - dy) / radial
+        else:
+            taken = _ITERATIONS
         lost = ~(error < 1e-3) | (radial <= 0)  # radial < 0: the ray is on the opposite side of the axis
     x[lost] = y[lost] = np.nan
-    return x, y
+    return x, y, taken
 
 
 def _angle_polynomial(theta: NDArray[np.float64], distortion: tuple[float, ...]) -> NDArray[np.float64]:
@@ -141,20 +170,20 @@ def _angle_polynomial(theta: NDArray[np.float64], distortion: tuple[float, ...])
 
 
 def _undistort_equidistant(
-    xd: NDArray[np.float64], yd: NDArray[np.float64], distortion: tuple[float, ...]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    xd: NDArray[np.float64], yd: NDArray[np.float64], distortion: tuple[float, ...], steps: int | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
     k1, k2, k3, k4 = distortion or (0.0,) * 4
     rd = np.hypot(xd, yd)
-    theta = rd.copy()
+    theta, taken = rd.copy(), 0
     with np.errstate(all="ignore"):  # as above
-        for _ in range(_ITERATIONS):
+        for taken in range(1, _ITERATIONS + 1):
             t2 = theta * theta
             slope = 1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))
             step = (_angle_polynomial(theta, distortion) - rd) / slope
             theta = theta - step
-            if not (np.abs(step) >= _TOLERANCE).any():
+            if taken == steps or (steps is None and not (np.abs(step) >= _TOLERANCE).any()):
                 break
         lost = ~(np.abs(_angle_polynomial(theta, distortion) - rd) < 1e-3) | (theta >= math.pi / 2) | (theta < 0)
         scale = np.where(rd > 0, np.tan(theta) / rd, 1.0)
     scale[lost] = np.nan
-    return xd * scale, yd * scale
+    return xd * scale, yd * scale, taken

@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Callable
 
+from neurove_core.geometry.tables import TABLES
 from neurove_core.models.bundle import Bundle
 from neurove_protocol.control import STATUS_SCHEMA, ChunkRequest
 from neurove_protocol.errors import NeuroVEError
@@ -71,6 +72,7 @@ class Service:
     def __init__(self, config: ServiceConfig, stop: threading.Event) -> None:
         self._config, self._stop = config, stop
         check_folders(config)
+        TABLES.max_bytes = config.tables_mib << 20
         self._guard = Guard()
         self._keys = config.keys
         self._active_file = ActiveFile(config.state_folder)

@@ -55,7 +55,7 @@ class Stream:
         self.counters = self.activity.counters
         self.verdicts = Verdicts(self.activity)
         self.lanes = Lanes(name, ring)
-        self._models = models
+        self.models = models
         self._flags = Flags()
         self._intake = Intake(name, self.activity, self._flags, max_age_s)
         self._answers = Answers(name, node, self.activity, self._flags, self._intake, now_ns, max_age_s)
@@ -214,12 +214,12 @@ class Stream:
             return self.lanes.push(packet)
         except ServingModelFailed as failure:
             assert self.lanes.serving_lane is not None
-            self._models.fault(self.lanes.serving_lane.serving, f"stream {self.name}: {failure}")
+            self.models.fault(self.lanes.serving_lane.serving, f"stream {self.name}: {failure}")
             self._assign_models(packet)
             return self.lanes.push(packet)
 
     def _assign_models(self, packet: Packet) -> None:
         optics = packet.sensor, self.calibration
-        skipped = self.lanes.assign(self._models.roles(self.name), optics, packet)
+        skipped = self.lanes.assign(self.models.roles(self.name), optics, packet)
         if skipped:
             self.activity.lost("skipped_windows", skipped)

@@ -10,11 +10,12 @@ from typing import NamedTuple
 from neurove_core.ingest.wire import read_packet
 from neurove_protocol import CameraInfo
 from neurove_protocol.camera import MAX_CAMERA_BYTES
-from neurove_protocol.errors import InvalidField, NeuroVEError
+from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.events import PacketLimits
 from neurove_protocol.velocity import TwistEstimate
 from neurove_service import logs
 from neurove_service.guard import Guard
+from neurove_service.streams.cameras import Cameras
 from neurove_service.streams.intake import Arrival
 from neurove_service.streams.overload import Overload, newest_whole_window
 from neurove_service.streams.runs import MAX_RUN, SMALL_BYTES
@@ -139,14 +140,13 @@ class StreamWorker:
     ) -> None:
         self.stream = stream
         self.beat_ns = time.monotonic_ns()
-        self.lost_cameras = 0  # not queued: too large, or too many; counted by the thread that puts them
-        self._told_cameras = 0  # of them, counted as refused
         self._inbox = inbox
         self._open_outlet, self._limits = open_outlet, limits
         self._standby_slots = standby_slots or threading.Semaphore()
         self._guard = guard or Guard()
         self._pause_until = 0.0  # a time, not a duration: packets that arrive in a pause must not extend it
         self._pending: deque[Sample] = deque()  # taken out of the queue, not yet processed
+        self._cameras = Cameras(stream, inbox.wake, self._guard)
         self._overload = Overload(inbox.max_age_s)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"stream {stream.name}", daemon=True)
@@ -159,11 +159,12 @@ class StreamWorker:
     def put_camera(self, payload: bytes, received_ns: int) -> None:
         """Queue a CameraInfo."""
         if len(payload) > MAX_CAMERA_BYTES or not self._inbox.put_camera(Sample(payload, received_ns, is_camera=True)):
-            self.lost_cameras += 1
+            self._cameras.lose()
 
     def stop(self) -> None:
         """Ask the thread to end; queued samples are not processed."""
         self._stopping.set()
+        self._cameras.stop()
         self._inbox.wake()
 
     def join(self, timeout_s: float) -> None:
@@ -175,7 +176,7 @@ class StreamWorker:
         if outlet is None:
             return
         with self._guard.at("camera query", stream=self.stream.name):
-            self._set_camera(outlet.ask_camera)
+            self._cameras.receive(outlet.ask_camera)
         while not self._stopping.is_set():
             self.beat_ns = time.monotonic_ns()
             first = self._pending[0] if self._pending else None
@@ -199,6 +200,7 @@ class StreamWorker:
 
     def _turn(self, outlet: Outlet) -> None:
         """Process the oldest samples, or else a step of the standby model."""
+        self._cameras.turn()
         if not self._pending:
             pause_s = max(0.0, self._pause_until - time.monotonic())
             self._take(pause_s if self.stream.lanes.has_backlog else _IDLE_BEAT_S)
@@ -212,9 +214,6 @@ class StreamWorker:
         self._pending.extend(samples)
         if dropped:
             self.stream.overloaded(dropped)
-        while self._told_cameras < self.lost_cameras:
-            self._told_cameras += 1
-            self._refused_camera(f"a camera info has at most {MAX_CAMERA_BYTES} bytes, and at most {_MAX_CAMERAS} wait")
 
     def _work_next(self, outlet: Outlet) -> None:
         now_ns = time.monotonic_ns()
@@ -240,6 +239,9 @@ class StreamWorker:
         try:
             for estimate in self.stream.accept_run(run, arrival):
                 self._publish(estimate, outlet)
+        except NeuroVEError as error:  # such as no memory for the look-up table of the sensor
+            for packet in packets:
+                self._refused(packet, error)
         except Exception as error:  # noqa: BLE001  # as for a single packet
             self._guard.caught("packet", error, stream=self.stream.name, packets=len(packets))
             self.stream.failed(len(packets))
@@ -269,7 +271,7 @@ class StreamWorker:
 
     def _work(self, sample: Sample, now_ns: int, outlet: Outlet) -> None:
         if sample.is_camera:
-            self._set_camera(lambda: CameraInfo.decode(sample.payload))
+            self._cameras.receive(lambda: CameraInfo.decode(sample.payload))
             return
         try:
             arrival = Arrival(sample.received_ns, now_ns, sample.sent_us)
@@ -277,32 +279,18 @@ class StreamWorker:
             for estimate in self.stream.accept(packet, arrival):
                 self._publish(estimate, outlet)
         except NeuroVEError as error:
-            total = self.stream.refused(sample.received_ns, error.message)
-            if total & (total - 1) == 0:  # log the 1st, 2nd, 4th, 8th, ...: packets are only counted
-                log.warning("packet refused", stream=self.stream.name, why=error.message, total=total)
+            self._refused(sample, error)
         except Exception as error:  # noqa: BLE001  # an internal error on one packet must not end the stream
             self._guard.caught("packet", error, stream=self.stream.name)
             self.stream.failed()
+
+    def _refused(self, sample: Sample, error: NeuroVEError) -> None:
+        total = self.stream.refused(sample.received_ns, error.message)
+        if total & (total - 1) == 0:  # log the 1st, 2nd, 4th, 8th, ...: packets are only counted
+            log.warning("packet refused", stream=self.stream.name, why=error.message, total=total)
 
     def _publish(self, estimate: TwistEstimate, outlet: Outlet) -> None:
         trace = estimate.trace.model_copy(update={"published_ns": time.monotonic_ns()})
         stamped = estimate.model_copy(update={"trace": trace})
         outlet.publish(stamped.encode())
         self.stream.activity.published(stamped)
-
-    def _set_camera(self, get: Callable[[], CameraInfo | None]) -> None:
-        try:
-            camera, name = get(), self.stream.name
-            if camera is not None and camera.stream != name:
-                raise InvalidField("camera info", "stream", camera.stream, f"received on the key of stream {name!r}")
-        except NeuroVEError as error:
-            self._refused_camera(error.message)
-            return
-        if camera is not None:
-            self.stream.set_camera(camera)
-
-    def _refused_camera(self, why: str) -> None:
-        self.stream.refused_camera(why)
-        total = self.stream.counters.refused_cameras
-        if total & (total - 1) == 0:
-            log.warning("camera info refused", stream=self.stream.name, why=why, total=total)

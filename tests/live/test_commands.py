@@ -67,9 +67,8 @@ def test_a_node_refuses_to_activate_an_unknown_model(node, run):
 def test_a_port_in_use_is_reported_in_one_line(node):
     second = neurove("serve", "--listen", node)
     assert second.returncode == 2
-    *log, error = second.stderr.splitlines()
-    assert error.startswith(f"neurove: cannot open a Zenoh session: listen={node}: Address already in use")
-    assert ["compiling the kernels" in line for line in log] == [True]
+    said = [line for line in second.stderr.splitlines() if line.startswith("neurove: ")]
+    assert said == [f"neurove: cannot open a Zenoh session: listen={node}: Address already in use"]
 
 
 @pytest.mark.parametrize("command", [("health",), ("watch",), ("models",), ("activate", "other")])

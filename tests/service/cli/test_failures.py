@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from neurove_service.cli import running
-from neurove_service.cli.arguments import duration, seconds
+from neurove_service.cli.arguments import duration, seconds, seed
 from neurove_service.cli.failures import failure
 from neurove_service.cli.parser import Parser
 from neurove_service.lifecycle import Terminated, interrupt_on_signals
@@ -38,6 +38,12 @@ def test_no_number_flag_of_any_command_takes_nan_or_more_than_64_bits():
     for kind in set(kinds):
         for text in ("nan", "9" * 30, "9" * 5000, "-inf", "", *([] if kind is duration else ["inf"])):
             assert refuses(kind, text), (kind, text)
+
+
+@pytest.mark.parametrize("text", ["-1", "1000000000", "1.5", "", "9" * 5000])
+def test_a_seed_that_no_generator_takes_is_refused(text):
+    assert refuses(seed, text)
+    assert seed("999999999") == 999_999_999
 
 
 def test_an_unbounded_duration_is_infinite():
