@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from neurove_service.cli import running
-from neurove_service.cli.arguments import duration, seconds, seed
+from neurove_service.cli.arguments import count, duration, metres, seconds, seed
 from neurove_service.cli.failures import failure
 from neurove_service.cli.parser import Parser
 from neurove_service.lifecycle import Terminated, interrupt_on_signals
@@ -32,7 +32,7 @@ def test_no_number_flag_of_any_command_takes_nan_or_more_than_64_bits():
         action.type
         for parser in all_parsers().values()
         for action in parser.arguments
-        if action.type in (int, float, seconds, duration)
+        if action.type in (int, float, count, duration, metres, seconds, seed)
     ]
     assert len(kinds) > 20
     for kind in set(kinds):
