@@ -10,10 +10,11 @@ from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol, TypeVar
+from typing import Any, BinaryIO, Final, NamedTuple, Protocol, TypeVar
 
 from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.faults import Reason, Tally
+from neurove_core.io.recording import BLOCK_BYTES
 from neurove_core.io.unpack import unpacked
 
 T = TypeVar("T")
@@ -22,6 +23,8 @@ SQLITE_MAGIC: Final = b"SQLite format 3\0"
 ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 MAX_RECORD_BYTES: Final = 64 << 20
 """Maximum size of one message or chunk [bytes], compressed and decompressed."""
+
+_CHUNK_HEAD_BYTES: Final = 256
 
 _MAX_STEP: Final = 1 << 20  # messages that are passed over after a damaged page
 
@@ -183,6 +186,29 @@ def damaged(tally: Tally | None, where: str, why: str) -> None:
     """Count a message or a chunk that is skipped."""
     if tally is not None:
         tally.add(Reason.DAMAGED, where, why)
+
+
+def find_next(file: BinaryIO, pattern: re.Pattern[bytes], at: int, accept: Callable[[int], bool]) -> int:
+    """Search a file for the next record that begins like a chunk.
+
+    Args:
+        file: the file.
+        pattern: matches the beginning of a chunk, at most _CHUNK_HEAD_BYTES long.
+        at: first byte to search.
+        accept: whether a chunk can begin at this byte.
+
+    Returns:
+        Its byte; 0 if there is none.
+    """
+    while True:
+        file.seek(at)
+        block = file.read(BLOCK_BYTES)
+        for match in pattern.finditer(block):
+            if accept(at + match.start()):
+                return at + match.start()
+        if len(block) < BLOCK_BYTES:
+            return 0
+        at += len(block) - _CHUNK_HEAD_BYTES  # a match may lie across two blocks
 
 
 def decompressed(data: bytes) -> tuple[bytes, str]:
