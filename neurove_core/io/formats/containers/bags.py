@@ -96,6 +96,7 @@ class SqliteBag:
         """
         try:
             with _ReadConnection(path) as connection:
+                _Work(connection, path.stat().st_size)
                 rows = connection.execute("SELECT name, type FROM topics").fetchall()
         except sqlite3.Error as error:
             raise UnknownSource(path, f"not a ROS 2 bag: {error}") from None
@@ -110,6 +111,7 @@ class SqliteBag:
         """
         first = 0
         with _ReadConnection(self.path) as connection:
+            _Work(connection, self.path.stat().st_size)
             if since_ns is not None:
                 query = "SELECT min(id) FROM messages WHERE timestamp >= ?"
                 (found,) = _checked(
@@ -120,7 +122,8 @@ class SqliteBag:
                 "SELECT m.id, t.name, m.timestamp, m.data FROM messages m JOIN topics t ON t.id = m.topic_id "
                 f"WHERE m.id >= ? AND t.name IN ({','.join('?' * len(topics))}) ORDER BY m.id"
             )
-            for row in self._rows(connection, query, first, topics, tally):
+            work = _Work(connection, self.path.stat().st_size)
+            for row in self._rows(connection, work, query, first, topics, tally):
                 number, topic, log_ns, data = row
                 where = f"message {number}"
                 if not isinstance(data, bytes) or not isinstance(log_ns, int):
@@ -133,13 +136,20 @@ class SqliteBag:
                     yield BagMessage(topic, log_ns, where, plain)
 
     def _rows(
-        self, connection: sqlite3.Connection, query: str, first: int, topics: Collection[str], tally: Tally | None
+        self,
+        connection: sqlite3.Connection,
+        work: "_Work",
+        query: str,
+        first: int,
+        topics: Collection[str],
+        tally: Tally | None,
     ) -> Iterator[Any]:
         """Rows of the query. After a damaged page it continues with a later row, at growing distance."""
         last, step = first - 1, 1
         error: BrokenRecording | None = None
         while step < _MAX_STEP:
             found = False
+            work.restart()
             try:
                 rows = _checked(self.path, max(last, 0), partial(connection.execute, query, (last + step, *topics)))
                 while (row := _checked(self.path, max(last, 0), rows.fetchone)) is not None:
@@ -147,7 +157,11 @@ class SqliteBag:
                         damaged(tally, error.where, error.why)
                     if not isinstance(row[0], int):
                         raise BrokenRecording(self.path, f"the message after message {last}", "it has no number")
-                    last, step, error, found = max(last, row[0]), 1, None, True
+                    if row[0] <= last:  # damaged pages can repeat
+                        why = f"message {row[0]} follows message {last}: the numbers must increase"
+                        raise BrokenRecording(self.path, f"the message after message {last}", why)
+                    last, step, error, found = row[0], 1, None, True
+                    work.restart()
                     yield row
             except BrokenRecording as broken:
                 error = error or broken
@@ -172,6 +186,29 @@ class _ReadConnection:
 
     def __exit__(self, *_: object) -> None:
         self._connection.close()
+
+
+class _Work:
+    """Interrupts SQLite where it searches a row for too long: damaged pages can repeat.
+
+    Args:
+        connection: the connection to watch.
+        size: of the file [bytes]. A row takes more bytes than SQLite takes instructions to pass it.
+    """
+
+    _STEP = 10_000  # instructions between two looks
+
+    def __init__(self, connection: sqlite3.Connection, size: int) -> None:
+        self._limit, self._done = 1_000_000 + 2 * size, 0
+        connection.set_progress_handler(self._look, self._STEP)
+
+    def restart(self) -> None:
+        """Begin again: a row was found."""
+        self._done = 0
+
+    def _look(self) -> int:
+        self._done += self._STEP
+        return int(self._done > self._limit)
 
 
 def _checked(path: Path, last: int, call: Callable[[], T]) -> T:
