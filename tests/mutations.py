@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+import zstandard
 
 from neurove_core.io import Recording
 from neurove_core.io.formats.packet_log.writer import write_mcap
@@ -15,7 +16,17 @@ from neurove_protocol import NeuroVEError, Sensor
 from neurove_protocol.events import check_events
 from tests import datasets, ros_bags
 from tests.builders import SENSOR, make_events
-from tests.builders_evt import HEADER_EVT2, HEADER_EVT3, write_evt2, write_evt3
+from tests.builders_evt import (
+    HEADER_EVT2,
+    HEADER_EVT3,
+    HEADER_EVT4,
+    HEADER_EVT21,
+    legacy,
+    write_evt2,
+    write_evt3,
+    write_evt4,
+    write_evt21,
+)
 from tests.neurove_core.io import (
     test_aedat2,
     test_aedat3,
@@ -23,7 +34,6 @@ from tests.neurove_core.io import (
     test_ecd,
     test_evbench,
     test_eventstream,
-    test_evt_vectors,
     test_hdf5_layouts,
     test_npy,
 )
@@ -43,6 +53,24 @@ def aedat2() -> bytes:
         + test_aedat2.pairs(test_aedat2.davis(events, DAVIS), events.t)
         + test_aedat2.pairs(samples, np.full(7, events.t[-1]))
     )
+
+
+def aedat3() -> bytes:
+    events = make_events(100, seed=1, sensor=DAVIS)
+    others = test_aedat3.special((2, 3), (3, 9)) + test_aedat3.imu(5, (0, -1, 0), (1, 2, 3))
+    return test_aedat3.DAVIS240 + others + test_aedat3.polarity(events) + others
+
+
+def words_in_bag(folder: Path, ros: int, encoding: str) -> bytes:
+    """A bag with Prophesee words in a few messages."""
+    store = ros_bags.Store(ros)
+    words = (write_evt21 if encoding == "evt21" else write_evt4)(EVENTS).words
+    messages = [
+        ("/cam/events", 10**9 + seq, ros_bags.packet(store, part.tobytes(), ns=10**9, seq=seq, encoding=encoding))
+        for seq, part in enumerate(np.array_split(words, 5))
+    ]
+    path = ros_bags.write_bag(folder / f"{encoding}.bag", store, messages)
+    return (path if path.is_file() else next(path.glob("*.db3"))).read_bytes()
 
 
 def bag(folder: Path, ros: int, *, mcap: bool = False, compression: str = "", dvs: bool = False) -> bytes:
@@ -77,14 +105,16 @@ def _npy(_: Path) -> bytes:
 WRITTEN: Final[dict[str, Callable[[Path], bytes]]] = {
     "evt2.raw": lambda _: HEADER_EVT2 + write_evt2(EVENTS).words.tobytes(),
     "evt3.raw": lambda _: HEADER_EVT3 + write_evt3(EVENTS).words.tobytes(),
-    "evt21.raw": lambda _: test_evt_vectors.HEADERS["EVT21"] + test_evt_vectors.WRITE["EVT21"](EVENTS).words.tobytes(),
-    "evt4.raw": lambda _: test_evt_vectors.HEADERS["EVT4"] + test_evt_vectors.WRITE["EVT4"](EVENTS).words.tobytes(),
-    "aedat3.aedat": lambda _: test_aedat3.DAVIS240 + test_aedat3.polarity(EVENTS),
+    "evt21.raw": lambda _: HEADER_EVT21 + write_evt21(EVENTS).words.tobytes(),
+    "legacy.raw": lambda _: HEADER_EVT21 + legacy(write_evt21(EVENTS).words).tobytes(),
+    "evt4.raw": lambda _: HEADER_EVT4 + write_evt4(EVENTS).words.tobytes(),
+    "evt4.raw.zst": lambda _: zstandard.compress(HEADER_EVT4 + write_evt4(EVENTS).words.tobytes()),
     "a.bin": lambda _: test_npy.atis(test_npy.DIGIT),
     "a.npy": _npy,
     "a.dat": lambda _: dat(EVENTS),
     "a.es": lambda _: test_eventstream.header() + b"".join(test_eventstream.write(EVENTS)),
     "a.aedat": lambda _: aedat2(),
+    "aedat3.aedat": lambda _: aedat3(),
     "a.aedat4": lambda _: aedat4([EVENTS.span(0, 80), EVENTS.span(80, 200)], SENSOR).data,
     "a.txt": lambda _: ecd_text(EVENTS),
     "a.csv": lambda _: b"t,x,y,p\n" + b"\n".join(b"%d,%d,%d,%d" % row for row in zip(*EVENTS, strict=True)),
@@ -97,6 +127,8 @@ WRITTEN: Final[dict[str, Callable[[Path], bytes]]] = {
     "lz4.bag": lambda folder: bag(folder, 1, compression="lz4", dvs=True),
     "a.db3": lambda folder: bag(folder, 2),
     "ros2.mcap": lambda folder: bag(folder, 2, mcap=True, dvs=True),
+    "evt21.db3": lambda folder: words_in_bag(folder, 2, "evt21"),
+    "evt4.bag": lambda folder: words_in_bag(folder, 1, "evt4"),
     "log.mcap": packet_log,
     "mvsec.hdf5": lambda folder: _at(datasets.mvsec_file(folder)),
     "dsec.h5": lambda folder: _at(datasets.dsec_file(folder)),

@@ -116,6 +116,13 @@ def count(text: str) -> int:
     return int(text)
 
 
+def seed(text: str) -> int:
+    """A whole number that every generator of random numbers takes as its seed."""
+    if not (text.isascii() and text.isdecimal() and len(text) <= 9):
+        raise argparse.ArgumentTypeError(f"{text!r}: give a whole number from 0 to 999999999")
+    return int(text)
+
+
 def metres(text: str) -> float:
     """A number of metres above 0."""
     try:

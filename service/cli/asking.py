@@ -13,7 +13,7 @@ from neurove_protocol import TwistEstimate
 from neurove_protocol.control import HealthReply, ModelsReply, StreamStatus
 from neurove_protocol.errors import EXIT_FAILURE
 from neurove_service.cli import lines
-from neurove_service.cli.arguments import add_client_flags, client_config, command
+from neurove_service.cli.arguments import add_client_flags, client_config, command, count
 from neurove_service.cli.waiting import Wait, add_wait
 from neurove_service.config import ClientConfig
 from neurove_service.lifecycle import stop_on_signals
@@ -163,7 +163,7 @@ def add_watch(parser: argparse.ArgumentParser) -> None:
     add_wait(parser)
     about = "show the newest estimate of every stream once; exit code 1 if there is none"
     parser.add_argument("--once", action="store_true", help=about)
-    parser.add_argument("--count", type=int, metavar="N", help="end after N lines; default: until Ctrl-C")
+    parser.add_argument("--count", type=count, metavar="N", help="end after N lines; default: until Ctrl-C")
 
 
 def add_health(parser: argparse.ArgumentParser) -> None:

@@ -10,7 +10,7 @@ from neurove_protocol.control import HealthReply, StreamStatus
 from neurove_protocol.errors import EXIT_FAILURE, NeuroVEError
 from neurove_service.cli.arguments import add_client_flags, client_config, command
 from neurove_service.cli.installation import Check, check_engine, check_extras, check_kernels, check_processor
-from neurove_service.config import ClientConfig
+from neurove_service.config import ClientConfig, ConfigError
 
 _LISTEN_S: Final = 2.0
 """Longest wait for an estimate of every stream."""
@@ -24,14 +24,22 @@ _WIDE: Final = 200
 
 def doctor(args: argparse.Namespace) -> int:
     """Check connection, streams, compiled kernels, processor and installed extras."""
-    config = client_config(args)
-    checks = [*_check_network(config), check_kernels(), check_processor(), check_engine(), *check_extras()]
+    checks = [*_check_connection(args), check_kernels(), check_processor(), check_engine(), *check_extras()]
     ok = not any(check.level == "bad" for check in checks)
     if args.json:
         print(json.dumps({"ok": ok, "checks": [check._asdict() for check in checks]}))
     else:
         _print_table(checks)
     return 0 if ok else EXIT_FAILURE
+
+
+def _check_connection(args: argparse.Namespace) -> list[Check]:
+    """As `_check_network`; wrong settings are a check too, so that the others are still made."""
+    try:
+        config = client_config(args)
+    except ConfigError as error:
+        return [Check("settings", error.message, "bad", "correct the flag or the variable NEUROVE_*")]
+    return _check_network(config)
 
 
 def _check_network(config: ClientConfig) -> list[Check]:

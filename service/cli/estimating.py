@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import math
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -16,8 +17,8 @@ from neurove_service.cli.arguments import (
     add_lens_flags,
     add_recording_flags,
     command,
+    duration,
     refuse_existing,
-    seconds,
     tell_faults,
 )
 from neurove_service.cli.bars import event_count
@@ -136,7 +137,7 @@ def estimate(args: argparse.Namespace) -> int:
     if path.suffix not in WRITERS:
         raise InvalidField("estimate", "--out", str(path), f"its name must end in {', '.join(WRITERS)}")
     recording = open_source(args.source, args.sensor, args.topic, args.time_unit)
-    if recording.endless and args.seconds is None:
+    if recording.endless and args.seconds in (None, math.inf):
         raise InvalidField("estimate", "RECORDING", args.source, "it never ends: give --seconds S")
     refuse_existing("estimate", "--out", path, args.source, force=args.force)
     camera = lens_of(recording, args.calibration, args.height)
@@ -237,5 +238,5 @@ def add_estimate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--model", default="default", metavar="BUNDLE", help=about)
     add_lens_flags(parser)
     add_recording_flags(parser)
-    parser.add_argument("--seconds", type=seconds, metavar="S", help="seconds of the recording to read; default: all")
+    parser.add_argument("--seconds", type=duration, metavar="S", help="seconds of the recording to read; default: all")
     parser.add_argument("--force", action="store_true", help="replace FILE if it exists")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from neurove_protocol.errors import EXIT_FAILURE, InvalidField
-from neurove_service.cli.arguments import check_folder, commit, count, subcommand
+from neurove_service.cli.arguments import check_folder, commit, count, seed, subcommand
 from neurove_service.cli.bars import progress
 from neurove_service.cli.parser import Parser
 
@@ -244,7 +244,7 @@ def _add_velocity(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_seeds(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--seed", type=int, default=0, metavar="N", help="first seed; default 0")
+    parser.add_argument("--seed", type=seed, default=0, metavar="N", help="first seed; default 0")
     parser.add_argument("--seeds", type=count, default=1, metavar="N", help="number of seeds; default 1")
 
 

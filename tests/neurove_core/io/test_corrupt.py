@@ -16,7 +16,8 @@ from neurove_core.io.unpack import FREE_BYTES, MAX_RATIO, unpacked
 from neurove_core.sources import open_source
 from neurove_protocol import Events, NeuroVEError
 from neurove_protocol.errors import InvalidField
-from tests.builders import SENSOR
+from tests import ros_bags
+from tests.builders import SENSOR, make_events
 from tests.mutations import DAVIS, WRITTEN, mutated, read_or_refused
 from tests.recordings import put, read
 
@@ -40,6 +41,26 @@ def test_a_file_whose_name_is_in_capitals_is_read(name, tmp_path):
     recording = open_source(put(tmp_path, name.upper(), WRITTEN[name](tmp_path)), sensor)
     assert Events.join(list(recording.chunks())).n > 0
     assert not recording.faults.found
+
+
+def test_pages_of_a_bag_that_come_again_are_not_read_again(tmp_path):
+    """All later pages of the messages are replaced by the first one, so that SQLite gives its rows again and again."""
+    store, events = ros_bags.Store(2), make_events(6000, duration_us=600_000)
+    messages = [("/cam/events", i, ros_bags.dvs(store, events.span(100 * i, 100 * i + 100))) for i in range(60)]
+    path = next(ros_bags.write_bag(tmp_path / "bag", store, messages).glob("*.db3"))
+    data, size = bytearray(path.read_bytes()), 4096
+    for page in range(size, len(data), size):
+        cells = int.from_bytes(data[page + 3 : page + 5], "big")
+        if data[page] == 5 and cells > 10:  # an inner page of a table: in each cell, four bytes give the page below
+            pointers = struct.unpack_from(f">{cells}H", data, page + 12)
+            for pointer in pointers[5:]:
+                data[page + pointer : page + pointer + 4] = data[page + pointers[0] : page + pointers[0] + 4]
+    path.write_bytes(data)
+    recording = open_source(str(path))
+    got = read(recording)
+    assert 0 < got.n < events.n
+    assert (np.diff(got.t) >= 0).all()
+    assert any("the numbers must increase" in fault.why for fault in recording.faults.found)
 
 
 # --- decompression is bounded --------------------------------------------------------------------------------------

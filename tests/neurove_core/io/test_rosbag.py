@@ -1,11 +1,14 @@
 """ROS bags: real bags, every encoding and container as the rosbags package writes them, and damaged bags."""
 
+import re
+import struct
+
+import mcap.writer
 import numpy as np
 import pytest
 
-from neurove_core.io import BrokenRecording, UnknownSource
+from neurove_core.io import UnknownSource
 from neurove_core.io.formats.ros.libcaer import WORD_EVENTS, LibcaerState, libcaer_decode, libcaer_reference
-from neurove_core.io.formats.ros.recording import RosbagRecording
 from neurove_core.sources import open_source
 from neurove_protocol import Events, Sensor
 from tests import ros_bags
@@ -340,66 +343,68 @@ def test_a_file_that_is_not_a_bag_is_rejected(tmp_path, name, data):
         open_source(str(tmp_path / name))
 
 
-@pytest.mark.parametrize("container", ["bag", "bag lz4", "mcap"])
-def test_a_truncated_bag_gives_its_complete_messages_and_then_an_error(tmp_path, container):
-    events = make_events(600, duration_us=60_000)
-    name, _, compression = container.partition(" ")
-    store = ros_bags.Store(1 if name == "bag" else 2)
-    path = tmp_path / ("a.bag" if name == "bag" else "a")
-    ros_bags.write_bag(path, store, in_packets(store, events, 50), compression=compression, mcap=name == "mcap")
-    path = path / "a.mcap" if path.is_dir() else path
-    data, counts = path.read_bytes(), set()
-    for size in range(0, len(data), 211):
-        (tmp_path / f"truncated.{name}").write_bytes(data[:size])
-        try:
-            got, error = read_broken(RosbagRecording.open(tmp_path / f"truncated.{name}"))
-        except (UnknownSource, BrokenRecording):
-            continue
-        assert_same(got, events.span(0, got.n))
-        assert error is not None or got.n == events.n
-        counts.add(got.n)
-    assert len(counts) > (0 if compression else 5)  # an lz4 block is read completely or not at all
+# --- damage between chunks of a file without an index -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("container", ["bag", "db3", "mcap"])
-def test_corrupt_bytes_raise_only_recording_errors(tmp_path, container):
-    events, store = make_events(600, duration_us=60_000), ros_bags.Store(1 if container == "bag" else 2)
-    path = tmp_path / ("a.bag" if container == "bag" else "a")
-    ros_bags.write_bag(path, store, in_packets(store, events, 50), mcap=container == "mcap")
-    path = path / f"a.{container}" if path.is_dir() else path
-    rng, data = np.random.default_rng(0), path.read_bytes()
-    for _ in range(150):
-        corrupt = np.frombuffer(data, np.uint8).copy()
-        corrupt[rng.integers(0, corrupt.size, 20)] = rng.integers(0, 256, 20)
-        (tmp_path / f"corrupt.{container}").write_bytes(corrupt.tobytes())
-        try:
-            recording = RosbagRecording.open(tmp_path / f"corrupt.{container}", SENSOR)
-        except (UnknownSource, BrokenRecording):
-            continue
-        read_broken(recording)
+def chunks_of_ros1(folder, parts, compression):
+    """The bytes of a bag without an index, and where each chunk begins."""
+    head, chunks = b"", []
+    for i, message in enumerate(parts):
+        path = folder / f"{i}.bag"
+        ros_bags.write_bag(path, ros_bags.Store(1), [message], compression=compression)
+        data = path.read_bytes()
+        first = 13 + 8 + sum(struct.unpack_from("<I", data, at)[0] for at in (13,))
+        first += struct.unpack_from("<I", data, first - 4)[0]  # after the record of the bag
+        size = struct.unpack_from("<I", data, first)[0]
+        stop = first + 8 + size + struct.unpack_from("<I", data, first + 4 + size)[0]
+        head = head or data[:first].replace(
+            b"index_pos=" + data[13:].partition(b"index_pos=")[2][:8], b"index_pos=" + bytes(8)
+        )
+        chunks.append(data[first:stop])
+    starts = np.cumsum([len(head), *map(len, chunks[:-1])]).tolist()
+    return head + b"".join(chunks), starts
 
 
-@pytest.mark.parametrize(
-    ("change", "why"),
-    [
-        ({"encoding": "evt9"}, "unknown encoding 'evt9'; supported: evt2, evt21, evt3, evt4, libcaer"),
-        ({"data": b"\0" * 9}, "9 bytes are not a multiple of 8"),
-        ({"data": mono(Events.from_columns([1], [64], [0], [1]))}, "lies outside the sensor 64x48"),
-        ({"data": mono(Events.from_columns([1], [0], [0], [1]))}, "time"),
-        (
-            {"encoding": "evt3", "data": evt3((TIME_HIGH, 1), (1, 0)).tobytes()},
-            "word 1 (0x1000) has an unknown type",
-        ),
-        ({"encoding": "libcaer_cmp", "data": b"\0\xf0"}, "word 0 (0xf000) has an unknown type"),
-        ({"encoding": "libcaer", "data": libcaer(-1, 0, 0, 0)}, "an event has a negative time"),
-    ],
-)
-def test_an_invalid_message_is_skipped_and_counted_with_its_place_and_reason(tmp_path, change, why):
-    store, events = ros_bags.Store(2), make_events(800, start_us=10, duration_us=10_000)
-    fields = {"data": b"", "ns": STAMP_NS, "seq": 2, "encoding": "mono"} | change
-    messages = [*in_packets(store, events), (TOPIC, STAMP_NS, ros_bags.packet(store, **fields))]
-    got, error = read_broken(open_source(str(ros_bags.write_bag(tmp_path / "a", store, messages))))
-    assert_same(got, events)
-    assert error is not None
-    assert why in error.message
-    assert "message 3" in error.message
+@pytest.mark.parametrize("compression", ["", "bz2", "lz4"])
+def test_after_a_damaged_chunk_of_a_bag_without_an_index_the_next_one_is_found(tmp_path, compression):
+    parts = [make_events(400, seed=i, start_us=i * 300_000, duration_us=100_000) for i in range(3)]
+    store = ros_bags.Store(1)
+    messages = [
+        (TOPIC, STAMP_NS + i, ros_bags.packet(store, mono(one, 0), ns=STAMP_NS + i, seq=i, encoding="mono"))
+        for i, one in enumerate(parts)
+    ]
+    data, starts = chunks_of_ros1(tmp_path, messages, compression)
+    (tmp_path / "a.bag").write_bytes(data)
+    assert_same(read(open_source(str(tmp_path / "a.bag"))), Events.join(parts))
+    damaged = bytearray(data)
+    damaged[starts[1] : starts[1] + 12] = b"\xff" * 12
+    (tmp_path / "a.bag").write_bytes(damaged)
+    recording = open_source(str(tmp_path / "a.bag"))
+    assert_same(read(recording), Events.join([parts[0], parts[2]]))
+    assert [(fault.reason, fault.where) for fault in recording.faults.found] == [("damaged", f"byte {starts[1]}")]
+
+
+@pytest.mark.parametrize("compression", ["ZSTD", "LZ4"])
+def test_after_a_damaged_chunk_of_an_mcap_file_without_an_index_the_next_one_is_found(tmp_path, compression):
+    parts = [make_events(400, seed=i, start_us=i * 300_000, duration_us=100_000) for i in range(4)]
+    store, path = ros_bags.Store(2), tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        kind = mcap.writer.CompressionType[compression]
+        writer = mcap.writer.Writer(file, chunk_size=100, compression=kind, index_types=mcap.writer.IndexType.NONE)
+        writer.start("ros2", "x")
+        schema = writer.register_schema("event_camera_msgs/msg/EventPacket", "ros2msg", b"")
+        channel = writer.register_channel(TOPIC, "cdr", schema)
+        for i, one in enumerate(parts):
+            message = ros_bags.packet(store, mono(one, 0), ns=STAMP_NS, seq=i, encoding="mono")
+            writer.add_message(channel, STAMP_NS, store.raw(message), STAMP_NS)
+        writer.finish()
+    assert_same(read(open_source(str(path))), Events.join(parts))
+    data = bytearray(path.read_bytes())
+    name = b"\x04\0\0\0zstd" if compression == "ZSTD" else b"\x03\0\0\0lz4"
+    second = [match.start() - 37 for match in re.finditer(re.escape(name), data)][1]
+    data[second + 1 : second + 9] = b"\xff" * 8  # the length of the record
+    path.write_bytes(data)
+    recording = open_source(str(path))
+    assert_same(read(recording), Events.join([parts[0], parts[2], parts[3]]))
+    (fault,) = recording.faults.found
+    assert (fault.reason, fault.where) == ("damaged", f"byte {second}")

@@ -33,8 +33,8 @@ def test_the_table_has_one_row_for_each_check(run):
 
 def test_a_wrong_endpoint_is_reported(run):
     _, out, _ = run("doctor", "--connect", "nonsense", "--json")
-    connection = json.loads(out)["checks"][0]
-    assert (connection["level"], "nonsense" in connection["state"]) == ("bad", True)
+    first = json.loads(out)["checks"][0]
+    assert (first["what"], first["level"], "nonsense" in first["state"]) == ("settings", "bad", True)
 
 
 def test_kernels_are_counted_where_numba_caches_them(tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from neurove_service.cli import running
-from neurove_service.cli.arguments import duration, seconds
+from neurove_service.cli.arguments import count, duration, metres, seconds, seed
 from neurove_service.cli.failures import failure
 from neurove_service.cli.parser import Parser
 from neurove_service.lifecycle import Terminated, interrupt_on_signals
@@ -32,12 +32,18 @@ def test_no_number_flag_of_any_command_takes_nan_or_more_than_64_bits():
         action.type
         for parser in all_parsers().values()
         for action in parser.arguments
-        if action.type in (int, float, seconds, duration)
+        if action.type in (int, float, count, duration, metres, seconds, seed)
     ]
     assert len(kinds) > 20
     for kind in set(kinds):
         for text in ("nan", "9" * 30, "9" * 5000, "-inf", "", *([] if kind is duration else ["inf"])):
             assert refuses(kind, text), (kind, text)
+
+
+@pytest.mark.parametrize("text", ["-1", "1000000000", "1.5", "", "9" * 5000])
+def test_a_seed_that_no_generator_takes_is_refused(text):
+    assert refuses(seed, text)
+    assert seed("999999999") == 999_999_999
 
 
 def test_an_unbounded_duration_is_infinite():

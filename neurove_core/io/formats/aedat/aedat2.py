@@ -16,7 +16,6 @@ from neurove_core.io.faults import Faults
 from neurove_core.io.format import Format
 from neurove_core.io.order import Where
 from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Imu, refuse_topic
-from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
 
 MAX_HEADER_BYTES = 4 << 20  # jAER writes all its preferences there, about 200,000 bytes
@@ -152,10 +151,8 @@ class Aedat2Recording(EventsOnly):
     def imu(self) -> Iterator[Imu]:
         """All complete samples; see `Recording`. Axes: the optical frame for a DAVIS240, else those of the unit.
 
-        A sample without all of its words is skipped. The last sample of a recording can be such a sample.
-
-        Raises:
-            InvalidField: there are samples, but the header does not give their scale.
+        A sample without all of its words is skipped. The last sample of a recording can be such a sample. If the header
+        does not give the scale, there are no samples, and this is counted.
         """
         if self.chip is not _DVS128:
             yield from ordered(self._imu_pieces(), self.faults.begin("imu"))
@@ -178,9 +175,8 @@ class Aedat2Recording(EventsOnly):
         accel_lsb = ACCEL_LSB_G.get(self.header.accel_g or 0)
         if gyro_lsb is None or accel_lsb is None:
             found = f"{self.header.gyro_deg_s} deg/s, {self.header.accel_g} g"
-            raise InvalidField(
-                str(self.path), "ImuGyroScale, ImuAccelScale", found, "the header must give one value of each"
-            )
+            why = f"ImuGyroScale, ImuAccelScale: the header gives {found}, and must give one value of each"
+            raise BrokenRecording(self.path, "the header", why)
         raw = (words[0] >> 12).astype(np.uint16).view(np.int16)[first[:, None] + np.arange(_IMU_WORDS)]
         axes = np.array(self.chip.camera_axes or (1, 1, 1), np.float64)
         return Imu(words[1, first], raw[:, :3] * axes * (G_M_S2 / accel_lsb), np.radians(raw[:, 4:] * axes / gyro_lsb))

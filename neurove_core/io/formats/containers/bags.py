@@ -10,10 +10,11 @@ from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol, TypeVar
+from typing import Any, BinaryIO, Final, NamedTuple, Protocol, TypeVar
 
 from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.faults import Reason, Tally
+from neurove_core.io.recording import BLOCK_BYTES
 from neurove_core.io.unpack import unpacked
 
 T = TypeVar("T")
@@ -22,6 +23,8 @@ SQLITE_MAGIC: Final = b"SQLite format 3\0"
 ZSTD_MAGIC: Final = b"\x28\xb5\x2f\xfd"
 MAX_RECORD_BYTES: Final = 64 << 20
 """Maximum size of one message or chunk [bytes], compressed and decompressed."""
+
+_CHUNK_HEAD_BYTES: Final = 256
 
 _MAX_STEP: Final = 1 << 20  # messages that are passed over after a damaged page
 
@@ -93,6 +96,7 @@ class SqliteBag:
         """
         try:
             with _ReadConnection(path) as connection:
+                _Work(connection, path.stat().st_size)
                 rows = connection.execute("SELECT name, type FROM topics").fetchall()
         except sqlite3.Error as error:
             raise UnknownSource(path, f"not a ROS 2 bag: {error}") from None
@@ -107,6 +111,7 @@ class SqliteBag:
         """
         first = 0
         with _ReadConnection(self.path) as connection:
+            _Work(connection, self.path.stat().st_size)
             if since_ns is not None:
                 query = "SELECT min(id) FROM messages WHERE timestamp >= ?"
                 (found,) = _checked(
@@ -117,7 +122,8 @@ class SqliteBag:
                 "SELECT m.id, t.name, m.timestamp, m.data FROM messages m JOIN topics t ON t.id = m.topic_id "
                 f"WHERE m.id >= ? AND t.name IN ({','.join('?' * len(topics))}) ORDER BY m.id"
             )
-            for row in self._rows(connection, query, first, topics, tally):
+            work = _Work(connection, self.path.stat().st_size)
+            for row in self._rows(connection, work, query, first, topics, tally):
                 number, topic, log_ns, data = row
                 where = f"message {number}"
                 if not isinstance(data, bytes) or not isinstance(log_ns, int):
@@ -130,13 +136,20 @@ class SqliteBag:
                     yield BagMessage(topic, log_ns, where, plain)
 
     def _rows(
-        self, connection: sqlite3.Connection, query: str, first: int, topics: Collection[str], tally: Tally | None
+        self,
+        connection: sqlite3.Connection,
+        work: "_Work",
+        query: str,
+        first: int,
+        topics: Collection[str],
+        tally: Tally | None,
     ) -> Iterator[Any]:
         """Rows of the query. After a damaged page it continues with a later row, at growing distance."""
         last, step = first - 1, 1
         error: BrokenRecording | None = None
         while step < _MAX_STEP:
             found = False
+            work.restart()
             try:
                 rows = _checked(self.path, max(last, 0), partial(connection.execute, query, (last + step, *topics)))
                 while (row := _checked(self.path, max(last, 0), rows.fetchone)) is not None:
@@ -144,7 +157,11 @@ class SqliteBag:
                         damaged(tally, error.where, error.why)
                     if not isinstance(row[0], int):
                         raise BrokenRecording(self.path, f"the message after message {last}", "it has no number")
-                    last, step, error, found = max(last, row[0]), 1, None, True
+                    if row[0] <= last:  # damaged pages can repeat
+                        why = f"message {row[0]} follows message {last}: the numbers must increase"
+                        raise BrokenRecording(self.path, f"the message after message {last}", why)
+                    last, step, error, found = row[0], 1, None, True
+                    work.restart()
                     yield row
             except BrokenRecording as broken:
                 error = error or broken
@@ -171,6 +188,29 @@ class _ReadConnection:
         self._connection.close()
 
 
+class _Work:
+    """Interrupts SQLite where it searches a row for too long: damaged pages can repeat.
+
+    Args:
+        connection: the connection to watch.
+        size: of the file [bytes]. A row takes more bytes than SQLite takes instructions to pass it.
+    """
+
+    _STEP = 10_000  # instructions between two looks
+
+    def __init__(self, connection: sqlite3.Connection, size: int) -> None:
+        self._limit, self._done = 1_000_000 + 2 * size, 0
+        connection.set_progress_handler(self._look, self._STEP)
+
+    def restart(self) -> None:
+        """Begin again: a row was found."""
+        self._done = 0
+
+    def _look(self) -> int:
+        self._done += self._STEP
+        return int(self._done > self._limit)
+
+
 def _checked(path: Path, last: int, call: Callable[[], T]) -> T:
     """Run an SQLite call; `last` is the number of the last message that was read."""
     try:
@@ -183,6 +223,29 @@ def damaged(tally: Tally | None, where: str, why: str) -> None:
     """Count a message or a chunk that is skipped."""
     if tally is not None:
         tally.add(Reason.DAMAGED, where, why)
+
+
+def find_next(file: BinaryIO, pattern: re.Pattern[bytes], at: int, accept: Callable[[int], bool]) -> int:
+    """Search a file for the next record that begins like a chunk.
+
+    Args:
+        file: the file.
+        pattern: matches the beginning of a chunk, at most _CHUNK_HEAD_BYTES long.
+        at: first byte to search.
+        accept: whether a chunk can begin at this byte.
+
+    Returns:
+        Its byte; 0 if there is none.
+    """
+    while True:
+        file.seek(at)
+        block = file.read(BLOCK_BYTES)
+        for match in pattern.finditer(block):
+            if accept(at + match.start()):
+                return at + match.start()
+        if len(block) < BLOCK_BYTES:
+            return 0
+        at += len(block) - _CHUNK_HEAD_BYTES  # a match may lie across two blocks
 
 
 def decompressed(data: bytes) -> tuple[bytes, str]:

@@ -4,15 +4,23 @@ This module reads the records itself. The `mcap` package reads a file without an
 does not report the byte at which it failed. The package parses only the few records of the index.
 """
 
+import re
 import zlib
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import BinaryIO, NamedTuple, Self
 
 from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.faults import Tally
-from neurove_core.io.formats.containers.bags import MAX_RECORD_BYTES, BagMessage, damaged, decompressed, type_name
+from neurove_core.io.formats.containers.bags import (
+    MAX_RECORD_BYTES,
+    BagMessage,
+    damaged,
+    decompressed,
+    find_next,
+    type_name,
+)
 from neurove_core.io.formats.containers.mcap_records import (
     CHANNEL,
     CHUNK,
@@ -36,6 +44,9 @@ from neurove_core.io.formats.containers.mcap_records import (
     summary,
 )
 from neurove_core.io.unpack import unpacked
+
+_CHUNK_START = re.compile(rb"\x06.{36}(?:\x04\x00\x00\x00zstd|\x03\x00\x00\x00lz4)", re.DOTALL)
+"""Beginning of a compressed chunk: its record, times, size and checksum, and the name of its compression."""
 
 
 class Record(NamedTuple):
@@ -167,19 +178,27 @@ class McapFile:
                 if opcode in (DATA_END, FOOTER):
                     return
                 fault = _fault_of(length, size - file.tell())
-                if not fault or (length <= MAX_RECORD_BYTES and not self._chunk_after(at)):
+                later = self._chunk_after(file, at, size) if fault else 0
+                file.seek(at + RECORD.size)
+                if not fault or (length <= MAX_RECORD_BYTES and not later):
                     yield from walk.record(at, opcode, file.read(min(length, MAX_RECORD_BYTES)), length)
                 after = at + RECORD.size + length
                 if fault:
-                    after = self._chunk_after(at)
+                    after = later
                     if not after:
                         raise BrokenRecording(self.path, f"byte {at}", fault)
                     damaged(tally, f"byte {at}", fault)
                 at = file.seek(after)
 
-    def _chunk_after(self, at: int) -> int:
-        """The first byte of the next chunk that the index names; 0 without one."""
-        return next((chunk.start for chunk in self.chunks if chunk.start > at), 0)
+    def _chunk_after(self, file: BinaryIO, at: int, size: int) -> int:
+        """The first byte of the next chunk: as the index says, or found in a file without one. 0 without a chunk."""
+        if self.chunks:
+            return next((chunk.start for chunk in self.chunks if chunk.start > at), 0)
+
+        def accept(start: int) -> bool:
+            return not _fault_of(length_at(file, start), size - start - RECORD.size)
+
+        return find_next(file, _CHUNK_START, at + 1, accept)
 
 
 def _fault_of(length: int, left: int) -> str:

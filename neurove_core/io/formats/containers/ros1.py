@@ -6,6 +6,7 @@ did not write one. Source: wiki.ros.org/Bags/Format/2.0.
 """
 
 import bz2
+import re
 import struct
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
@@ -16,12 +17,16 @@ from typing import Any, BinaryIO, Final, NamedTuple, Self
 from neurove_core.extras import MissingExtra
 from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.faults import Tally
-from neurove_core.io.formats.containers.bags import MAX_RECORD_BYTES, BagMessage, damaged
+from neurove_core.io.formats.containers.bags import MAX_RECORD_BYTES, BagMessage, damaged, find_next
 from neurove_core.io.unpack import ERRORS, bounded
 
 MAGIC: Final = b"#ROSBAG V2.0\n"
 MAX_HEADER_BYTES: Final = 1 << 20
 _MESSAGE, _BAG, _CHUNK, _CHUNK_INFO, _CONNECTION = 2, 3, 5, 6, 7
+
+
+_CHUNK_START: Final = re.compile(rb".{4}(?:.{4}(?:compression=(?:none|bz2|lz4)|op=\x05|size=.{4})){3}", re.DOTALL)
+"""Beginning of a chunk: the length of its header, and the three fields of the header in any order."""
 
 
 class _Connection(NamedTuple):
@@ -106,15 +111,25 @@ class Ros1Bag:
                 except _BadRecord as error:
                     why = str(error) or "the file ends within a record"
                 if why:
-                    after = after if 0 < after < size else self._chunk_after(at)
+                    after = after if 0 < after < size else self._chunk_after(file, at, size)
                     if not after:
                         raise BrokenRecording(self.path, f"byte {at}", why)
                     damaged(tally, f"byte {at}", why)
                 at = file.seek(after)
 
-    def _chunk_after(self, at: int) -> int:
-        """The first byte of the next chunk that the index names; 0 without one."""
-        return next((start for start, _ in self.chunk_ends if start > at), 0)
+    def _chunk_after(self, file: BinaryIO, at: int, size: int) -> int:
+        """The first byte of the next chunk: as the index says, or found in a file without one. 0 without a chunk."""
+        if self.chunk_ends:
+            return next((start for start, _ in self.chunk_ends if start > at), 0)
+
+        def accept(start: int) -> bool:
+            file.seek(start)
+            try:
+                return _read_record(file).size <= size - file.tell()
+            except _BadRecord:
+                return False
+
+        return find_next(file, _CHUNK_START, at + 1, accept)
 
     def _in_chunk(
         self, file: BinaryIO, chunk: _Record, at: int, wanted: frozenset[str], tally: Tally | None
