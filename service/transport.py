@@ -166,12 +166,7 @@ class Transport:
 
     def subscribe(self, key: str, on_sample: OnSample) -> None:
         """Receive every message of a key expression until the session is closed."""
-
-        def receive(sample: zenoh.Sample) -> None:
-            with self._guard.at("message"):
-                on_sample(str(sample.key_expr), sample.payload.to_bytes(), time.monotonic_ns())
-
-        self._kept.append(self._session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
+        self.subscribe_timed(key, lambda name, payload, received_ns, _: on_sample(name, payload, received_ns))
 
     def subscribe_timed(self, key: str, on_sample: OnTimedSample) -> None:
         """As subscribe, with the time of sending, if the driver attaches it [us]."""
