@@ -90,6 +90,8 @@ def _check_node(reply: HealthReply, where: str) -> Check:
     state = f"service {reply.version} at {where}, model {reply.model.name}"
     if reply.ok:
         return Check(f"node {reply.node}", state, "ok")
+    if reply.namesakes:
+        return Check(f"node {reply.node}", f"{state}: {reply.why}", "bad", "give each node its own name: --node NAME")
     return Check(f"node {reply.node}", f"{state}: {reply.why}", "bad", "run `neurove health`; see the log of the node")
 
 

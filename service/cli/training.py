@@ -229,4 +229,4 @@ def _add_workers(parser: argparse.ArgumentParser) -> None:
 
 def _add_calibration(parser: argparse.ArgumentParser, none: str) -> None:
     about = f"number of simulated sequences to fit the uncertainty on; default {_CALIBRATION_SEQUENCES}{none}"
-    parser.add_argument("--calibration-sequences", type=count, default=_CALIBRATION_SEQUENCES, metavar="N", help=about)
+    parser.add_argument("--calibration-sequences", type=int, default=_CALIBRATION_SEQUENCES, metavar="N", help=about)

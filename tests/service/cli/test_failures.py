@@ -36,7 +36,8 @@ def test_no_number_flag_of_any_command_takes_nan_or_more_than_64_bits():
     ]
     assert len(kinds) > 20
     for kind in set(kinds):
-        for text in ("nan", "9" * 30, "9" * 5000, "-inf", "", *([] if kind is duration else ["inf"])):
+        whole = ["9" * 30, "9" * 5000] if kind in (int, count, seed) else []
+        for text in ("nan", "-inf", "", *whole, *([] if kind is duration else ["inf"])):
             assert refuses(kind, text), (kind, text)
 
 
