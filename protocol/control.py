@@ -193,6 +193,8 @@ class HealthReply(Message):
     rollbacks: Count = 0  # automatic rollbacks since the start
     internal_errors: dict[str, Count] = Field(default_factory=dict)  # place in the node -> number since the start
     dropped_log_lines: Count = 0  # not read in time
+    missing_streams: Annotated[tuple[Name, ...], Field(strict=False)] = ()  # expected, and without packets now
+    namesakes: Count = 0  # other nodes of this name on the network
 
 
 class ModelsReply(Message):

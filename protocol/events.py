@@ -24,6 +24,9 @@ FORMATS = ("soa6", "soa8")
 SCHEMA = "application/msgpack;neurove.events.1"
 """Zenoh Encoding of an event packet."""
 
+MAX_PACKET_BYTES = 32 << 20
+"""No packet is larger, whatever a service configures: the transport refuses larger messages."""
+
 MAX_HEADER_BYTES = 1024
 """Cap of a packet's fields without its events."""
 

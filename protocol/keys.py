@@ -105,6 +105,10 @@ class Keys:
         """Liveliness token of a node."""
         return self._of_node(node, "alive")
 
+    def instance(self, node: str = "*", instance: str = "*") -> str:
+        """Liveliness token of one process of a node; two of one node are two nodes of one name."""
+        return self._of_node(node, f"instance/{instance if instance == '*' else check_name('instance', instance)}")
+
     def serves(self, node: str = "*", stream: str = "*") -> str:
         """Liveliness token of a node that serves a stream."""
         return self._of_node(node, f"serves/{stream if stream == '*' else check_name('stream', stream)}")

@@ -29,7 +29,7 @@ from pydantic_settings import (
 
 from neurove_core.files import read_toml
 from neurove_protocol.errors import NeuroVEError
-from neurove_protocol.events import PacketLimits
+from neurove_protocol.events import MAX_PACKET_BYTES, PacketLimits
 from neurove_protocol.fields import WrongField
 from neurove_protocol.keys import DEFAULT_PREFIX, Keys, check_name
 from neurove_service.endpoints import check_endpoint
@@ -59,6 +59,11 @@ def _given(value: object) -> object:
 
 Endpoints = Annotated[tuple[Annotated[str, AfterValidator(check_endpoint)], ...], NoDecode, BeforeValidator(_listed)]
 GivenPath = Annotated[Path, BeforeValidator(_given)]
+Names = Annotated[
+    tuple[Annotated[str, AfterValidator(lambda name: check_name("expect_streams", name))], ...],
+    NoDecode,
+    BeforeValidator(_listed),
+]
 Paths = Annotated[tuple[GivenPath, ...], NoDecode, BeforeValidator(lambda value: _listed(_given(value)))]
 
 _OF_KUBERNETES = re.compile(
@@ -141,7 +146,16 @@ class ServiceConfig(_Settings):
     max_streams: int = Field(
         16, ge=1, le=1024, description="Maximum number of streams; further ones are refused and counted."
     )
-    max_packet_events: int = Field(1_000_000, ge=1, le=16_000_000, description="Larger packets are refused.")
+    expect_streams: Annotated[Names, Field(description="Streams that must be served; health names a missing one.")] = ()
+    allow_same_name: bool = Field(
+        False, description="Start even if another node of this name is on the network; each estimate comes twice."
+    )
+    max_packet_events: int = Field(
+        1_000_000,
+        ge=1,
+        le=(MAX_PACKET_BYTES - (1 << 16)) // 8,
+        description="Larger packets are refused; the bound is the largest message of the transport, 32 MiB.",
+    )
     tables_mib: int = Field(
         512,
         ge=1,

@@ -20,7 +20,9 @@ import zenoh
 
 from neurove_protocol.control import CONTROL_SCHEMA, PROGRESS_SCHEMA, ErrorReply, PeerError
 from neurove_protocol.errors import Busy, InternalError, NeuroVEError
+from neurove_protocol.events import MAX_PACKET_BYTES
 from neurove_service import logs
+from neurove_service.desk import Desk
 from neurove_service.guard import Guard
 
 log = logs.get(__name__)
@@ -28,7 +30,7 @@ log = logs.get(__name__)
 _SETTINGS = {
     "scouting/multicast/enabled": False,
     "transport/shared_memory/enabled": False,  # leaks 17 MiB per publisher restart in this version
-    "transport/link/rx/max_message_size": 32 << 20,
+    "transport/link/rx/max_message_size": MAX_PACKET_BYTES,
     # What waits on the sender's side of a slow link is old when it arrives: 5 Mbit/s take 0.6 s for these two.
     "transport/link/tx/queue/size/data": 4,  # batches of 64 KiB
     "transport/link/tcp/so_sndbuf": 1 << 16,  # bytes; Linux takes twice as many
@@ -114,7 +116,7 @@ class Transport:
 
     def __init__(self, session: zenoh.Session, guard: Guard | None = None) -> None:
         self._session, self._guard = session, guard or Guard()
-        self._answering: list[tuple[Any, threading.Thread]] = []
+        self._answering: list[tuple[Any, Desk[zenoh.Query], threading.Thread]] = []
         self._kept: list[Any] = []  # Zenoh undeclares what is garbage collected
         _OPEN[id(self)] = self
 
@@ -130,8 +132,9 @@ class Transport:
         """Undeclare everything and close the session; a second call does nothing."""
         if _OPEN.pop(id(self), None) is None:
             return
-        for queryable, thread in self._answering:
+        for queryable, desk, thread in self._answering:
             queryable.undeclare()
+            desk.close()
             thread.join(timeout=1)
         try:
             self._session.close()  # type: ignore[no-untyped-call]  # gap in Zenoh's stubs
@@ -163,12 +166,7 @@ class Transport:
 
     def subscribe(self, key: str, on_sample: OnSample) -> None:
         """Receive every message of a key expression until the session is closed."""
-
-        def receive(sample: zenoh.Sample) -> None:
-            with self._guard.at("message"):
-                on_sample(str(sample.key_expr), sample.payload.to_bytes(), time.monotonic_ns())
-
-        self._kept.append(self._session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
+        self.subscribe_timed(key, lambda name, payload, received_ns, _: on_sample(name, payload, received_ns))
 
     def subscribe_timed(self, key: str, on_sample: OnTimedSample) -> None:
         """As subscribe, with the time of sending, if the driver attaches it [us]."""
@@ -239,16 +237,22 @@ class Transport:
         self._answer(key, work)
 
     def _answer(self, key: str, work: Callable[[zenoh.Query], None]) -> None:
-        queryable = self._session.declare_queryable(key, zenoh.handlers.FifoChannel(16))
+        desk: Desk[zenoh.Query] = Desk()
+
+        def receive(query: zenoh.Query) -> None:  # on Zenoh's thread: it must not wait
+            if not desk.offer(query):
+                with query:
+                    _refuse(query, Busy(desk.most))
 
         def serve() -> None:
-            for query in queryable:
+            for query in desk:
                 with self._guard.at("query", key=key):
                     work(query)
 
+        queryable = self._session.declare_queryable(key, zenoh.handlers.Callback(receive, indirect=False))
         thread = threading.Thread(target=serve, name=f"answer {key}", daemon=True)
         thread.start()
-        self._answering.append((queryable, thread))
+        self._answering.append((queryable, desk, thread))
 
     def ask(self, key: str, request: bytes, timeout_s: float, *, bulk: bool = False) -> list[Reply]:
         """Query a key expression and wait for all replies.
@@ -286,6 +290,16 @@ class Transport:
             token.undeclare()  # type: ignore[no-untyped-call]  # gap in Zenoh's stubs
 
         return undeclare
+
+    def watch_tokens(self, key: str, on_token: Callable[[str, bool], None]) -> None:
+        """Call `on_token` with a token's key and whether it is present, for present tokens and at each change."""
+
+        def receive(sample: zenoh.Sample) -> None:
+            with self._guard.at("token"):
+                on_token(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+
+        handler = zenoh.handlers.Callback(receive, indirect=False)
+        self._kept.append(self._session.liveliness().declare_subscriber(key, handler, history=True))
 
     def tokens(self, key: str, timeout_s: float) -> list[str]:
         """The present liveliness tokens of a key expression."""

@@ -59,7 +59,8 @@ MAY_IMPORT = {
     "neurove_service.endpoints": "",
     "neurove_service.config": "core:files endpoints",
     "neurove_service.guard": "logs",
-    "neurove_service.transport": "logs guard",
+    "neurove_service.desk": "",
+    "neurove_service.transport": "logs guard desk",
     "neurove_service.streams": (
         "core:config core:geometry core:ingest core:networks core:models core:estimator logs guard"
     ),

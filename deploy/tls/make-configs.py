@@ -75,13 +75,16 @@ def _rules(role: str, name: str, prefix: str) -> list[Rule]:
             *_publishes(results, heard_as=results),
             *_answers([f"{own}/health", f"{own}/models", f"{own}/model/**"], asked_as=[*asked, change]),
             (IN, ["reply"], [change]),  # an error reply has the key of the query, maybe for all nodes
-            (IN, ["liveliness_token"], [f"{own}/alive", f"{own}/serves/*"]),
+            (IN, ["liveliness_query", "declare_liveliness_subscriber"], [f"{own}/instance/*"]),
+            (OUT, ["liveliness_token"], [f"{own}/instance/*"]),
+            (IN, ["liveliness_token"], [f"{own}/alive", f"{own}/serves/*", f"{own}/instance/*"]),
         ]
+    tokens = [f"{node}/alive", f"{node}/serves/*", f"{node}/instance/*"]
     reads = [
         *_hears(results),
         *_asks(asked),
-        (IN, ["liveliness_query", "declare_liveliness_subscriber"], [f"{node}/alive", f"{node}/serves/*"]),
-        (OUT, ["liveliness_token"], [f"{node}/alive", f"{node}/serves/*"]),
+        (IN, ["liveliness_query", "declare_liveliness_subscriber"], tokens),
+        (OUT, ["liveliness_token"], tokens),
     ]
     if role == "recorder":  # as a consumer, and events
         return [*reads, *_hears([events, camera]), *_asks([camera])]

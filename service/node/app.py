@@ -22,7 +22,9 @@ from neurove_service.node.condition import Watch
 from neurove_service.node.folders import check_folders
 from neurove_service.node.handlers import Handlers
 from neurove_service.node.housekeeping import Housekeeping
+from neurove_service.node.namesakes import Namesakes
 from neurove_service.node.outlets import open_outlet, route
+from neurove_service.node.snapshot import Snapshot
 from neurove_service.node.watchdog import Watchdog
 from neurove_service.streams.comparison import TrialLimits
 from neurove_service.streams.history import RingSize
@@ -117,7 +119,11 @@ class Service:
                 lambda name: open_outlet(transport, self._keys, self._config.node, name),
                 self._guard,
             )
-            watch = Watch(self._config.node, registry, self._guard)
+            namesakes = Namesakes(transport, self._keys, self._config.node)
+            namesakes.join(self._stop, allowed=self._config.allow_same_name)
+            watch = Watch(
+                self._config.node, registry, self._guard, self._config.expect_streams, lambda: namesakes.count
+            )
             self._declare(transport, registry, watch)
             self._log_ready()
             housekeeping = self._housekeeping(transport, registry, watch)
@@ -157,7 +163,7 @@ class Service:
         )
         transport.subscribe_timed(keys.camera(), route(keys, registry, registry.put_camera))
         transport.subscribe_timed(keys.events(), route(keys, registry, registry.put_packet))
-        transport.answer(keys.health(node), handlers.health)
+        transport.answer(keys.health(node), Snapshot(handlers.health, lambda: self._slot.last_change))
         transport.answer(keys.models(node), handlers.models)
         for key, handle in (
             (keys.activate(node), handlers.activate),

@@ -1,6 +1,7 @@
 """Condition: what is wrong with a node as a whole, apart from its streams and its models."""
 
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -8,6 +9,7 @@ from neurove_protocol.control import StreamStatus
 from neurove_service import logs
 from neurove_service.guard import Guard
 from neurove_service.node.health import stream_status
+from neurove_service.streams.activity import IDLE_NS
 from neurove_service.streams.registry import StreamRegistry
 
 
@@ -20,12 +22,18 @@ class Condition(NamedTuple):
     dropped_log_lines: int = 0  # not read in time
     stuck_streams: tuple[str, ...] = ()  # their worker has not turned for 10 s
 
+    missing_streams: tuple[str, ...] = ()  # expected, and without packets now
+    namesakes: int = 0  # other nodes of this name on the network
+
     def reasons(self) -> list[str]:
         """Why the node is not ok, each as the part of a sentence."""
         reasons = [f"the loop of stream {name} is stuck" for name in self.stuck_streams]
         if self.recent_errors:
             counted = ", ".join(f"{place} {self.internal_errors.get(place, 0)}" for place in self.recent_errors)
             reasons.append(f"internal errors within a minute, total by place: {counted}; see the log of the node")
+        reasons += [f"expected stream {name} is missing" for name in self.missing_streams]
+        if self.namesakes:
+            reasons.append(f"{self.namesakes} other nodes of this name on the network: every estimate comes twice")
         if self.refused_streams:
             reasons.append(f"{self.refused_streams} streams refused: max_streams reached")
         return reasons
@@ -38,10 +46,20 @@ class Watch:
         node: its name.
         registry: its streams.
         guard: its internal errors.
+        expected: the streams that it must serve.
+        namesakes: number of other nodes of its name.
     """
 
-    def __init__(self, node: str, registry: StreamRegistry, guard: Guard) -> None:
+    def __init__(
+        self,
+        node: str,
+        registry: StreamRegistry,
+        guard: Guard,
+        expected: tuple[str, ...] = (),
+        namesakes: Callable[[], int] = lambda: 0,
+    ) -> None:
         self._node, self._registry, self._guard = node, registry, guard
+        self._expected, self._namesakes = expected, namesakes
 
     def statuses(self) -> list[StreamStatus]:
         """Status of every stream; one that cannot be told is left out."""
@@ -53,10 +71,16 @@ class Watch:
 
     def condition(self) -> Condition:
         """Of the node as a whole."""
+        now_ns = time.monotonic_ns()
+        present = {
+            stream.name for stream in self._registry.streams() if now_ns - stream.activity.last_packet_ns < IDLE_NS
+        }
         return Condition(
             refused_streams=self._registry.refused,
             internal_errors=self._guard.counts,
             recent_errors=tuple(self._guard.recent),
             dropped_log_lines=logs.dropped(),
             stuck_streams=tuple(self._registry.stuck()),
+            missing_streams=tuple(name for name in self._expected if name not in present),
+            namesakes=self._namesakes(),
         )

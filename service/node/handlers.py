@@ -87,6 +87,8 @@ class Handlers:
             refused_streams=condition.refused_streams,
             internal_errors=dict(condition.internal_errors),
             dropped_log_lines=condition.dropped_log_lines,
+            missing_streams=condition.missing_streams,
+            namesakes=condition.namesakes,
             streams=tuple(streams),
             ready=self._ready(),
             change=self._slot.last_change,

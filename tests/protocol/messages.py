@@ -154,6 +154,8 @@ EXAMPLES: dict[str, Fields] = {
         "rollbacks": 1,
         "internal_errors": {"packet": 2},
         "dropped_log_lines": 3,
+        "missing_streams": ["cam1"],
+        "namesakes": 1,
     },
     "ModelsRequest": {"v": 1},
     "ModelsReply": {
@@ -388,6 +390,8 @@ ANY: dict[str, st.SearchStrategy[Fields]] = {
             "rollbacks": counts,
             "internal_errors": st.dictionaries(sentences, counts, max_size=3),
             "dropped_log_lines": counts,
+            "missing_streams": st.lists(names, max_size=2),
+            "namesakes": counts,
         }
     ),
     "ModelsRequest": st.just({}),

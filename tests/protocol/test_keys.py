@@ -21,6 +21,7 @@ NODE_KEYS: list[Callable[..., str]] = [
     Keys.rollback,
     Keys.alive,
     Keys.serves,
+    Keys.instance,
 ]
 NO_NAMES = ["", "*", "**", "@node", "@", "a/b", "/", "a/", "/a", "..", ".", "-", "$*", "a$*", "a b", "#", "?", "a" * 65]
 NO_NAMES += ["a\n", "\n", "caf\u00e9", "\u0661", "a\x00"]

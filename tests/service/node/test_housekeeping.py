@@ -9,6 +9,7 @@ from neurove_service.node.condition import Watch
 from neurove_service.node.health import node_verdict
 from neurove_service.node.housekeeping import Housekeeping
 from neurove_service.node.watchdog import STOPPED_LOOP_S, Watchdog
+from neurove_service.streams.activity import IDLE_NS
 from neurove_service.streams.history import RingSize
 from neurove_service.streams.registry import StreamRegistry, StreamSettings
 from neurove_service.streams.worker import Outlet
@@ -121,3 +122,22 @@ def test_the_watchdog_pings_while_housekeeping_turns_and_no_longer(guard):
     assert not watchdog.turn(101.0 + STOPPED_LOOP_S)
     assert not watchdog.turn(102.0 + STOPPED_LOOP_S)
     assert len(pings) == 1
+
+
+def test_an_expected_stream_that_never_came_or_has_died_is_named(make, guard):
+    registry = make()
+    put(registry, "cam0"), put(registry, "cam1")
+    watch = Watch("edge", registry, guard, ("cam0", "cam1", "cam2"))
+    assert watch.condition().missing_streams == ("cam2",)
+    dead = next(stream for stream in registry.streams() if stream.name == "cam1")
+    wait_until(lambda: dead.counters.packets_received == 3)
+    dead.activity.last_packet_ns -= 2 * IDLE_NS
+    assert watch.condition().missing_streams == ("cam1", "cam2")
+    ok, why = node_verdict(watch.statuses(), watch.condition().reasons())
+    assert not ok
+    assert "expected stream cam2 is missing" in why
+
+
+def test_another_node_of_the_name_is_a_reason(make, guard):
+    watch = Watch("edge", make(), guard, namesakes=lambda: 1)
+    assert "1 other nodes of this name" in node_verdict([], watch.condition().reasons())[1]
