@@ -108,7 +108,10 @@ def check_stream(status: StreamStatus, estimate: TwistEstimate | None) -> list[C
         Check(f"{name}: calibration", "the service has a CameraInfo", "ok")
         if status.calibrated
         else Check(
-            f"{name}: calibration", "no CameraInfo", "bad", "let the driver publish the CameraInfo of its camera"
+            f"{name}: calibration",
+            "no CameraInfo",
+            "bad",
+            "let the driver publish its CameraInfo; `neurove drive --calibration FILE` does",
         ),
         _check_height(f"{name}: height", estimate),
     ]
@@ -128,7 +131,12 @@ def _check_height(what: str, estimate: TwistEstimate | None) -> Check:
     if estimate is None:
         return Check(what, f"unknown: no estimate within {_LISTEN_S:.0f} s", "info")
     if Flag.UNSCALED in estimate.flags:
-        return Check(what, "unknown to the service, which assumes 1 m", "bad", "set CameraInfo.height_m in the driver")
+        return Check(
+            what,
+            "unknown to the service, which assumes 1 m",
+            "bad",
+            "set CameraInfo.height_m in the driver; `neurove drive --height M` does",
+        )
     return Check(what, "known", "ok")
 
 
