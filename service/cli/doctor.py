@@ -96,7 +96,7 @@ def _check_node(reply: HealthReply, where: str) -> Check:
 
 
 def check_stream(status: StreamStatus, estimate: TwistEstimate | None) -> list[Check]:
-    """Clock, calibration and camera height of one stream.
+    """Feed, clock, calibration and camera height of one stream.
 
     Args:
         status: of the node that serves the stream.
@@ -104,6 +104,7 @@ def check_stream(status: StreamStatus, estimate: TwistEstimate | None) -> list[C
     """
     name = f"stream {status.stream}"
     return [
+        _check_feed(f"{name}: feed", status),
         _check_clock(f"{name}: clock", status),
         Check(f"{name}: calibration", "the service has a CameraInfo", "ok")
         if status.calibrated
@@ -115,6 +116,13 @@ def check_stream(status: StreamStatus, estimate: TwistEstimate | None) -> list[C
         ),
         _check_height(f"{name}: height", estimate),
     ]
+
+
+def _check_feed(what: str, status: StreamStatus) -> Check:
+    if status.verdict in ("unstable", "lossy"):
+        advice = "see `Verdicts of a stream` in deploy/README.md"
+        return Check(what, f"{status.verdict}: {status.why}", "bad", advice)
+    return Check(what, "nothing is lost now", "ok")
 
 
 def _check_clock(what: str, status: StreamStatus) -> Check:

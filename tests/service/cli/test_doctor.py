@@ -89,13 +89,14 @@ class Estimate:
 @pytest.mark.parametrize(
     ("changes", "estimate", "levels"),
     [
-        ({"calibrated": True, "last_packet_age_s": 0.1}, Estimate(), ["ok", "ok", "ok"]),
-        ({"calibrated": False, "last_packet_age_s": 0.1}, Estimate(Flag.UNSCALED), ["ok", "bad", "bad"]),
-        ({"calibrated": True, "last_packet_age_s": 9.0}, None, ["bad", "ok", "info"]),
-        ({"calibrated": True, "last_packet_age_s": 0.1, "verdict": "stalled"}, None, ["bad", "ok", "info"]),
+        ({"calibrated": True, "last_packet_age_s": 0.1}, Estimate(), ["ok", "ok", "ok", "ok"]),
+        ({"calibrated": False, "last_packet_age_s": 0.1}, Estimate(Flag.UNSCALED), ["ok", "ok", "bad", "bad"]),
+        ({"calibrated": True, "last_packet_age_s": 9.0}, None, ["ok", "bad", "ok", "info"]),
+        ({"calibrated": True, "last_packet_age_s": 0.1, "verdict": "stalled"}, None, ["ok", "bad", "ok", "info"]),
+        ({"calibrated": True, "last_packet_age_s": 0.1, "verdict": "unstable"}, Estimate(), ["bad", "ok", "ok", "ok"]),
     ],
 )
-def test_each_stream_is_checked_for_clock_calibration_and_height(changes, estimate, levels):
+def test_each_stream_is_checked_for_feed_clock_calibration_and_height(changes, estimate, levels):
     found = doctor.check_stream(status(**changes), estimate)
     assert [check.level for check in found] == levels
     assert all(check.advice for check in found if check.level == "bad")
