@@ -163,7 +163,10 @@ class Service:
         )
         transport.subscribe_timed(keys.camera(), route(keys, registry, registry.put_camera))
         transport.subscribe_timed(keys.events(), route(keys, registry, registry.put_packet))
-        transport.answer(keys.health(node), Snapshot(handlers.health, lambda: self._slot.last_change))
+        transport.answer(
+            keys.health(node),
+            Snapshot(handlers.health, lambda: (self._slot.last_change, len(registry.streams()), self._stop.is_set())),
+        )
         transport.answer(keys.models(node), handlers.models)
         for key, handle in (
             (keys.activate(node), handlers.activate),

@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-FRESH_S: Final = 0.1
+FRESH_S: Final = 0.05
 """A reply is given again for this time [s]."""
 
 
