@@ -16,6 +16,7 @@ from neurove_service.config import ClientConfig
 from neurove_service.transport import open_transport
 
 START_S = 180
+AT_FULL_SPEED = {"COVERAGE_PROCESS_CONFIG": ""}  # environment of a process that must keep up with a camera
 
 
 def free_endpoint():
@@ -87,11 +88,11 @@ def is_alive(transport, config):
 
 
 @contextlib.contextmanager
-def service(endpoint, *arguments):
+def service(endpoint, *arguments, **environment):
     """A serving node and a session with it."""
     config = ClientConfig(connect=(endpoint,))
     always = ("--listen", endpoint, "--node", "n1", "--log-level", "warning", "--probation-s", "0.5")
-    with running("serve", *always, *arguments) as process:
+    with running("serve", *always, *arguments, **environment) as process:
         wait_until(lambda: _connects(endpoint) or process.child.poll() is not None, START_S)
         with client(endpoint) as transport:
             wait_until(lambda: is_alive(transport, config), START_S)
