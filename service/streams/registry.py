@@ -12,6 +12,7 @@ from neurove_service.guard import Guard
 from neurove_service.streams.history import RingSize
 from neurove_service.streams.model_source import ModelSource
 from neurove_service.streams.stream import Stream
+from neurove_service.streams.turns import Slots
 from neurove_service.streams.worker import Inbox, Outlet, StreamWorker
 
 log = logs.get(__name__)
@@ -58,7 +59,7 @@ class StreamRegistry:
         self._models, self._settings, self._open_outlet = models, settings, open_outlet
         self._guard = guard or Guard()
         self._workers: dict[str, StreamWorker] = {}
-        self._standby_slots = threading.Semaphore(max(1, (os.cpu_count() or 1) // 2))  # the rest is for serving models
+        self._slots = Slots(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
         self._refused: dict[str, float] = {}  # stream -> time of its newest message
         self._lock = threading.Lock()  # of both dicts; only its worker changes a stream
         self._closed = False
@@ -140,7 +141,7 @@ class StreamRegistry:
             lambda: self._open_outlet(name),
             Inbox(settings.queue_s, settings.queue_bytes),
             settings.limits,
-            self._standby_slots,
+            self._slots,
             self._guard,
         )
         self._workers[name] = worker

@@ -20,6 +20,7 @@ from neurove_service.streams.intake import Arrival
 from neurove_service.streams.overload import Overload, newest_whole_window
 from neurove_service.streams.runs import MAX_RUN, SMALL_BYTES
 from neurove_service.streams.stream import Stream
+from neurove_service.streams.turns import Slots
 
 log = logs.get(__name__)
 
@@ -125,7 +126,7 @@ class StreamWorker:
         open_outlet: called first on the thread.
         inbox: the queue.
         limits: limits of packets.
-        standby_slots: limits how many workers of the node run a standby model at once; None: no limit.
+        slots: limit how many workers of the node work at once.
         guard: counts internal errors.
     """
 
@@ -135,14 +136,14 @@ class StreamWorker:
         open_outlet: Callable[[], Outlet],
         inbox: Inbox,
         limits: PacketLimits,
-        standby_slots: threading.Semaphore | None = None,
+        slots: Slots | None = None,
         guard: Guard | None = None,
     ) -> None:
         self.stream = stream
         self.beat_ns = time.monotonic_ns()
         self._inbox = inbox
         self._open_outlet, self._limits = open_outlet, limits
-        self._standby_slots = standby_slots or threading.Semaphore()
+        self._slots = slots or Slots()
         self._guard = guard or Guard()
         self._pause_until = 0.0  # a time, not a duration: packets that arrive in a pause must not extend it
         self._pending: deque[Sample] = deque()  # taken out of the queue, not yet processed
@@ -205,7 +206,8 @@ class StreamWorker:
             pause_s = max(0.0, self._pause_until - time.monotonic())
             self._take(pause_s if self.stream.lanes.has_backlog else _IDLE_BEAT_S)
         if self._pending:
-            self._work_next(outlet)
+            with self._slots.serving:
+                self._work_next(outlet)
         elif self.stream.lanes.has_backlog:
             self._pause_until = time.monotonic() + self._run_standby()
 
@@ -260,13 +262,13 @@ class StreamWorker:
 
     def _run_standby(self) -> float:
         """Run one step of the standby model; return the pause after it [s], which leaves the processor to others."""
-        if not self._standby_slots.acquire(blocking=False):
+        if not self._slots.standby.acquire(blocking=False):
             return _RETRY_STANDBY_S
         began = time.monotonic()
         try:
             self.stream.lanes.run_standby()
         finally:
-            self._standby_slots.release()
+            self._slots.standby.release()
         return min(_MAX_PAUSE_S, time.monotonic() - began)  # as long as the step: half of the time
 
     def _work(self, sample: Sample, now_ns: int, outlet: Outlet) -> None:

@@ -1,0 +1,55 @@
+import threading
+
+from neurove_service.streams.turns import Turns
+from tests.live.conftest import wait_until
+
+
+def test_turns_are_given_in_the_order_in_which_they_were_asked_for():
+    turns, order = Turns(1), []
+    threads = []
+
+    def work(name):
+        with turns:
+            order.append(name)
+
+    with turns:
+        for name in range(5):
+            threads.append(threading.Thread(target=work, args=(name,)))
+            threads[-1].start()
+            wait_until(lambda: turns.waiting == len(threads))
+        assert order == []
+    for thread in threads:
+        thread.join(5)
+    assert order == list(range(5))
+
+
+def test_no_more_workers_than_allowed_have_their_turn_at_once():
+    turns, lock, counts = Turns(2), threading.Lock(), {"now": 0, "most": 0}
+
+    def work():
+        for _ in range(200):
+            with turns:
+                with lock:
+                    counts["now"] += 1
+                    counts["most"] = max(counts.values())
+                with lock:
+                    counts["now"] -= 1
+
+    threads = [threading.Thread(target=work) for _ in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(20)
+    assert counts["now"] == 0
+    assert 1 <= counts["most"] <= 2
+
+
+def test_an_error_gives_the_turn_back():
+    turns = Turns(1)
+    try:
+        with turns:
+            raise RuntimeError("planted")
+    except RuntimeError:
+        pass
+    with turns:
+        pass
