@@ -154,7 +154,7 @@ class StreamStatus(Message):
     lost: Losses
     latency_ms: Latency | None  # None before the first estimate
     last_packet_age_s: float
-    recovered_packets: Count = 0  # of gap_packets: they arrived later, in time for their window
+    recovered_packets: Count = 0  # of gap_packets: they arrived later; too late ones are out_of_order_packets too
     uncounted_packets: Count = 0  # all had the sequence number 0, so losses before this node cannot be counted
     refused_cameras: Count = 0  # CameraInfo messages that were refused or do not belong to the sensor
     refusal: str = ""  # why the newest packet or CameraInfo was refused

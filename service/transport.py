@@ -173,10 +173,12 @@ class Transport:
 
         def receive(sample: zenoh.Sample) -> None:
             received_ns = time.monotonic_ns()
-            with self._guard.at("message"):
-                attached = sample.attachment.to_bytes() if sample.attachment is not None else b""
-                sent_us = _SENT.unpack(attached)[0] if len(attached) == _SENT.size else None
+            try:  # not `guard.at`: this runs for every packet
+                attached = sample.attachment
+                sent_us = _sent_us(attached.to_bytes()) if attached is not None else None
                 on_sample(str(sample.key_expr), sample.payload.to_bytes(), received_ns, sent_us)
+            except Exception as error:  # noqa: BLE001  # one message must not end the subscription
+                self._guard.caught("message", error)
 
         self._kept.append(self._session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
 
@@ -305,6 +307,11 @@ class Transport:
         """The present liveliness tokens of a key expression."""
         replies = self._session.liveliness().get(key, timeout=timeout_s)
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+
+
+def _sent_us(attached: bytes) -> int | None:
+    """The time of sending in an attachment [us]; None if it is another attachment."""
+    return int(_SENT.unpack(attached)[0]) if len(attached) == _SENT.size else None
 
 
 def _query(

@@ -15,7 +15,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.files import write_atomically
+from neurove_core.files import Stamp, stamp, write_atomically
 from neurove_core.geometry.camera import lookup_table
 from neurove_core.geometry.motion import Twists, twists
 from neurove_core.ingest import windows
@@ -249,7 +249,7 @@ def _open(field: str, source: str, one: RecordedConfig) -> _OpenRecording:
     parts: list[Any] = [camera.model_dump() if camera else None, str(recording.sensor), one.topic]
     parts += [one.time_unit] if one.time_unit else []
     parts += [hashlib.sha256(column.tobytes()).hexdigest() for column in truth]
-    parts += [source] if "://" in source else [_digest(file, *_version(file)) for file in _files(Path(source))]
+    parts += [source] if "://" in source else [_digest(file, stamp(file)) for file in _files(Path(source))]
     digest = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
     return _OpenRecording(field, source, recording, truth, height_m or 1.0, digest)
 
@@ -258,13 +258,8 @@ def _files(path: Path) -> list[Path]:
     return [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
 
 
-def _version(file: Path) -> tuple[int, int]:
-    stat = file.stat()
-    return stat.st_size, stat.st_mtime_ns
-
-
 @functools.lru_cache(maxsize=4096)
-def _digest(file: Path, size: int, changed_ns: int) -> str:
+def _digest(file: Path, _: Stamp | None) -> str:
     """SHA-256 of the content of a file; a process reads a file again only after a change."""
     with file.open("rb") as content:
         return hashlib.file_digest(content, "sha256").hexdigest()

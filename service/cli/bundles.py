@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurove_protocol.errors import EXIT_FAILURE, BadModel, InvalidField, Untrusted
-from neurove_service.cli.arguments import Run, subcommand
+from neurove_service.cli.arguments import Run, seed, subcommand
 from neurove_service.cli.bundle_views import fields, lines, release_line
 from neurove_service.cli.parser import Parser
 
@@ -221,7 +221,7 @@ def add_bundle(parser: Parser) -> None:
     commands = parser.add_commands()
     one = subcommand(commands, "new", new, as_json=False)
     one.add_argument("file", type=Path, metavar="FILE", help="bundle to write, ending in .safetensors")
-    one.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the weights; default 0")
+    one.add_argument("--seed", type=seed, default=0, metavar="N", help="seed of the weights; default 0")
     one = subcommand(commands, "inspect", inspect)
     one.add_argument("file", type=Path, metavar="BUNDLE", help="bundle to show, with BUNDLE.sig if it exists")
     _add_trust(one, default=[])

@@ -73,7 +73,7 @@ class Watch:
         """Of the node as a whole."""
         now_ns = time.monotonic_ns()
         present = {
-            stream.name for stream in self._registry.streams() if now_ns - stream.activity.last_packet_ns < IDLE_NS
+            stream.name for stream in self._registry.streams() if now_ns - stream.activity.newest_packet_ns < IDLE_NS
         }
         return Condition(
             refused_streams=self._registry.refused,

@@ -61,6 +61,7 @@ class Activity:
         self.latencies_ms: deque[float] = deque(maxlen=_LATENCIES)
         self.last_packet_ns = self.last_estimate_ns = self.flow_began_ns = now_ns()
         self.last_loss_ns: int | None = None
+        self.arrived_ns = 0  # when the newest packet arrived, which may still wait; written by Zenoh's thread
         self.taken_ns = 0  # when the newest packet was taken out of the queue
         self.reset_ns: deque[int] = deque(maxlen=_RESETS)  # times of the newest resets
         self.newest_ns: dict[str, int] = {}  # counter or flag -> when it last grew
@@ -73,6 +74,11 @@ class Activity:
     def flowing(self) -> bool:
         """Whether packets are processed, however late."""
         return self._now_ns() - self.taken_ns < IDLE_NS
+
+    @property
+    def newest_packet_ns(self) -> int:
+        """When the newest packet arrived, processed or not."""
+        return max(self.last_packet_ns, self.arrived_ns)
 
     def heard(self, received_ns: int) -> None:
         """Record when a packet arrived."""

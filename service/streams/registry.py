@@ -101,7 +101,7 @@ class StreamRegistry:
             idle = [
                 name
                 for name, worker in self._workers.items()
-                if now_ns - worker.stream.activity.last_packet_ns > idle_ns
+                if now_ns - worker.stream.activity.newest_packet_ns > idle_ns
             ]
             for name in [name for name, heard in self._refused.items() if (now_ns - heard * 1e9) > idle_ns]:
                 del self._refused[name]

@@ -73,19 +73,19 @@ class Stream:
         order = self._intake.order(packet, arrival.received_ns)
         if order not in _PROCESSED:
             return []
+        if order is Order.RECOVERED:  # its delay is that of a detour, and its time is not that of another clock
+            window = self.lanes.open_window
+            if packet.sensor != self.sensor or window is None or newest_us(packet) < window.start_us:
+                self.activity.lost("out_of_order_packets", 1)  # all of its windows are answered
+                return []
+            return self._process(packet, arrival, packet)
         if order is Order.AFTER_RESTART:
             self._restart()
             self._intake.ages.forget()
         self._restart_if_changed(packet)
-        window = self.lanes.open_window
-        if order is Order.RECOVERED:  # its delay is that of a detour
-            if window is not None and newest_us(packet) < window.start_us:  # all of its windows are answered
-                self.activity.lost("out_of_order_packets", 1)
-                return []
-        elif self._intake.is_stale(packet, arrival):
+        if self._intake.is_stale(packet, arrival):
             return []
-        else:
-            self._flags.close_gap(self.lanes.open_window, packet.t0_us)
+        self._flags.close_gap(self.lanes.open_window, packet.t0_us)
         return self._process(packet, arrival, packet)
 
     def collect(self, payloads: Sequence[bytes], limits: PacketLimits) -> Run | None:

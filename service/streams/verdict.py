@@ -64,7 +64,7 @@ def judge(activity: Activity, now_ns: int) -> Judgement:
         activity: of the stream.
         now_ns: monotonic clock of this node [ns].
     """
-    packet_age_ns = now_ns - activity.last_packet_ns
+    packet_age_ns = now_ns - activity.newest_packet_ns
     if packet_age_ns > IDLE_NS:
         return Judgement("idle", f"no packet for {packet_age_ns / 1e9:.1f} s")
     estimate_age_s = (now_ns - max(activity.last_estimate_ns, activity.flow_began_ns)) / 1e9

@@ -29,6 +29,7 @@ _REOPEN_S = 0.5  # pause before the outlet is opened again after a failure
 _REST_S = 0.01  # pause of the loop after an error in it
 _RETRY_STANDBY_S = 0.002
 _MAX_PAUSE_S = 0.02
+_SOON_NS, _GATHER_S = 300_000, 0.001  # packets that follow this soon are gathered: a wake-up costs more than a packet
 _SAMPLE_BYTES = 256
 _MAX_CAMERAS = 16  # CameraInfo messages that wait for the worker
 
@@ -148,6 +149,7 @@ class StreamWorker:
         self._pause_until = 0.0  # a time, not a duration: packets that arrive in a pause must not extend it
         self._pending: deque[Sample] = deque()  # taken out of the queue, not yet processed
         self._cameras = Cameras(stream, inbox.wake, self._guard)
+        self._taken_ns = 0  # when the queue was last emptied
         self._overload = Overload(inbox.max_age_s)
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"stream {stream.name}", daemon=True)
@@ -155,6 +157,7 @@ class StreamWorker:
 
     def put_packet(self, payload: bytes, received_ns: int, sent_us: int | None = None) -> None:
         """Queue an event packet."""
+        self.stream.activity.arrived_ns = received_ns
         self._inbox.put(Sample(payload, received_ns, is_camera=False, sent_us=sent_us))
 
     def put_camera(self, payload: bytes, received_ns: int) -> None:
@@ -203,6 +206,8 @@ class StreamWorker:
         """Process the oldest samples, or else a step of the standby model."""
         self._cameras.turn()
         if not self._pending:
+            if time.monotonic_ns() - self._taken_ns < _SOON_NS:
+                self._stopping.wait(_GATHER_S)
             pause_s = max(0.0, self._pause_until - time.monotonic())
             self._take(pause_s if self.stream.lanes.has_backlog else _IDLE_BEAT_S)
         if self._pending:
@@ -213,6 +218,7 @@ class StreamWorker:
 
     def _take(self, timeout_s: float) -> None:
         samples, dropped = self._inbox.take_all(timeout_s)
+        self._taken_ns = time.monotonic_ns()
         self._pending.extend(samples)
         if dropped:
             self.stream.overloaded(dropped)

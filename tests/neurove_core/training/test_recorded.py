@@ -1,5 +1,7 @@
 """Training on recordings: windows as in the service, unknown truth, and errors."""
 
+import os
+
 import numpy as np
 import pytest
 import torch
@@ -68,6 +70,17 @@ def test_a_recording_is_split_again_only_after_a_change(ours, tmp_path):
     copy = tmp_path / "drive.mcap"
     write_mcap(open_source(SOURCE.replace("seed=3", "seed=4")), copy)
     assert RecordedSequences(tmp_path, learning_from(str(copy))).missing() == 1
+
+
+def test_a_recording_of_equal_size_and_time_is_another_recording(ecd, tmp_path):
+    config = learning_from({"source": str(ecd), "height_m": 1.0})
+    assert list(RecordedSequences(tmp_path / "cache", config).fill())
+    events = ecd / "events.txt"
+    before, content = events.stat(), events.read_text()
+    events.write_text(content[:-2] + ("0" if content[-2] == "1" else "1") + "\n")  # the polarity of the last event
+    os.utime(events, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert (events.stat().st_size, events.stat().st_mtime_ns) == (before.st_size, before.st_mtime_ns)
+    assert RecordedSequences(tmp_path / "cache", config).missing() == 1
 
 
 def test_sequences_simulated_before_there_were_recordings_stay_valid(tmp_path):

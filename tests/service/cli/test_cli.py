@@ -121,3 +121,10 @@ def test_reproduce_sine_prints_both_tables_and_writes_its_results(run, tmp_path)
     assert "Table II: " in out
     assert {f"wrote {file}" for file in tmp_path.iterdir()} == set(err.splitlines())
     assert json.loads((tmp_path / "sine.json").read_text())[0]["commit"]
+
+
+def test_a_bundle_with_a_seed_below_0_is_refused(run, tmp_path):
+    with pytest.raises(SystemExit) as ended:
+        run("bundle", "new", str(tmp_path / "fresh.safetensors"), "--seed", "-1")
+    assert ended.value.code == 2
+    assert list(tmp_path.iterdir()) == []

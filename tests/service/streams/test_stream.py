@@ -379,3 +379,19 @@ def test_a_camera_info_of_another_size_is_told(stream):
     feed(stream, make_packets(3))
     assert stream.activity.refusal == "the camera info is for 9x9, the stream sends 64x48"
     assert stream.counters.refused_cameras == 1
+
+
+def test_a_missing_packet_that_arrives_seconds_later_is_no_new_clock(stream):
+    packets = make_packets(600)
+    feed(stream, [*packets[:6], *packets[7:], packets[6]])
+    counters = stream.counters
+    assert (counters.recovered_packets, counters.out_of_order_packets, counters.resets) == (1, 1, 0)
+
+
+def test_a_missing_number_with_another_sensor_is_not_counted_into_the_window(stream):
+    packets = make_packets(10)
+    wrong = replace(make_packet(seq=6, t0_us=packets[6].t0_us, sensor=Sensor(640, 480)))
+    feed(stream, [*packets[:6], packets[7], wrong, *packets[8:]])
+    counters = stream.counters
+    assert (counters.recovered_packets, counters.out_of_order_packets, counters.resets) == (1, 1, 0)
+    assert stream.sensor == packets[0].sensor

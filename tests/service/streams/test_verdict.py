@@ -116,3 +116,9 @@ def test_a_counter_stops_at_the_largest_number_that_can_be_sent(activity):
     for _ in range(3):
         activity.lost("gap_packets", (1 << 63) - 2)
     assert activity.counters.losses().gap_packets == (1 << 63) - 1
+
+
+def test_a_stream_whose_packets_wait_is_not_idle(activity, clock):
+    clock.ns += 3 * S
+    activity.arrived_ns = clock.ns
+    assert judge(activity, clock.ns).verdict == "stalled"
