@@ -174,9 +174,7 @@ class Transport:
         def receive(sample: zenoh.Sample) -> None:
             received_ns = time.monotonic_ns()
             try:  # not `guard.at`: this runs for every packet
-                attached = sample.attachment
-                sent_us = _sent_us(attached.to_bytes()) if attached is not None else None
-                on_sample(str(sample.key_expr), sample.payload.to_bytes(), received_ns, sent_us)
+                on_sample(str(sample.key_expr), sample.payload.to_bytes(), received_ns, _sent_us(sample.attachment))
             except Exception as error:  # noqa: BLE001  # one message must not end the subscription
                 self._guard.caught("message", error)
 
@@ -309,8 +307,11 @@ class Transport:
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
 
-def _sent_us(attached: bytes) -> int | None:
-    """The time of sending in an attachment [us]; None if it is another attachment."""
+def _sent_us(attachment: zenoh.ZBytes | None) -> int | None:
+    """The time of sending in an attachment [us]; None if there is none or it is another attachment."""
+    if attachment is None:
+        return None
+    attached = attachment.to_bytes()
     return int(_SENT.unpack(attached)[0]) if len(attached) == _SENT.size else None
 
 

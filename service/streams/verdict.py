@@ -20,7 +20,7 @@ UNCERTAIN_S = 60.0
 """A stream without a certain estimate for this time is uncertain."""
 
 HOLD_S = 1.0
-"""The worst verdict of this time is told, so that it does not flap."""
+"""The worst verdict of this time is told, so that it does not flap; `idle` itself lasts until a packet comes."""
 
 _SEVERITY: tuple[Verdict, ...] = ("idle", "ok", "uncertain", "lossy", "unstable", "stalled")
 
@@ -49,6 +49,8 @@ class Verdicts:
         judgement = judge(self._activity, now_ns)
         with self._lock:
             held = self._newest
+            if judgement.verdict == "idle":
+                held.clear()
             held.append((now_ns, judgement))
             while now_ns - held[0][0] > HOLD_S * 1e9:
                 held.popleft()

@@ -132,6 +132,7 @@ def test_an_expected_stream_that_never_came_or_has_died_is_named(make, guard):
     dead = next(stream for stream in registry.streams() if stream.name == "cam1")
     wait_until(lambda: dead.counters.packets_received == 3)
     dead.activity.last_packet_ns -= 2 * IDLE_NS
+    dead.activity.arrived_ns = dead.activity.last_packet_ns
     assert watch.condition().missing_streams == ("cam1", "cam2")
     ok, why = node_verdict(watch.statuses(), watch.condition().reasons())
     assert not ok

@@ -84,18 +84,26 @@ def test_a_refused_camera_info_is_told(activity, clock):
     assert judge(activity, clock.ns) == ("lossy", f"camera info refused: {activity.refusal}")
 
 
+def test_a_camera_that_stops_is_idle_after_a_second_and_flows_at_the_next_packet(activity, clock):
+    verdicts = Verdicts(activity)
+    flows(activity, clock, 1)
+    assert verdicts.at(clock.ns).verdict == "ok"
+    assert verdicts.at(clock.ns + S * 11 // 10).verdict == "idle"
+    clock.ns += 2 * S
+    activity.heard(clock.ns)
+    assert verdicts.at(clock.ns).verdict == "ok"
+
+
 def test_the_verdict_does_not_flap(activity, clock):
     verdicts = Verdicts(activity)
     told = []
-    for turn in range(100):  # ten times a second the stream is idle, then lossy
-        if turn % 2:
-            activity.lost("gap_packets", 1)
-            activity.heard(clock.ns)
-        else:
-            activity.last_packet_ns = clock.ns - 2 * S
+    for turn in range(100):  # ten times a second the stream is unstable, then in order
+        activity.heard(clock.ns)
+        activity.last_estimate_ns = clock.ns
+        activity.newest_ns = {} if turn % 2 else {"uncounted_packets": clock.ns}
         told.append(verdicts.at(clock.ns).verdict)
         clock.ns += S // 20
-    assert set(told[1:]) == {"lossy"}
+    assert set(told) == {"unstable"}
 
 
 def test_a_worse_verdict_is_told_at_once_and_a_better_one_after_the_hold(activity, clock):
