@@ -15,8 +15,9 @@ from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.faults import Faults
 from neurove_core.io.format import Format
 from neurove_core.io.order import Where
-from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Imu, refuse_topic
+from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, refuse_topic
 from neurove_protocol.events import Events, Sensor
+from neurove_protocol.imu import Imu
 
 MAX_HEADER_BYTES = 4 << 20  # jAER writes all its preferences there, about 200,000 bytes
 PAIR = np.dtype([("address", ">u4"), ("t", ">u4")])

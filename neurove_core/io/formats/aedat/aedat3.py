@@ -29,8 +29,9 @@ from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSour
 from neurove_core.io.faults import Faults, Reason, Tally
 from neurove_core.io.format import Format
 from neurove_core.io.order import Where
-from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Imu, Triggers
+from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Triggers
 from neurove_protocol.events import Events, Sensor
+from neurove_protocol.imu import Imu
 
 MAX_HEADER_BYTES: Final = 4 << 20
 MAX_PACKET_BYTES: Final = 64 << 20

@@ -15,9 +15,10 @@ from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSour
 from neurove_core.io.faults import Faults, Reason, Tally
 from neurove_core.io.format import Format
 from neurove_core.io.formats.aedat.flatbuffer import MAX_PACKET_BYTES, BadPacket, events_of, frame_of, tables_of
-from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Frame, Imu, Triggers
+from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Frame, Triggers
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
+from neurove_protocol.imu import Imu
 
 _MAGIC = b"#!AER-DAT4.0\r\n"
 MAX_HEADER_BYTES = 16 << 20  # a header has about 3,000 bytes

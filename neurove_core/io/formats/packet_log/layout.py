@@ -27,8 +27,9 @@ import msgpack
 import numpy as np
 
 from neurove_core.geometry.motion import Poses, Twists
-from neurove_core.io.recording import Frame, Imu, Triggers
+from neurove_core.io.recording import Frame, Triggers
 from neurove_protocol import camera, events, velocity
+from neurove_protocol.imu import Imu
 
 PROFILE: Final = "neurove"
 VERSION: Final = 1

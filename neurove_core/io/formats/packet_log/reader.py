@@ -16,10 +16,11 @@ from neurove_core.io.format import Format
 from neurove_core.io.formats.containers.mcap import McapFile, Record
 from neurove_core.io.formats.packet_log import layout
 from neurove_core.io.formats.packet_log.layout import PROFILE, BadColumns
-from neurove_core.io.recording import EventsOnly, Frame, Imu, Triggers, later
+from neurove_core.io.recording import EventsOnly, Frame, Triggers, later
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.events import EventPacket, Events, PacketLimits, Sensor, decode_packet
+from neurove_protocol.imu import Imu
 
 LIMITS: Final = PacketLimits(max_events=16_000_000, max_side_px=1 << 15)
 """Limits for packets. Each service sets its own wire limits, and a recording may come from any service."""

@@ -32,11 +32,12 @@ from neurove_core.io.formats.ros import messages
 from neurove_core.io.formats.ros.events import PROPHESEE, UNIX_TIME, Anchor, Decoder
 from neurove_core.io.formats.ros.messages import BadMessage, EventMessage
 from neurove_core.io.order import Where
-from neurove_core.io.recording import EventsOnly, Imu, Triggers, later
+from neurove_core.io.recording import EventsOnly, Triggers, later
 from neurove_core.io.spool import plain_file
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
+from neurove_protocol.imu import Imu
 
 DVS_TYPES: Final = ("dvs_msgs/EventArray", "prophesee_event_msgs/EventArray")
 """Types with one layout: github.com/uzh-rpg/rpg_dvs_ros and github.com/prophesee-ai/prophesee_ros_wrapper."""
