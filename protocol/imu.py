@@ -43,7 +43,7 @@ class Imu(NamedTuple):
 
     def span(self, first: int, stop: int) -> Self:
         """Samples [first, stop), as views."""
-        return type(self)(*(column[first:stop] for column in self))
+        return type(self)(self.t[first:stop], self.accel_m_s2[first:stop], self.gyro_rad_s[first:stop])
 
     @classmethod
     def empty(cls) -> Self:
