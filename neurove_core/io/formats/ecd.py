@@ -131,7 +131,7 @@ class EcdRecording(EventsOnly):
     def imu(self) -> Iterator[Imu]:
         """The samples of imu.txt, `t ax ay az gx gy gz` [s, m/s2, rad/s]; see `Recording`.
 
-        The axes are those of the IMU. On these cameras they match the optical frame to within a few degrees.
+        The driver rpg_dvs_ros has rotated them into the optical frame; the unit is mounted to within a few degrees.
         """
         if "imu" in self.streams:
             tally = self.faults.begin("imu")

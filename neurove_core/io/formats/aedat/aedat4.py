@@ -10,6 +10,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from neurove_core.io.axes import optical_samples
 from neurove_core.io.checked import as_recorded, cleaned, ordered, until_broken
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
 from neurove_core.io.faults import Faults, Reason, Tally
@@ -25,9 +26,6 @@ MAX_HEADER_BYTES = 16 << 20  # a header has about 3,000 bytes
 _PACKET_HEADER = struct.Struct("<ii")  # stream, size of the packet after this header [bytes]
 _PACKET_START = re.compile(rb"\x04\x22\x4d\x18|\x28\xb5\x2f\xfd|(?<=.{8})(?:EVTS|IMUS|TRIG|FRME)", re.DOTALL)
 """First bytes of compressed content, or the identifier at byte 8 of uncompressed content."""
-
-G_M_S2 = 9.80665
-"""Standard gravity: DV writes accelerations in this unit."""
 
 EXTERNAL, GENERATOR, READOUT, EXPOSURE = range(4)
 """Channels of the triggers: the camera's input, its generator, and the readout and exposure of a frame."""
@@ -132,10 +130,7 @@ class Aedat4Recording(EventsOnly):
         return cleaned(self._decoded("events", _events_of, tally), self.sensor, tally)
 
     def imu(self) -> Iterator[Imu]:
-        """All samples; see `Recording`. The axes are those of the unit, because the file does not give its mounting.
-
-        DV writes deg/s and g. A stationary, upright DAVIS346 measures about -9.8 m/s2 in y, as in the optical frame.
-        """
+        """All samples in the optical frame; see `Recording` and `axes.OPTICAL`. DV writes deg/s and g."""
         tally = self.faults.begin("imu")
         return ordered(self._decoded("imu", _imu_of, tally), tally)
 
@@ -202,7 +197,7 @@ def _events_of(packet: bytes) -> Events:
 def _imu_of(packet: bytes) -> Imu:
     t, *numbers = tables_of(packet, b"IMUS", (_T, *_UNITS))
     values = np.stack(numbers, -1).astype(np.float64)
-    return Imu(t, values[:, :3] * G_M_S2, np.radians(values[:, 3:]))
+    return optical_samples(t, values[:, :3], values[:, 3:])
 
 
 def _triggers_of(packet: bytes) -> Triggers:
