@@ -213,7 +213,7 @@ class RosbagRecording(EventsOnly):
     def imu(self) -> Iterator[Imu]:
         """The samples of the sensor_msgs/Imu topic nearest by name.
 
-        The driver rpg_dvs_ros (dvs_msgs) gives the optical frame, and samples of libcaer_driver are rotated into it, see
+        The driver rpg_dvs_ros (dvs_msgs) gives the optical frame. Samples of libcaer_driver are rotated into it, see
         `axes.OPTICAL`. Samples of any other driver are in the frame of the IMU, because bags rarely give its mounting.
         """
         topic = self._nearest_topic(IMU_TYPE)
