@@ -28,6 +28,7 @@ from pydantic_settings import (
 )
 
 from neurove_core.files import read_toml
+from neurove_core.models.bounds import UNCERTAIN_M_S, UNCERTAIN_RAD_S
 from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.events import MAX_PACKET_BYTES, PacketLimits
 from neurove_protocol.fields import WrongField
@@ -185,6 +186,17 @@ class ServiceConfig(_Settings):
     )
     probation_divergence: float = Field(
         3.0, gt=0, description="The same on probation; beyond it the node rolls back automatically."
+    )
+    uncertain_m_s: float | None = Field(
+        None,
+        gt=0,
+        description="Estimates with a smaller linear sigma are never uncertain; default: the model's bound, or "
+        f"{UNCERTAIN_M_S} [m/s].",
+    )
+    uncertain_rad_s: float | None = Field(
+        None,
+        gt=0,
+        description=f"The same for the angular sigma; default: the model's bound, or {UNCERTAIN_RAD_S} [rad/s].",
     )
 
     @model_validator(mode="before")
