@@ -25,6 +25,7 @@ from neurove_core.networks.runner import Runner
 from neurove_protocol import CameraInfo, Events, Sensor
 from neurove_protocol.errors import BadModel
 from neurove_protocol.events import EventPacket, PacketLimits, WireEvents, encode_packet
+from neurove_protocol.velocity import Source
 
 _STREAM = "cam0"
 
@@ -55,6 +56,7 @@ class WindowEstimate(NamedTuple):
     saturated: bool
     covariance: NDArray[np.float64] | None = None  # (6, 6) of each of these twists, from the bundle's calibration
     uncertain: bool = False  # the linear part's sigma over its speed exceeds the bundle's bound
+    source: Source = "network"  # of the angular part
 
 
 class PushResult(NamedTuple):
