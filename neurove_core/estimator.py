@@ -26,6 +26,7 @@ from neurove_core.networks.runner import Runner
 from neurove_protocol import CameraInfo, Events, Sensor
 from neurove_protocol.errors import BadModel
 from neurove_protocol.events import EventPacket, PacketLimits, WireEvents, encode_packet
+from neurove_protocol.velocity import Source
 
 _STREAM = "cam0"
 
@@ -56,6 +57,7 @@ class WindowEstimate(NamedTuple):
     saturated: bool
     covariance: NDArray[np.float64] | None = None  # (6, 6) of each of these twists, from the bundle's calibration
     uncertain: bool = False  # the linear or the angular sigma exceeds both its bounds, see Uncertainty.is_uncertain
+    source: Source = "network"  # of the angular part
 
 
 class PushResult(NamedTuple):

@@ -158,6 +158,7 @@ def _table(report: dict[str, Any]) -> Iterator[str]:
     rate = report["firing_rate"]
     fires = "no spikes" if rate is None else f"firing rate {rate:.3f}"
     yield f"{fires}; a window takes {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"
+    yield "angular part: " + ", ".join(f"{name} {share:.0%}" for name, share in report["source_share"].items())
     if not report["scaled"]:
         yield "linear part: assumes a camera 1 m above the ground, because the recording does not give its height"
 
