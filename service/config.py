@@ -28,7 +28,6 @@ from pydantic_settings import (
 )
 
 from neurove_core.files import read_toml
-from neurove_core.models.bounds import UNCERTAIN_M_S, UNCERTAIN_RAD_S
 from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.events import MAX_PACKET_BYTES, PacketLimits
 from neurove_protocol.fields import WrongField
@@ -190,13 +189,10 @@ class ServiceConfig(_Settings):
     uncertain_m_s: float | None = Field(
         None,
         gt=0,
-        description="Estimates with a smaller linear sigma are never uncertain; default: the model's bound, or "
-        f"{UNCERTAIN_M_S} [m/s].",
+        description="A linear sigma below this is never uncertain; without it the model's bound, or 0.2 [m/s].",
     )
     uncertain_rad_s: float | None = Field(
-        None,
-        gt=0,
-        description=f"The same for the angular sigma; default: the model's bound, or {UNCERTAIN_RAD_S} [rad/s].",
+        None, gt=0, description="The same for the angular sigma; without it the model's bound, or 0.1 [rad/s]."
     )
 
     @model_validator(mode="before")
