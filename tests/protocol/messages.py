@@ -146,6 +146,7 @@ EXAMPLES: dict[str, Fields] = {
         "trace": {"received_ns": 1_000, "queued_ns": 2_000, "computed_ns": 3_000, "published_ns": 4_000},
         "node": "rover-1",
         "host": {"end_ns": 1_700_000_000_000_000_000, "uncertainty_ns": 200_000, "age_ns": 4_000_000},
+        "source": "refined",
     },
     "StreamStatus": STATUS,
     "HealthRequest": {"v": 1},
@@ -378,6 +379,7 @@ def estimates(draw: st.DrawFn) -> Fields:
         "trace": draw(st.fixed_dictionaries(dict.fromkeys(EXAMPLES["TwistEstimate"]["trace"], int64s))),
         "node": draw(st.none() | names),
         "host": draw(st.none() | st.fixed_dictionaries({"end_ns": int64s, "uncertainty_ns": counts, "age_ns": counts})),
+        "source": draw(st.sampled_from(["network", "refined", "gyro"])),
     }
 
 
