@@ -76,8 +76,8 @@ def run(estimator: Estimator, folder: Path) -> Iterator[dict[str, Any]]:
         folder: holds the recordings.
 
     Yields:
-        one row per check: recording, what, truth, asked, value, met, made_of, skipped. `skipped` is the reason why a check was
-        not run, and then value and met are None.
+        one row per check: recording, what, truth, asked, value, met, made_of, skipped. `skipped` is the reason why a
+        check was not run, and then value and met are None.
     """
     for check in CHECKS:
         row: dict[str, Any] = {name: getattr(check, name) for name in ("recording", "what", "truth", "asked")}
