@@ -305,8 +305,8 @@ def _check(
     return Check(recording, what, truth, *span, partial(measure, recording))
 
 
-_UNIT, _SHAPES = "the pan-tilt unit", "the gyro, less its bias at rest"
-_REST: Final = "the camera is at rest"
+_UNIT, _SHAPES = "the pan-tilt unit", "the gyro, less its bias"
+_REST: Final = "a stationary camera"
 
 CHECKS: Final = (
     _check("evbench/seq_0001_e.mat", "rotation about x over its truth", _UNIT, (0.7, 1.3), _pitch),
