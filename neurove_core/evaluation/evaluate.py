@@ -1,6 +1,7 @@
 """Run a model on a recording as the service does, packet by packet, and compare its estimates with the truth."""
 
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -18,7 +19,7 @@ from neurove_core.models.uncertainty import LEVEL, LEVELS, coverage
 from neurove_core.networks.kinds import State, fired
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import NeuroVEError
-from neurove_protocol.velocity import AXES
+from neurove_protocol.velocity import AXES, Source
 
 _SAMPLES = 4  # samples of the truth per bin; the bin has their mean
 _STREAM = "evaluate"
@@ -49,6 +50,7 @@ class Estimates:
         None  # (W, 6) of the twists of each window; None if the model has no uncertainty
     )
     uncertain: NDArray[np.bool_] | None = None  # (W,) windows flagged as uncertain
+    sources: tuple[Source, ...] = ()  # (W,) origin of the angular part of each window
 
 
 @dataclass(frozen=True)
@@ -110,6 +112,7 @@ def estimate_recording(
         scaled=camera is not None and camera.height_m is not None,
         sigma=_sigmas(found),
         uncertain=None if _sigmas(found) is None else np.array([one.uncertain for one in found], np.bool_),
+        sources=tuple(one.source for one in found),
     )
 
 
@@ -189,12 +192,19 @@ def report(evaluations: list[Evaluation]) -> dict[str, Any]:
         "zero": figures(truth, np.zeros_like(truth), bins),
         "mean": figures(truth, np.broadcast_to(truth.mean(0), truth.shape), bins),
         "uncertainty": reliability(evaluations),
+        "source_share": _source_share(evaluations),
         "recordings": [
             {"name": one.estimates.name} | figures(one.truth, one.estimate, bins) | {"uncertainty": reliability([one])}
             for one in evaluations
         ],
     }
     return found | {"judgement": judgement(found)}
+
+
+def _source_share(evaluations: list[Evaluation]) -> dict[str, float]:
+    """Share of the windows by the origin of their angular part."""
+    found = Counter(source for one in evaluations for source in one.estimates.sources)
+    return {source: count / found.total() for source, count in sorted(found.items())}
 
 
 def reliability(evaluations: list[Evaluation]) -> dict[str, Any] | None:

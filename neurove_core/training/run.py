@@ -253,9 +253,7 @@ def wider_input(weight: Tensor, had: ModelConfig, wanted: ModelConfig) -> Tensor
     Returns:
         (C', C, 3, 3), C that of `wanted.input_shape`.
     """
-    own, further = weight.split([had.window_shape[0], had.input_shape[0] - had.window_shape[0]], dim=1)
-    times = wanted.canonical.parts // had.canonical.parts
-    found = torch.cat([part.repeat_interleave(times, dim=1) for part in (own, further)], dim=1)
+    found = weight.repeat_interleave(wanted.canonical.parts // had.canonical.parts, dim=1)
     missing = wanted.input_shape[0] - found.shape[1]
     return torch.cat([found, found.new_zeros(len(found), missing, *found.shape[2:])], dim=1)
 

@@ -134,6 +134,17 @@ def metres(text: str) -> float:
     return value
 
 
+def sigma(text: str) -> float:
+    """A standard deviation above 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r}: give a finite number above 0")
+    return value
+
+
 def sensor_size(text: str) -> Sensor:
     """A sensor size from the text WIDTHxHEIGHT."""
     width, _, height = text.partition("x")
@@ -195,6 +206,11 @@ def refuse_existing(what: str, field: str, path: Path, source: str | None, *, fo
         raise InvalidField(what, field, str(path), "it is the input recording")
     if not force:
         raise InvalidField(what, field, str(path), "the file exists; --force replaces it")
+
+
+def add_force(parser: argparse.ArgumentParser, name: str) -> None:
+    """Add --force, which lets a command replace the file that it writes."""
+    parser.add_argument("--force", action="store_true", help=f"replace {name} if it exists")
 
 
 def check_folder(what: str, field: str, path: Path) -> None:

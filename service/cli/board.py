@@ -390,5 +390,5 @@ def _footer(received: Received, status: StreamStatus | None, now: float) -> Text
         causes = ", ".join(f"{key} {value}" for key, value in lost.items()) or "nothing"
         text.append(f"\nlost: {causes}", style="yellow" if lost else "dim")
     if received.last is not None:
-        text.append(f"\nflags: {', '.join(received.last.flags) or 'none'}")
+        text.append(f"\nflags: {', '.join(received.last.flags) or 'none'}; angular part: {received.last.source}")
     return text

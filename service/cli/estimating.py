@@ -14,6 +14,7 @@ from neurove_protocol import CameraInfo, EventPacket, TwistEstimate
 from neurove_protocol.errors import EXIT_FAILURE, InvalidField, NeuroVEError
 from neurove_service import logs
 from neurove_service.cli.arguments import (
+    add_force,
     add_lens_flags,
     add_recording_flags,
     command,
@@ -187,13 +188,14 @@ class _Told:
         self._bundle, self._recording = estimator.bundle, recording
         self.estimates = 0
         self._begin_us = self._end_us = 0
-        self._flags = Counter[str]()
+        self._flags, self._sources = Counter[str](), Counter[str]()
 
     def add(self, one: TwistEstimate) -> None:
         self._begin_us = one.start_us if not self.estimates else self._begin_us
         self._end_us = one.end_us
         self.estimates += 1
         self._flags.update(one.flags)
+        self._sources[one.source] += 1
 
     def summary(self, path: Path, offline: Offline) -> dict[str, Any]:
         return {
@@ -207,6 +209,7 @@ class _Told:
             "model": self._bundle.name,
             "digest": self._bundle.digest,
             "flags": dict(self._flags),
+            "sources": dict(self._sources),
             "lost": offline.stream.counters.losses().nonzero(),
             "faults": [fault.as_json() for fault in self._recording.faults.found],
         }
@@ -222,6 +225,8 @@ def _lines(summary: dict[str, Any]) -> Iterator[str]:
     yield f"{summary['file']}: {estimates:,} estimates of {summary['recording']} by {model}, {span_s:,.3f} s"
     flags = [f"{name} {count / estimates:.0%}" for name, count in sorted(summary["flags"].items())]
     yield f"flags: {', '.join(flags) or 'none'}"
+    sources = [f"{name} {count / estimates:.0%}" for name, count in sorted(summary["sources"].items())]
+    yield f"angular part: {', '.join(sources)}"
     if summary["lost"]:
         yield "not used: " + ", ".join(f"{count:,} {name.replace('_', ' ')}" for name, count in summary["lost"].items())
     if "unscaled" in summary["flags"]:
@@ -239,4 +244,4 @@ def add_estimate(parser: argparse.ArgumentParser) -> None:
     add_lens_flags(parser)
     add_recording_flags(parser)
     parser.add_argument("--seconds", type=duration, metavar="S", help="seconds of the recording to read; default: all")
-    parser.add_argument("--force", action="store_true", help="replace FILE if it exists")
+    add_force(parser, "FILE")
