@@ -16,6 +16,7 @@ from neurove_protocol.errors import EXIT_FAILURE, InvalidField, NeuroVEError
 from neurove_protocol.imu import decode_imu, encode_imu
 from neurove_service import logs
 from neurove_service.cli.arguments import (
+    add_force,
     add_lens_flags,
     add_recording_flags,
     command,
@@ -266,4 +267,4 @@ def add_estimate(parser: argparse.ArgumentParser) -> None:
     add_recording_flags(parser)
     parser.add_argument("--no-imu", action="store_true", help="use the events alone, not the inertial samples")
     parser.add_argument("--seconds", type=duration, metavar="S", help="seconds of the recording to read; default: all")
-    parser.add_argument("--force", action="store_true", help="replace FILE if it exists")
+    add_force(parser, "FILE")
