@@ -7,7 +7,7 @@ def imu_text(unit: ImuStatus) -> str:
     """The inertial unit of a stream in one sentence: its problem, or its rate, bias and offset."""
     if unit.problem:
         cure = "; the estimates use the events alone" if not unit.used else ""
-        word = "gyroscope disagrees with the events" if unit.disagrees else "inertial unit"
+        word = "gyroscope disagrees with the events" if unit.disagrees and unit.rate_hz else "inertial unit"
         return f"{word}: {unit.problem}{cure}"
     bias = "not known before the first rest"
     if unit.bias_rad_s is not None:
