@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from neurove_core.engine.runner import runner_of
 from neurove_core.geometry.tables import TABLES
 from neurove_core.ingest import windows
+from neurove_core.ingest.channels import Recent, remembered, with_history
 from neurove_core.ingest.windows import Pushed, Window, WindowsState
 from neurove_core.ingest.wire import read_packet
 from neurove_core.io.packets import slices
@@ -42,6 +43,7 @@ class StreamState(NamedTuple):
     age: int  # windows since the network state began
     end_us: int | None = None  # end of the newest window that the network has processed
     low_activity_below: float = 0.0  # a window with fewer visible events is flagged low_activity
+    recent: Recent = ()  # counts of earlier windows, for models with a history
 
 
 class WindowEstimate(NamedTuple):
@@ -198,7 +200,7 @@ class Estimator:
             due = [stream for stream in streams if turn < len(stream.windows)]
             for stream in due:
                 self._reset_after_gap(stream, stream.windows[turn])
-            counts = [stream.windows[turn].counts for stream in due]
+            counts = [with_history(stream.windows[turn].counts, stream.state.recent, self.config) for stream in due]
             steps = self._runner.run(counts, [stream.state.network for stream in due])
             for stream, (twists, network) in zip(due, steps, strict=True):
                 self._take(stream, stream.windows[turn], twists * self._scale + self._offset, network)
@@ -206,13 +208,14 @@ class Estimator:
     def _reset_after_gap(self, stream: _Progress, window: Window) -> None:
         """Reset the network state where a window does not follow the one before it."""
         if stream.state.end_us not in (None, window.start_us) and not window.bridged:
-            stream.state = stream.state._replace(network=self.network.initial_state(), age=0)
+            stream.state = stream.state._replace(network=self.network.initial_state(), age=0, recent=())
 
     def _take(self, stream: _Progress, window: Window, twists: NDArray[np.float64], network: State) -> None:
         state = stream.state
         stream.estimates.append(self._estimate(window, twists, network, state))
         end_us = window.start_us + self.config.window.duration_us
-        stream.state = state._replace(network=network, age=state.age + 1, end_us=end_us)
+        recent = remembered(window.counts, state.recent, self.config)
+        stream.state = state._replace(network=network, age=state.age + 1, end_us=end_us, recent=recent)
 
     def warm_up(self) -> None:
         """Compile all code and run all parts, so that the first packet does not wait for it.

@@ -57,6 +57,7 @@ MAY_IMPORT = {
     "neurove_service.logs": "output log_writer",
     "neurove_service.lifecycle": "",
     "neurove_service.latency": "",
+    "neurove_service.clock_offset": "",
     "neurove_service.limits": "",
     "neurove_service.endpoints": "",
     "neurove_service.config": "core:files endpoints",
@@ -65,13 +66,13 @@ MAY_IMPORT = {
     "neurove_service.transport": "logs guard desk",
     "neurove_service.streams": (
         "core:config core:geometry core:ingest core:networks core:models core:estimator "
-        "core:inertial core:aided logs guard"
+        "core:inertial core:aided logs guard clock_offset"
     ),
     "neurove_service.models": (
         "core:config core:files core:ingest core:networks core:models core:estimator core:self_test logs guard streams"
     ),
     "neurove_service.clients": (
-        "core:config core:geometry core:ingest core:io core:io.formats core:bench logs config transport"
+        "core:config core:geometry core:ingest core:io core:io.formats core:bench logs config transport clock_offset"
     ),
     "neurove_service.node": (
         "core:files core:geometry core:models logs guard lifecycle latency config transport streams models"

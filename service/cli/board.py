@@ -114,7 +114,7 @@ class Received:
 
     @property
     def late_s(self) -> float | None:
-        """Age of the newest estimate when it was published [s], if it was older than two windows."""
+        """Age of the newest estimate when it arrived [s], if it was older than two windows."""
         if self.last is None or self.last.host is None:
             return None
         age_s = self.last.host.age_ns / 1e9
@@ -386,7 +386,7 @@ def _footer(received: Received, status: StreamStatus | None, now: float) -> Text
     elif numbers is not None:
         text.append(f"{received.rate_hz:.1f} estimates/s, latency p50 {numbers.p50:.1f} ms p99 {numbers.p99:.1f} ms")
     if received.late_s is not None:
-        text.append(f", {received.late_s:.1f} s old when published", style="yellow")
+        text.append(f", {received.late_s:.1f} s old on arrival", style="yellow")
     if status is not None:
         text.append(f", {status.packets_received:,} packets, {status.events_received:,} events")
         lost = status.lost.nonzero()

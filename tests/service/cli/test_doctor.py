@@ -4,10 +4,10 @@ import json
 
 import pytest
 
-from neurove_protocol import Flag
+from neurove_protocol import Flag, TwistEstimate
 from neurove_protocol.control import StreamStatus
 from neurove_service.cli import doctor, extras, installation
-from tests.protocol.messages import STATUS
+from tests.protocol.messages import EXAMPLES, STATUS
 
 NOWHERE = "tcp/127.0.0.1:9"
 
@@ -75,6 +75,22 @@ def test_an_extra_that_is_not_installed_is_named_with_its_modules(monkeypatch):
     monkeypatch.setitem(extras.EXTRAS, "carla", ("no_such_module",))
     found = {check.what: check for check in installation.check_extras()}["extra carla"]
     assert (found.level, found.state) == ("info", "not installed: no_such_module")
+
+
+@pytest.mark.parametrize(
+    ("flags", "state", "level"),
+    [
+        (("unscaled",), "unknown to the service, which assumes 1 m", "bad"),
+        (("uncalibrated", "unscaled"), "unknown to the service, which assumes 1 m", "bad"),
+        (("gap",), "known", "ok"),
+        (None, "unknown: no estimate within 2 s", "info"),
+    ],
+)
+def test_the_height_of_a_stream_is_known_by_the_flags_of_its_newest_estimate(flags, state, level):
+    estimate = None if flags is None else TwistEstimate.model_validate(EXAMPLES["TwistEstimate"] | {"flags": flags})
+    found = {check.what: check for check in doctor.check_stream(status(), estimate)}["stream cam0: height"]
+    assert (found.state, found.level) == (state, level)
+    assert ("--height M" in found.advice) == (level == "bad")
 
 
 def status(**changes):
