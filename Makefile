@@ -1,19 +1,21 @@
 # Two commands do all the set-up: `make run` (the main job) and `make test` (everything that must hold).
 # PYTHON: 3.11 or newer. TORCH_ARGS: extra pip arguments for torch, such as the index of PyTorch's CPU builds.
-# JOBS: processes that test side by side.
+# HASHES: the packages with the hashes of their files. Empty (make HASHES= ...) installs by version only, for an index
+# whose files are not those of hashes.txt. JOBS: processes that test side by side.
 PYTHON ?= python3
 VENV ?= .venv
 TORCH_ARGS ?=
+HASHES ?= hashes.txt
 JOBS ?= 2
 BIN := $(VENV)/bin
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt
+PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 
 .PHONY: run test format picture clean
 
 run: $(VENV)/installed
 	@$(BIN)/neurove demo
 
-test: $(VENV)/installed-dev
+test: $(VENV)/installed $(VENV)/packages
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	MYPYPATH=$(VENV)/packages $(BIN)/mypy
@@ -21,9 +23,9 @@ test: $(VENV)/installed-dev
 	$(BIN)/pytest --numprocesses $(JOBS) --dist loadgroup --no-loadscope-reorder --cov --cov-report=term
 
 picture: $(VENV)/installed  # the picture in README, of a simulated street with its truth
-	@$(BIN)/neurove demo "sim://street?seed=7&seconds=8" --screenshot service/pictures/demo.svg
+	@$(BIN)/neurove demo "sim://street?seed=7&seconds=8" --force --screenshot service/pictures/demo.svg
 
-format: $(VENV)/installed-dev
+format: $(VENV)/installed
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
@@ -35,7 +37,6 @@ $(VENV)/python:
 		|| { echo "make: $(PYTHON) is $$($(PYTHON) --version 2>&1): Python 3.11 or newer is needed, set PYTHON=..."; exit 1; }
 	@echo "setting up $(VENV): some minutes the first time"
 	@$(PYTHON) -m venv $(VENV)
-	@$(PIP) $(TORCH_ARGS) torch
 	@touch $@
 
 # Type checkers do not follow the mapping of folders to packages in pyproject.toml; these links show it to them.
@@ -45,10 +46,16 @@ $(VENV)/packages: $(VENV)/python
 	@ln -sfn $(CURDIR)/neurove_core $@/neurove_core
 	@ln -sfn $(CURDIR)/service $@/neurove_service
 
-$(VENV)/installed: $(VENV)/python pyproject.toml constraints.txt
-	@$(PIP) -e '.[serve,recordings,experiments]'
-	@touch $@
-
-$(VENV)/installed-dev: $(VENV)/installed $(VENV)/packages
-	@$(PIP) -e '.[dev]'
+# Three steps, because one hash makes pip ask for a hash of every package of the same call: the pinned packages with
+# hashes, torch by version (its builds for CPU and GPU differ under one version), and NeuroVE.
+$(VENV)/installed: $(VENV)/python pyproject.toml constraints.txt hashes.txt
+ifneq ($(HASHES),)
+	@$(PIP) install --require-hashes --no-deps -r $(HASHES)
+	@$(PIP) install -c constraints.txt $(TORCH_ARGS) torch
+	@$(PIP) install --no-deps --no-build-isolation -e .
+else
+	@$(PIP) install -c constraints.txt $(TORCH_ARGS) torch
+	@$(PIP) install -c constraints.txt -e '.[dev]'
+endif
+	@$(PIP) check
 	@touch $@

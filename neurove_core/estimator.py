@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 from neurove_core.engine.runner import runner_of
 from neurove_core.geometry.tables import TABLES
 from neurove_core.ingest import windows
+from neurove_core.ingest.channels import Recent, remembered, with_history
 from neurove_core.ingest.windows import Pushed, Window, WindowsState
 from neurove_core.ingest.wire import read_packet
 from neurove_core.io.packets import slices
 from neurove_core.io.recording import Recording
+from neurove_core.models.bounds import UNSET, Bounds
 from neurove_core.models.bundle import PER_HEIGHT, Bundle, LinearUnit
 from neurove_core.networks.kinds import State
 from neurove_core.networks.neurove import NetworkState, NeuroVE
@@ -25,6 +27,7 @@ from neurove_core.networks.runner import Runner
 from neurove_protocol import CameraInfo, Events, Sensor
 from neurove_protocol.errors import BadModel
 from neurove_protocol.events import EventPacket, PacketLimits, WireEvents, encode_packet
+from neurove_protocol.velocity import Source
 
 _STREAM = "cam0"
 
@@ -40,6 +43,7 @@ class StreamState(NamedTuple):
     age: int  # windows since the network state began
     end_us: int | None = None  # end of the newest window that the network has processed
     low_activity_below: float = 0.0  # a window with fewer visible events is flagged low_activity
+    recent: Recent = ()  # counts of earlier windows, for models with a history
 
 
 class WindowEstimate(NamedTuple):
@@ -54,7 +58,9 @@ class WindowEstimate(NamedTuple):
     low_activity: bool
     saturated: bool
     covariance: NDArray[np.float64] | None = None  # (6, 6) of each of these twists, from the bundle's calibration
-    uncertain: bool = False  # the linear part's sigma over its speed exceeds the bundle's bound
+    uncertain: bool = False  # the linear or the angular sigma exceeds both its bounds, see Uncertainty.is_uncertain
+    source: Source = "network"  # of the angular part
+    gyro_disagrees: bool = False  # the events and the gyroscope of the camera disagree
 
 
 class PushResult(NamedTuple):
@@ -91,10 +97,12 @@ class Estimator:
     Args:
         bundle: the model; its network is put into evaluation mode.
         runner: runs the network; by default the fastest one. `PlainRunner(bundle.network)` runs the network itself.
+        bounds: absolute bounds of sigma for `uncertain`; they take precedence over those of the bundle.
     """
 
-    def __init__(self, bundle: Bundle, runner: Runner | None = None) -> None:
+    def __init__(self, bundle: Bundle, runner: Runner | None = None, bounds: Bounds = UNSET) -> None:
         self.bundle = bundle
+        self._bounds = bounds
         self.config = bundle.config
         self.network = bundle.network.eval().requires_grad_(requires_grad=False)
         self._runner: Runner = runner or runner_of(self.network)
@@ -117,7 +125,7 @@ class Estimator:
         return StreamState(sensor, camera, lut, WindowsState(), network, 0, low_activity_below=least)
 
     def estimates(self, recording: Recording, camera: CameraInfo | None = None) -> Iterator[WindowEstimate]:
-        """Estimates of all complete windows of a recording, in order, as the service answers its packets.
+        """Estimates of all complete windows of a recording by its events alone, as the service answers its packets.
 
         Args:
             recording: source of events, see `open_source`.
@@ -171,6 +179,11 @@ class Estimator:
         self._answer([stream])
         return stream.estimates, stream.state
 
+    def is_uncertain(self, twists: NDArray[np.float64], covariance: NDArray[np.float64]) -> bool:
+        """Whether sigma exceeds the bounds, see `Uncertainty.is_uncertain`; False for a model without uncertainty."""
+        unsure = self.bundle.uncertainty
+        return unsure is not None and unsure.is_uncertain(twists, covariance, self._bounds)
+
     def has_same_windows(self, other: "Estimator") -> bool:
         """Whether both models use the same windows and canonical camera, so that one can use the other's windows."""
         return (self.config.window, self.config.canonical) == (other.config.window, other.config.canonical)
@@ -187,7 +200,7 @@ class Estimator:
             due = [stream for stream in streams if turn < len(stream.windows)]
             for stream in due:
                 self._reset_after_gap(stream, stream.windows[turn])
-            counts = [stream.windows[turn].counts for stream in due]
+            counts = [with_history(stream.windows[turn].counts, stream.state.recent, self.config) for stream in due]
             steps = self._runner.run(counts, [stream.state.network for stream in due])
             for stream, (twists, network) in zip(due, steps, strict=True):
                 self._take(stream, stream.windows[turn], twists * self._scale + self._offset, network)
@@ -195,13 +208,14 @@ class Estimator:
     def _reset_after_gap(self, stream: _Progress, window: Window) -> None:
         """Reset the network state where a window does not follow the one before it."""
         if stream.state.end_us not in (None, window.start_us) and not window.bridged:
-            stream.state = stream.state._replace(network=self.network.initial_state(), age=0)
+            stream.state = stream.state._replace(network=self.network.initial_state(), age=0, recent=())
 
     def _take(self, stream: _Progress, window: Window, twists: NDArray[np.float64], network: State) -> None:
         state = stream.state
         stream.estimates.append(self._estimate(window, twists, network, state))
         end_us = window.start_us + self.config.window.duration_us
-        stream.state = state._replace(network=network, age=state.age + 1, end_us=end_us)
+        recent = remembered(window.counts, state.recent, self.config)
+        stream.state = state._replace(network=network, age=state.age + 1, end_us=end_us, recent=recent)
 
     def warm_up(self) -> None:
         """Compile all code and run all parts, so that the first packet does not wait for it.
@@ -252,7 +266,9 @@ class Estimator:
             low_activity=window.events - window.outside < before.low_activity_below,
             saturated=bool(window.counts.max() == 255),
             covariance=covariance,
-            uncertain=covariance is not None and unsure is not None and unsure.is_uncertain(twists, covariance),
+            uncertain=covariance is not None
+            and unsure is not None
+            and unsure.is_uncertain(twists, covariance, self._bounds),
         )
 
 

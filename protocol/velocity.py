@@ -2,7 +2,7 @@
 
 import math
 from enum import StrEnum
-from typing import Annotated, ClassVar, NamedTuple, Self
+from typing import Annotated, ClassVar, Literal, NamedTuple, Self
 
 from pydantic import AfterValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
@@ -15,6 +15,10 @@ SCHEMA = "application/msgpack;neurove.velocity.1"
 
 AXES = ("vx", "vy", "vz", "wx", "wy", "wz")
 """Order of a twist's six numbers: linear [m/s], then angular [rad/s]."""
+
+
+Source = Literal["network", "refined", "gyro"]
+"""Origin of an estimate's angular velocity: the network alone, contrast maximisation of the events, or a gyroscope."""
 
 
 class Flag(StrEnum):
@@ -32,7 +36,8 @@ class Flag(StrEnum):
     LOW_ACTIVITY = "low_activity"  # fewer events than the model needs to see motion
     SATURATED = "saturated"  # the event count of a cell reached its maximum
     FROZEN = "frozen"  # the camera repeats the same events
-    UNCERTAIN = "uncertain"  # sigma of the linear velocity, as a share of the speed, is above the model's bound
+    GYRO_DISAGREES = "gyro_disagrees"  # gyroscope and events turn differently; the gyroscope is not used
+    UNCERTAIN = "uncertain"  # sigma of the linear or the angular part is above its relative and its absolute bound
 
 
 class Twist(NamedTuple):
@@ -113,6 +118,7 @@ class TwistEstimate(Message):
     trace: Trace
     node: Name | None = None  # the node that made the estimate
     host: HostTime | None = None  # None if the driver gives no time to learn from
+    source: Source = "network"  # of the angular part
 
     @model_validator(mode="after")
     def _one_twist_per_bin(self) -> Self:

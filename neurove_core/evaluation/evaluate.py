@@ -1,6 +1,7 @@
 """Run a model on a recording as the service does, packet by packet, and compare its estimates with the truth."""
 
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -8,17 +9,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.estimator import Estimator, WindowEstimate
+from neurove_core.aided import aided
+from neurove_core.estimator import Estimator, PushResult, WindowEstimate
 from neurove_core.evaluation.judgement import judgement
 from neurove_core.evaluation.metrics import ANGULAR_FLOOR_RAD_S, LINEAR_FLOOR_M_S, SKIP_S, figures
 from neurove_core.geometry.motion import Twists
+from neurove_core.inertial.state import InertialState, push
+from neurove_core.io.imu_feed import ImuFeed
 from neurove_core.io.packets import slices
 from neurove_core.io.recording import Recording
 from neurove_core.models.uncertainty import LEVEL, LEVELS, coverage
 from neurove_core.networks.kinds import State, fired
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import NeuroVEError
-from neurove_protocol.velocity import AXES
+from neurove_protocol.velocity import AXES, Source
 
 _SAMPLES = 4  # samples of the truth per bin; the bin has their mean
 _STREAM = "evaluate"
@@ -49,6 +53,7 @@ class Estimates:
         None  # (W, 6) of the twists of each window; None if the model has no uncertainty
     )
     uncertain: NDArray[np.bool_] | None = None  # (W,) windows flagged as uncertain
+    sources: tuple[Source, ...] = ()  # (W,) origin of the angular part of each window
 
 
 @dataclass(frozen=True)
@@ -68,6 +73,8 @@ def estimate_recording(
     recording: Recording,
     camera: CameraInfo | None = None,
     on_events: Callable[[int], None] = lambda _: None,
+    *,
+    inertial: bool = False,
 ) -> Estimates:
     """Run a model on a recording, packet by packet as a driver sends it.
 
@@ -76,6 +83,7 @@ def estimate_recording(
         recording: its input.
         camera: lens of the recording; by default the one that the recording gives.
         on_events: called after each packet with the number of events so far.
+        inertial: use the recording's inertial samples too, as the service does.
 
     Raises:
         InvalidField: the lens belongs to another sensor.
@@ -86,9 +94,14 @@ def estimate_recording(
     latencies_ms: list[float] = []
     firing_rate = _FiringRate()
     events = 0
+    feed, unit = ImuFeed(recording) if inertial and "imu" in recording.streams else None, InertialState()
     for piece in slices(recording.chunks()):
+        if feed is not None:
+            unit, _ = push(unit, feed.until(piece.end_us))
         began = time.perf_counter()
         pushed = estimator.push(piece.events, state, piece.t0_us)
+        if feed is not None:
+            pushed, unit = _aided(estimator, pushed, unit, camera)
         took_ms = (time.perf_counter() - began) * 1e3
         state = pushed.state
         found += pushed.estimates
@@ -110,7 +123,18 @@ def estimate_recording(
         scaled=camera is not None and camera.height_m is not None,
         sigma=_sigmas(found),
         uncertain=None if _sigmas(found) is None else np.array([one.uncertain for one in found], np.bool_),
+        sources=tuple(one.source for one in found),
     )
+
+
+def _aided(
+    estimator: Estimator, pushed: PushResult, unit: InertialState, camera: CameraInfo | None
+) -> tuple[PushResult, InertialState]:
+    found = []
+    for estimate in pushed.estimates:
+        one, unit = aided(estimator, estimate, unit, camera)
+        found.append(one)
+    return pushed._replace(estimates=found), unit
 
 
 def _sigmas(found: list[WindowEstimate]) -> NDArray[np.float64] | None:
@@ -189,12 +213,19 @@ def report(evaluations: list[Evaluation]) -> dict[str, Any]:
         "zero": figures(truth, np.zeros_like(truth), bins),
         "mean": figures(truth, np.broadcast_to(truth.mean(0), truth.shape), bins),
         "uncertainty": reliability(evaluations),
+        "source_share": _source_share(evaluations),
         "recordings": [
             {"name": one.estimates.name} | figures(one.truth, one.estimate, bins) | {"uncertainty": reliability([one])}
             for one in evaluations
         ],
     }
     return found | {"judgement": judgement(found)}
+
+
+def _source_share(evaluations: list[Evaluation]) -> dict[str, float]:
+    """Share of the windows by the origin of their angular part."""
+    found = Counter(source for one in evaluations for source in one.estimates.sources)
+    return {source: count / found.total() for source, count in sorted(found.items())}
 
 
 def reliability(evaluations: list[Evaluation]) -> dict[str, Any] | None:

@@ -61,6 +61,12 @@ def add_lens_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--height", type=metres, metavar="M", help="height of the camera above the ground [m]")
 
 
+def add_axes_flag(parser: argparse.ArgumentParser) -> None:
+    """Add the mounting of the inertial unit, if the recording lacks it."""
+    about = "axes of the inertial unit along x (right), y (down), z (forward) of the camera, such as -x,y,-z; write "
+    parser.add_argument("--imu-axes", metavar="A", help=about + "--imu-axes=A, because of the first dash")
+
+
 def add_playback_flags(parser: argparse.ArgumentParser, seconds_help: str) -> None:
     """Add how fast and how long a source is played."""
     parser.add_argument(
@@ -134,6 +140,17 @@ def metres(text: str) -> float:
     return value
 
 
+def sigma(text: str) -> float:
+    """A standard deviation above 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r}: give a finite number above 0")
+    return value
+
+
 def sensor_size(text: str) -> Sensor:
     """A sensor size from the text WIDTHxHEIGHT."""
     width, _, height = text.partition("x")
@@ -195,6 +212,11 @@ def refuse_existing(what: str, field: str, path: Path, source: str | None, *, fo
         raise InvalidField(what, field, str(path), "it is the input recording")
     if not force:
         raise InvalidField(what, field, str(path), "the file exists; --force replaces it")
+
+
+def add_force(parser: argparse.ArgumentParser, name: str) -> None:
+    """Add --force, which lets a command replace the file that it writes."""
+    parser.add_argument("--force", action="store_true", help=f"replace {name} if it exists")
 
 
 def check_folder(what: str, field: str, path: Path) -> None:

@@ -7,12 +7,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neurove_protocol.errors import InvalidField
 from neurove_service.cli.arguments import (
+    add_force,
     add_lens_flags,
     add_recording_flags,
     check_folder,
     command,
     count,
+    refuse_existing,
+    sigma,
     tell_faults,
 )
 from neurove_service.cli.bars import event_count, progress
@@ -29,12 +33,15 @@ def train(args: argparse.Namespace) -> int:
     import torch
 
     from neurove_core import models
+    from neurove_core.models import bundle
     from neurove_core.training import config as configs
     from neurove_core.training import loop, pipeline
 
     torch.set_num_threads(args.threads)
     config = configs.load(args.config)
     out: Path = args.out or Path("runs") / config.name
+    if not args.resume:
+        _refuse_run(out, (out / loop.CHECKPOINT, out / f"{config.name}{bundle.SUFFIX}"), force=args.force)
     with progress() as show:
         path = pipeline.train(
             config,
@@ -54,21 +61,31 @@ def train(args: argparse.Namespace) -> int:
     return 0
 
 
+def _refuse_run(out: Path, results: tuple[Path, ...], *, force: bool) -> None:
+    """Refuse a folder that holds a run: its checkpoint or its model would be replaced."""
+    if not force and any(path.exists() for path in results):
+        bound = "the folder holds a run; --resume continues it, --force replaces it"
+        raise InvalidField("training", "--out", str(out), bound)
+
+
 def calibrate(args: argparse.Namespace) -> int:
     """Fit the uncertainty of a trained model on new simulated sequences; its estimates stay the same."""
     import torch
 
     from neurove_core import models
     from neurove_core.models import bundle
+    from neurove_core.models.bounds import Bounds
     from neurove_core.training import config as configs
     from neurove_core.training import pipeline
 
     torch.set_num_threads(1)
     config, model = configs.load(args.config), models.find(args.model)
+    bounds = Bounds(args.uncertain_m_s, args.uncertain_rad_s)
     out: Path = args.out or Path(f"{model.name}{bundle.SUFFIX}")
+    refuse_existing("calibrate", "--out", out, None, force=args.force)
     data: Path = args.data or Path("runs") / config.name / "data"
     with progress() as show:
-        report = pipeline.calibrate(model, config, data, out, args.calibration_sequences, args.workers, show)
+        report = pipeline.calibrate(model, config, data, out, args.calibration_sequences, args.workers, show, bounds)
     if args.json:
         print(json.dumps({"bundle": str(out), **report}))
         return 0
@@ -103,7 +120,7 @@ def evaluate(args: argparse.Namespace) -> int:
     evaluated = []
     for (_, recording), truth in zip(sources, truths, strict=True):
         with event_count(recording.name) as show:
-            estimates = evaluation.estimate_recording(estimator, recording, on_events=show)
+            estimates = evaluation.estimate_recording(estimator, recording, on_events=show, inertial=not args.no_imu)
         evaluated.append(evaluation.evaluate(estimates, truth))
         tell_faults(recording)
     report = {"model": estimator.bundle.info.model_dump(), **evaluation.report(evaluated)}
@@ -155,6 +172,7 @@ def _table(report: dict[str, Any]) -> Iterator[str]:
     rate = report["firing_rate"]
     fires = "no spikes" if rate is None else f"firing rate {rate:.3f}"
     yield f"{fires}; a window takes {latency['p50']:.1f} ms, p99 {latency['p99']:.1f} ms"
+    yield "angular part: " + ", ".join(f"{name} {share:.0%}" for name, share in report["source_share"].items())
     if not report["scaled"]:
         yield "linear part: assumes a camera 1 m above the ground, because the recording does not give its height"
 
@@ -185,6 +203,7 @@ def add_train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="DIR", help=about)
     parser.add_argument("--data", type=Path, metavar="DIR", help="folder for the sequences; default OUT/data")
     parser.add_argument("--resume", action="store_true", help="continue from the checkpoint in OUT, if it exists")
+    add_force(parser, "a run in OUT")
     about = "initialise weights from BUNDLE, a file or `default`, instead of randomly"
     parser.add_argument("--start", metavar="BUNDLE", help=about)
     about = "number of devices that share each batch; default 1"
@@ -207,6 +226,11 @@ def add_calibrate(parser: argparse.ArgumentParser) -> None:
     _add_calibration(parser, "")
     _add_workers(parser)
     parser.add_argument("--out", type=Path, metavar="FILE", help="bundle to write; default NAME.safetensors")
+    add_force(parser, "FILE")
+    about = "estimates with a smaller linear sigma are never `uncertain` [m/s]; default: the node decides"
+    parser.add_argument("--uncertain-m-s", type=sigma, metavar="S", help=about)
+    about = "the same for the angular sigma [rad/s]"
+    parser.add_argument("--uncertain-rad-s", type=sigma, metavar="S", help=about)
 
 
 def add_evaluate(parser: argparse.ArgumentParser) -> None:
@@ -219,6 +243,7 @@ def add_evaluate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--truth", type=Path, metavar="FILE", help=about)
     add_recording_flags(parser)
     add_lens_flags(parser)
+    parser.add_argument("--no-imu", action="store_true", help="use the events alone, not the inertial samples")
     parser.add_argument("--plot", type=Path, metavar="DIR", help="draw truth and estimate over time into this folder")
 
 

@@ -4,6 +4,7 @@ import threading
 from collections.abc import Callable
 
 from neurove_core.geometry.tables import TABLES
+from neurove_core.models.bounds import Bounds
 from neurove_core.models.bundle import Bundle
 from neurove_protocol.control import STATUS_SCHEMA, ChunkRequest
 from neurove_protocol.errors import NeuroVEError
@@ -43,6 +44,7 @@ def _rules(config: ServiceConfig) -> Rules:
         prime_s=config.prime_s,
         shadow=TrialLimits(config.shadow_divergence),
         probation=TrialLimits(config.probation_divergence),
+        bounds=Bounds(config.uncertain_m_s, config.uncertain_rad_s),
     )
 
 
@@ -92,6 +94,7 @@ class Service:
             trained_only=bool(config.trusted_keys),
             trial=last.trial if last else None,
             on_trial=self._save_trial,
+            guard=self._guard,
         )
         self._slot.resume()
 
@@ -162,6 +165,7 @@ class Service:
             lambda: not self._stop.is_set() and registry.alive(),
         )
         transport.subscribe_timed(keys.camera(), route(keys, registry, registry.put_camera))
+        transport.subscribe_timed(keys.imu(), route(keys, registry, registry.put_imu))
         transport.subscribe_timed(keys.events(), route(keys, registry, registry.put_packet))
         transport.answer(
             keys.health(node),

@@ -87,6 +87,7 @@ class Answers:
             ),
             node=self._node,
             host=host,
+            source=window.source,
         )
         self._activity.counters.windows += 1
         self._activity.counters.estimates += 1

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import msgpack
+import numpy as np
 from hypothesis import settings
 from hypothesis import strategies as st
 
@@ -29,6 +30,7 @@ from neurove_protocol.control import (
     StreamStatus,
 )
 from neurove_protocol.events import decode_packet, encode_packet
+from neurove_protocol.imu import MAX_ACCEL_M_S2, MAX_GYRO_RAD_S, Imu, ImuPacket, decode_imu, encode_imu
 
 Fields = dict[str, Any]
 Path = tuple[str | int, ...]
@@ -91,6 +93,21 @@ STATUS: Fields = {
     "uncounted_packets": 0,
     "refused_cameras": 1,
     "refusal": "t0_us=-1: must be 0 or more",
+    "imu": {
+        "rate_hz": 1000.5,
+        "samples": 4_000,
+        "lost_packets": 1,
+        "refused_packets": 2,
+        "dropped_packets": 3,
+        "late_samples": 5,
+        "used": False,
+        "resting": False,
+        "bias_rad_s": [0.0625, 0.0, -0.125],
+        "bias_sigma_rad_s": 0.0005,
+        "offset_ms": 3.5,
+        "disagrees": True,
+        "problem": "the gyroscope turns the other way about y",
+    },
 }
 EXAMPLES: dict[str, Fields] = {
     "EventPacket": {
@@ -117,6 +134,15 @@ EXAMPLES: dict[str, Fields] = {
         "distortion": [-0.048, 0.011, -0.0005, 0.0002],
         "height_m": 0.31,
     },
+    "ImuPacket": {
+        "v": 1,
+        "stream": "cam0",
+        "seq": 7,
+        "n": 2,
+        "t": struct.pack("<2q", -1_000, 0),
+        "accel_m_s2": struct.pack("<6d", 0.0, -9.75, 0.5, 0.0, -10.0, 0.0),
+        "gyro_rad_s": struct.pack("<6d", 0.0, -0.125, 0.0, 0.0625, 0.0, 0.0),
+    },
     "TwistEstimate": {
         "v": 1,
         "stream": "cam0",
@@ -135,6 +161,7 @@ EXAMPLES: dict[str, Fields] = {
         "trace": {"received_ns": 1_000, "queued_ns": 2_000, "computed_ns": 3_000, "published_ns": 4_000},
         "node": "rover-1",
         "host": {"end_ns": 1_700_000_000_000_000_000, "uncertainty_ns": 200_000, "age_ns": 4_000_000},
+        "source": "refined",
     },
     "StreamStatus": STATUS,
     "HealthRequest": {"v": 1},
@@ -237,7 +264,8 @@ MODELS: tuple[type[Message], ...] = (
     ErrorReply,
 )
 EVENT_PACKET = Kind("EventPacket", decode_packet, encode_packet, strict=False, optional=frozenset())
-KINDS = (EVENT_PACKET, *map(_kind, MODELS))
+IMU_PACKET = Kind("ImuPacket", decode_imu, encode_imu, strict=False, optional=frozenset())
+KINDS = (EVENT_PACKET, IMU_PACKET, *map(_kind, MODELS))
 BY_NAME = {kind.name: kind for kind in KINDS}
 
 
@@ -302,6 +330,16 @@ models = st.fixed_dictionaries(
         "signature": st.sampled_from(["unsigned", "unchecked", "trusted", "untrusted"]),
     }
 )
+inertial_units = st.fixed_dictionaries(
+    {
+        **dict.fromkeys(("rate_hz", "bias_sigma_rad_s"), floats),
+        **{name: counts for name, value in STATUS["imu"].items() if type(value) is int},
+        **dict.fromkeys(("used", "resting", "disagrees"), st.booleans()),
+        "bias_rad_s": st.none() | st.lists(floats, min_size=3, max_size=3),
+        "offset_ms": st.none() | floats,
+        "problem": sentences,
+    }
+)
 statuses = st.fixed_dictionaries(
     {
         "node": names,
@@ -313,6 +351,7 @@ statuses = st.fixed_dictionaries(
         "lost": st.fixed_dictionaries(dict.fromkeys(STATUS["lost"], counts)),
         "latency_ms": st.none() | st.fixed_dictionaries(dict.fromkeys(("p50", "p95", "p99"), floats)),
         "last_packet_age_s": floats,
+        "imu": st.none() | inertial_units,
         **{name: counts for name, value in STATUS.items() if type(value) is int and name != "v"},
     }
 )
@@ -366,6 +405,7 @@ def estimates(draw: st.DrawFn) -> Fields:
         "trace": draw(st.fixed_dictionaries(dict.fromkeys(EXAMPLES["TwistEstimate"]["trace"], int64s))),
         "node": draw(st.none() | names),
         "host": draw(st.none() | st.fixed_dictionaries({"end_ns": int64s, "uncertainty_ns": counts, "age_ns": counts})),
+        "source": draw(st.sampled_from(["network", "refined", "gyro"])),
     }
 
 
@@ -460,6 +500,25 @@ def packets(draw: st.DrawFn, max_events: int = 40, max_span_us: int = 2**32 - 1)
     t, x, y, p = zip(*sorted(rows), strict=True) if rows else ((), (), (), ())
     events = Events.from_columns([t0_us + offset for offset in t], x, y, p)
     return EventPacket(draw(names), draw(counts), sensor, t0_us, events)
+
+
+@st.composite
+def imu_packets(draw: st.DrawFn, max_samples: int = 20) -> ImuPacket:
+    """Any valid packet, its numbers at their bounds too."""
+    t = sorted(draw(st.lists(st.integers(-(2**62), 2**62 - 1), min_size=1, max_size=max_samples)))
+    accel, gyro = (
+        draw(st.lists(st.lists(st.floats(-most, most), min_size=3, max_size=3), min_size=len(t), max_size=len(t)))
+        for most in (MAX_ACCEL_M_S2, MAX_GYRO_RAD_S)
+    )
+    return ImuPacket(draw(names), draw(counts), Imu(np.array(t), np.array(accel), np.array(gyro)))
+
+
+def assert_same_imu(left: ImuPacket, right: ImuPacket) -> None:
+    """Bit for bit."""
+    assert (left.stream, left.seq) == (right.stream, right.seq)
+    for name in Imu._fields:
+        a, b = getattr(left.samples, name), getattr(right.samples, name)
+        assert (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes()), name
 
 
 def same(left: object, right: object) -> bool:

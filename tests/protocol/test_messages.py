@@ -1,6 +1,7 @@
 """Laws that hold for every message of the contract, run over one table of examples."""
 
 import math
+import struct
 from typing import Any
 
 import pytest
@@ -42,8 +43,11 @@ NULLABLE = {
     ("TwistEstimate", "node"),
     ("TwistEstimate", "host"),
     ("CameraInfo", "height_m"),
-    ("StreamStatus", "latency_ms"),
-    ("HealthReply", "latency_ms"),
+    *(
+        (kind, name)
+        for kind in ("StreamStatus", "HealthReply")
+        for name in ("latency_ms", "imu", "bias_rad_s", "offset_ms")
+    ),
     ("ModelsReply", "previous"),
     ("PushRequest", "signature"),
     ("ActivateRequest", "expect"),
@@ -52,7 +56,7 @@ NULLABLE = {
 }
 FREE_MAPS = ("details", "unreadable", "figures", "partial", "internal_errors")
 DEFAULTED = {"release", "figures", "signature"}  # of a ModelInfo
-DEFAULTED |= {"recovered_packets", "uncounted_packets", "refused_cameras", "refusal"}  # of a StreamStatus
+DEFAULTED |= {"recovered_packets", "uncounted_packets", "refused_cameras", "refusal", "imu"}  # of a StreamStatus
 OUT_OF_BOUND: dict[str, dict[str, tuple[Any, ...]]] = {
     "EventPacket": {
         "stream": ("", "a/b", "@node", "*", "**", ".", "..", "-a", "a" * 65, "caf\u00e9", "a b", "a\n", "$*", "#", "?"),
@@ -61,6 +65,14 @@ OUT_OF_BOUND: dict[str, dict[str, tuple[Any, ...]]] = {
         "height": (0, -1, 4097),
         "t0_us": (-(1 << 62) - 1, 1 << 62),
         "n": (-1, 1_000_001, 1 << 63),
+    },
+    "ImuPacket": {
+        "stream": ("", "a/b", "@node"),
+        "seq": (-1, 1 << 63),
+        "n": (-1, 0, 4097, 1 << 63),
+        "t": (struct.pack("<2q", 0, 1 << 62), struct.pack("<2q", -(1 << 62) - 1, 0)),
+        "accel_m_s2": tuple(struct.pack("<6d", 0, 0, 0, 0, wrong, 0) for wrong in (NAN, INF, -1.1e4)),
+        "gyro_rad_s": tuple(struct.pack("<6d", wrong, 0, 0, 0, 0, 0) for wrong in (NAN, -INF, 1.1e3)),
     },
     "CameraInfo": {
         "stream": ("", "a/b", "@node"),
@@ -100,6 +112,8 @@ OUT_OF_BOUND: dict[str, dict[str, tuple[Any, ...]]] = {
             if type(value) is int and name != "v"
         },
         **{f"lost.{name}": (-1, 1 << 63) for name in Losses.model_fields},
+        "imu.samples": (-1, 1 << 63),
+        "imu.bias_rad_s": ([], [0.0] * 2, [0.0] * 4),
     },
     "HealthReply": {
         "node": ("*",),

@@ -2,7 +2,7 @@
 
 | suffix | content |
 | --- | --- |
-| .csv | one row for each bin of a window: times [us], twist, sigma, the events of the window, flags and model |
+| .csv | one row for each bin of a window: times [us], twist, sigma, the events of the window, flags, model and source |
 | .tum | `t x y z qx qy qz qw`: the pose of the camera, integrated from the twists; t in seconds, sensor clock |
 | .mcap | the messages TwistEstimate as on the wire, in the channel `<stream>/velocity`; see `packet_log.layout` |
 
@@ -31,9 +31,12 @@ Add = Callable[[TwistEstimate], None]
 _COLUMNS = tuple(f"{axis}_{'m_s' if axis[0] == 'v' else 'rad_s'}" for axis in AXES)
 CSV_HEADER: Final = (
     *("seq", "start_us", "end_us", "bin_end_us", *_COLUMNS, *(f"sigma_{name}" for name in _COLUMNS)),
-    *("events", "flags", "model"),
+    *("events", "flags", "model", "source"),
 )
-"""Columns of a .csv file; sigma is empty if the model has no uncertainty, flags are separated by spaces."""
+"""Columns of a .csv file; sigma is empty if the model has no uncertainty, flags are separated by spaces.
+
+`source` is the origin of the angular part: network, refined or gyro.
+"""
 
 
 @contextmanager
@@ -64,7 +67,7 @@ def _csv(path: Path) -> Iterator[Add]:
         def add(estimate: TwistEstimate) -> None:
             window = estimate.seq, estimate.start_us, estimate.end_us
             sigma = estimate.sigma or ("",) * len(AXES)
-            about = estimate.events, " ".join(estimate.flags), estimate.model
+            about = estimate.events, " ".join(estimate.flags), estimate.model, estimate.source
             for end_us, twist in zip(estimate.bin_end_us, estimate.twists, strict=True):
                 table.writerow((*window, end_us, *twist, *sigma, *about))
 
