@@ -19,6 +19,7 @@ from rich.text import Text
 from neurove_protocol import Flag, Twist, TwistEstimate
 from neurove_protocol.control import StreamStatus
 from neurove_protocol.velocity import AXES
+from neurove_service.cli.inertial_text import imu_text
 from neurove_service.latency import latency
 
 VERDICT_STYLE = {
@@ -255,6 +256,8 @@ def status_notes(status: StreamStatus) -> Iterator[str]:
         yield f"{status.stream}: {status.verdict}: {status.why}"
     if status.refusal and status.refusal not in status.why:
         yield f"{status.stream}: refused: {status.refusal}"
+    if status.imu is not None:
+        yield f"{status.stream}: {imu_text(status.imu)}"
     if status.uncounted_packets:
         count = f"{status.uncounted_packets:,} packets have the sequence number 0"
         yield f"{status.stream}: {count}, so losses on the way to the node are not counted"

@@ -94,7 +94,9 @@ def test_the_height_of_a_stream_is_known_by_the_flags_of_its_newest_estimate(fla
 
 
 def status(**changes):
-    return StreamStatus.model_validate(STATUS).model_copy(update={"stream": "cam0", "verdict": "ok"} | changes)
+    return StreamStatus.model_validate(STATUS).model_copy(
+        update={"stream": "cam0", "verdict": "ok", "imu": None} | changes
+    )
 
 
 class Estimate:
@@ -116,3 +118,23 @@ def test_each_stream_is_checked_for_feed_clock_calibration_and_height(changes, e
     found = doctor.check_stream(status(**changes), estimate)
     assert [check.level for check in found] == levels
     assert all(check.advice for check in found if check.level == "bad")
+
+
+@pytest.mark.parametrize(
+    ("changes", "level", "state"),
+    [
+        (
+            {"disagrees": False, "problem": ""},
+            "ok",
+            "inertial unit 1,000 Hz, gyroscope bias +0.0625 +0.0000",
+        ),
+        ({"disagrees": False, "problem": "no packet for 3.0 s"}, "bad", "inertial unit: no packet for 3.0 s"),
+        ({"disagrees": True, "problem": "it turns the other way"}, "bad", "gyroscope disagrees with the events"),
+    ],
+)
+def test_the_inertial_unit_of_a_stream_is_checked_if_it_has_one(changes, level, state):
+    unit = StreamStatus.model_validate(STATUS).imu.model_copy(update=changes)
+    check = doctor.check_stream(status(imu=unit, calibrated=True, last_packet_age_s=0.1), Estimate())[-1]
+    assert (check.what, check.level) == ("stream cam0: inertial unit", level)
+    assert check.state.startswith(state)
+    assert bool(check.advice) == (level == "bad")
