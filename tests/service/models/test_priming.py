@@ -18,7 +18,7 @@ from neurove_service.streams.lane import windows_to_prime
 from neurove_service.streams.stream import Stream
 from tests.builders import make_packets
 from tests.service.conftest import SMALL, arrived
-from tests.service.models.test_swap import LAX, feed, motion, wait_until
+from tests.service.models.swapping import LAX, feed, motion, wait_until
 
 PACKETS = make_packets(6_000, n=50, step_us=25_000)
 FEW = RingSize(8)

@@ -6,7 +6,7 @@ import pytest
 from neurove_protocol.errors import BadModel, Conflict, NothingBefore, UnknownModel
 from neurove_service.models.change import Rules
 from neurove_service.models.slot import ModelSlot
-from tests.service.models.test_swap import wait_until
+from tests.service.models.swapping import wait_until
 
 
 def test_a_model_is_found_by_name_and_by_digest(slot):

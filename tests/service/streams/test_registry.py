@@ -9,7 +9,7 @@ from neurove_service.streams.history import RingSize
 from neurove_service.streams.registry import StreamRegistry, StreamSettings
 from neurove_service.streams.worker import Outlet
 from tests.builders import make_packets
-from tests.service.models.test_swap import wait_until
+from tests.service.models.swapping import wait_until
 
 
 class Network:
