@@ -18,6 +18,7 @@ from neurove_core.ingest.windows import Pushed, Window, WindowsState
 from neurove_core.ingest.wire import read_packet
 from neurove_core.io.packets import slices
 from neurove_core.io.recording import Recording
+from neurove_core.models.bounds import UNSET, Bounds
 from neurove_core.models.bundle import PER_HEIGHT, Bundle, LinearUnit
 from neurove_core.networks.kinds import State
 from neurove_core.networks.neurove import NetworkState, NeuroVE
@@ -55,7 +56,7 @@ class WindowEstimate(NamedTuple):
     low_activity: bool
     saturated: bool
     covariance: NDArray[np.float64] | None = None  # (6, 6) of each of these twists, from the bundle's calibration
-    uncertain: bool = False  # the linear part's sigma over its speed exceeds the bundle's bound
+    uncertain: bool = False  # the linear or the angular sigma exceeds both its bounds, see Uncertainty.is_uncertain
     source: Source = "network"  # of the angular part
 
 
@@ -93,10 +94,12 @@ class Estimator:
     Args:
         bundle: the model; its network is put into evaluation mode.
         runner: runs the network; by default the fastest one. `PlainRunner(bundle.network)` runs the network itself.
+        bounds: absolute bounds of sigma for `uncertain`; they take precedence over those of the bundle.
     """
 
-    def __init__(self, bundle: Bundle, runner: Runner | None = None) -> None:
+    def __init__(self, bundle: Bundle, runner: Runner | None = None, bounds: Bounds = UNSET) -> None:
         self.bundle = bundle
+        self._bounds = bounds
         self.config = bundle.config
         self.network = bundle.network.eval().requires_grad_(requires_grad=False)
         self._runner: Runner = runner or runner_of(self.network)
@@ -254,7 +257,9 @@ class Estimator:
             low_activity=window.events - window.outside < before.low_activity_below,
             saturated=bool(window.counts.max() == 255),
             covariance=covariance,
-            uncertain=covariance is not None and unsure is not None and unsure.is_uncertain(twists, covariance),
+            uncertain=covariance is not None
+            and unsure is not None
+            and unsure.is_uncertain(twists, covariance, self._bounds),
         )
 
 

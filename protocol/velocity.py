@@ -36,7 +36,7 @@ class Flag(StrEnum):
     LOW_ACTIVITY = "low_activity"  # fewer events than the model needs to see motion
     SATURATED = "saturated"  # the event count of a cell reached its maximum
     FROZEN = "frozen"  # the camera repeats the same events
-    UNCERTAIN = "uncertain"  # sigma of the linear velocity, as a share of the speed, is above the model's bound
+    UNCERTAIN = "uncertain"  # sigma of the linear or the angular part is above its relative and its absolute bound
 
 
 class Twist(NamedTuple):

@@ -186,6 +186,14 @@ class ServiceConfig(_Settings):
     probation_divergence: float = Field(
         3.0, gt=0, description="The same on probation; beyond it the node rolls back automatically."
     )
+    uncertain_m_s: float | None = Field(
+        None,
+        gt=0,
+        description="A linear sigma below this is never uncertain; without it the model's bound, or 0.2 [m/s].",
+    )
+    uncertain_rad_s: float | None = Field(
+        None, gt=0, description="The same for the angular sigma; without it the model's bound, or 0.1 [rad/s]."
+    )
 
     @model_validator(mode="before")
     @classmethod

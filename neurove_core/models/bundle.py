@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from neurove_core.config import Config, ModelConfig
 from neurove_core.files import allow_no_temporary_folder, read_whole, write_atomically
 from neurove_core.models import golden
+from neurove_core.models.bounds import Bounds
 from neurove_core.models.container import Data, object_without_duplicates, read_container, read_tensors
 from neurove_core.models.golden import Golden
 from neurove_core.models.metadata import BundleLimits, Metadata
@@ -44,8 +45,10 @@ _SMALL = _OFFSET, _SCALE, _CORRELATION = "output.offset", "output.scale", "outpu
 class UncertaintyHeader(Config):
     """Present if a bundle has a spread (tensors spread.weight, spread.bias, output.correlation): its calibration."""
 
-    uncertain_above: float = Field(gt=0, description="An estimate is uncertain above this linear sigma / speed.")
+    uncertain_above: float = Field(gt=0, description="Relative bound: sigma / speed, and angular sigma / rate.")
     provenance: str = Field(max_length=1000, description="One line: how the model was calibrated.")
+    uncertain_m_s: float | None = Field(None, gt=0, description="Absolute bound of the linear sigma [m/s].")
+    uncertain_rad_s: float | None = Field(None, gt=0, description="Absolute bound of the angular sigma [rad/s].")
 
 
 class Header(Metadata):
@@ -129,17 +132,18 @@ class Bundle:
             config=self.config,
             linear_unit=self.linear_unit,
             golden_tolerance=self.golden.tolerance if self.golden else None,
-            uncertainty=self.uncertainty
-            and UncertaintyHeader(
-                uncertain_above=self.uncertainty.uncertain_above, provenance=self.uncertainty.provenance
-            ),
+            uncertainty=self.uncertainty and _header_of(self.uncertainty),
             **dict(self.metadata),
         )
-        omitted = Metadata.model_fields.keys() - self.metadata.non_default_fields()
+        omitted: dict[str, bool | set[str]] = dict.fromkeys(
+            Metadata.model_fields.keys() - self.metadata.non_default_fields(), True
+        )
         if self.golden is None:
-            omitted |= {"golden_tolerance"}
-        if self.uncertainty is None:
-            omitted |= {"uncertainty"}
+            omitted["golden_tolerance"] = True
+        if header.uncertainty is None:
+            omitted["uncertainty"] = True
+        else:  # what is not set is not stored, so that the bytes of older bundles stay the same
+            omitted["uncertainty"] = {name for name, value in header.uncertainty if value is None}
         tensors = {**_stored(self.network), _OFFSET: self.offset, _SCALE: self.scale}
         if self.golden:
             tensors |= golden.to_tensors(self.golden)
@@ -298,7 +302,17 @@ def _uncertainty(header: UncertaintyHeader | None, correlation: Tensor | None, n
     why = why_no_correlation(correlation)
     if why:
         raise BadModel(name, f"tensor {_CORRELATION!r} {why}")
-    return Uncertainty(correlation, header.uncertain_above, header.provenance)
+    bounds = Bounds(header.uncertain_m_s, header.uncertain_rad_s)
+    return Uncertainty(correlation, header.uncertain_above, header.provenance, bounds)
+
+
+def _header_of(found: Uncertainty) -> UncertaintyHeader:
+    return UncertaintyHeader(
+        uncertain_above=found.uncertain_above,
+        provenance=found.provenance,
+        uncertain_m_s=found.bounds.m_s,
+        uncertain_rad_s=found.bounds.rad_s,
+    )
 
 
 def _stored(network: Network) -> dict[str, Tensor]:

@@ -13,14 +13,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from neurove_core.models.bounds import DEFAULT, UNSET, Bounds
+
 LEVEL: Final = 0.9
 """The share of errors that the calibration places within their intervals."""
 
 LEVELS: Final = (0.5, 0.68, 0.8, LEVEL, 0.95, 0.99)
 """Nominal coverages that are compared with measured coverages."""
-
-MIN_SPEED_M_S: Final = 0.5
-"""Lower bound of the speed that sigma is divided by: for a stationary camera the ratio would be infinite."""
 
 _MAX_LOG: Final = 20.0  # bound of |log sigma|: far beyond realistic values, and exp stays finite
 _LEAST_EIGENVALUE: Final = 1e-4
@@ -34,13 +33,15 @@ class Uncertainty:
 
     Args:
         correlation: (6, 6) float32, between the errors of the axes of a twist.
-        uncertain_above: an estimate is flagged `uncertain` if its linear sigma / speed is larger.
+        uncertain_above: relative bound: sigma / speed of the linear part, sigma / rate of the angular part.
         provenance: one line: how the model was calibrated.
+        bounds: absolute bounds of sigma; those of bounds.DEFAULT where they are not set.
     """
 
     correlation: Tensor
     uncertain_above: float
     provenance: str
+    bounds: Bounds = UNSET
 
     def covariance(self, log_sigma: Array, scale: Array) -> Array:
         """D R D (6, 6) for log sigma (6) in units of the scale (6), in the scale's units squared."""
@@ -48,14 +49,26 @@ class Uncertainty:
         covariance: Array = self.correlation.double().numpy() * np.outer(sigma, sigma)
         return (covariance + covariance.T) / 2  # symmetric to the last bit, as the wire format requires
 
-    def is_uncertain(self, twists: Array, covariance: Array) -> bool:
-        """Whether the linear part of a window's twists (n, 6) [m/s] is too uncertain.
+    def is_uncertain(self, twists: Array, covariance: Array, node: Bounds = UNSET) -> bool:
+        """Whether the linear or the angular part of a window's twists is too uncertain.
 
-        The linear sigma is the root of the sum of the three variances. The speed is that of the mean twist, at least
-        MIN_SPEED_M_S.
+        A part is uncertain if its sigma exceeds both the relative and the absolute bound. Its sigma is the root of the
+        sum of its three variances. Its speed is the length of its mean over the window. At low speed the absolute bound
+        decides, because no sigma is small compared with a speed of 0.
+
+        Args:
+            twists: (n, 6) [m/s, rad/s].
+            covariance: (6, 6) of each of them.
+            node: absolute bounds that take precedence over those of the bundle.
         """
-        speed = max(float(np.linalg.norm(twists[:, :3].mean(0))), MIN_SPEED_M_S)
-        return float(np.sqrt(np.trace(covariance[:3, :3]))) > self.uncertain_above * speed
+        mean, sides = twists.mean(0), (slice(0, 3), slice(3, 6))
+        absolute = node.or_else(self.bounds).or_else(DEFAULT)
+        for side, bound in zip(sides, absolute, strict=True):
+            relative = self.uncertain_above * float(np.linalg.norm(mean[side]))
+            sigma = float(np.sqrt(np.trace(covariance[side, side])))
+            if sigma > max(relative, bound or 0.0):
+                return True
+        return False
 
 
 def why_no_correlation(matrix: Tensor) -> str | None:

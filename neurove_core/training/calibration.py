@@ -25,6 +25,7 @@ from torch import nn
 from neurove_core import self_test
 from neurove_core.engine.engine import Engine
 from neurove_core.estimator import Estimator
+from neurove_core.models.bounds import UNSET, Bounds
 from neurove_core.models.bundle import PER_HEIGHT, Bundle
 from neurove_core.models.uncertainty import LEVEL, LEVELS, Uncertainty, half_width
 from neurove_core.networks.encoding import to_spikes
@@ -38,7 +39,7 @@ from neurove_protocol.velocity import AXES
 
 SEQUENCES: Final = 96
 UNCERTAIN_ABOVE: Final = 0.3
-"""An estimate is flagged as uncertain if its linear sigma over its speed exceeds this (decision 48)."""
+"""Relative bound of sigma for the flag `uncertain` (decision 48); the absolute bounds are optional (decision 91)."""
 
 VARIANTS: Final = ("unchanged", "gaps", "few events", "noise")
 """Variants of each sequence."""
@@ -106,7 +107,9 @@ def fill(config: TrainingConfig, folder: Path, sequences: int, workers: int = 1)
         yield from Cache(folder, one).fill(workers)
 
 
-def calibrate(bundle: Bundle, config: TrainingConfig, folder: Path, sequences: int = SEQUENCES) -> Calibration:
+def calibrate(
+    bundle: Bundle, config: TrainingConfig, folder: Path, sequences: int = SEQUENCES, bounds: Bounds = UNSET
+) -> Calibration:
     """Fit the uncertainty of a model; an existing one is replaced.
 
     Args:
@@ -114,6 +117,7 @@ def calibrate(bundle: Bundle, config: TrainingConfig, folder: Path, sequences: i
         config: configuration that trained the model; its windows and canonical camera must be those of the bundle.
         folder: of the sequences, filled by `fill`.
         sequences: number of sequences.
+        bounds: absolute bounds for the flag `uncertain`; by default those that the bundle has.
 
     Raises:
         BadModel: the kind of the network is not `neurove`, the model does not fit the configuration, or its linear part
@@ -127,7 +131,7 @@ def calibrate(bundle: Bundle, config: TrainingConfig, folder: Path, sequences: i
         f"neurove calibrate: {sequences} simulated sequences of {first.seconds:g} s from seed {first.seed}, each seen "
         f"{len(VARIANTS)} times, {_FOLDS} folds, commit {commit() or 'unknown'}"
     )
-    return with_uncertainty(bundle, list(collect_errors(bundle, parts)), provenance)
+    return with_uncertainty(bundle, list(collect_errors(bundle, parts)), provenance, bounds)
 
 
 def check(bundle: Bundle, config: TrainingConfig, sequences: int) -> None:
@@ -146,7 +150,9 @@ def check(bundle: Bundle, config: TrainingConfig, sequences: int) -> None:
         )
 
 
-def with_uncertainty(bundle: Bundle, errors: list[SequenceErrors], provenance: str) -> Calibration:
+def with_uncertainty(
+    bundle: Bundle, errors: list[SequenceErrors], provenance: str, bounds: Bounds = UNSET
+) -> Calibration:
     """Fit the spread of a bundle on its errors, and return the bundle with its uncertainty.
 
     The golden test, if there is one, is recorded again, because the last layer has changed.
@@ -155,6 +161,7 @@ def with_uncertainty(bundle: Bundle, errors: list[SequenceErrors], provenance: s
         bundle: of kind `neurove`.
         errors: on all variants of the calibration sequences.
         provenance: one line that says what the sequences were; the uncertainty stores it.
+        bounds: absolute bounds for the flag `uncertain`; by default those that the bundle has.
 
     Raises:
         BadModel: the kind of the network is not `neurove`.
@@ -171,7 +178,8 @@ def with_uncertainty(bundle: Bundle, errors: list[SequenceErrors], provenance: s
         spread.weight.copy_(torch.from_numpy(weights[:-1].T))
         # the leaky neuron integrates log(factor) * leak to log(factor)
         spread.bias.copy_(torch.from_numpy(weights[-1] + np.log(factor) * leak))
-    uncertainty = Uncertainty(_correlation(usual, factor), UNCERTAIN_ABOVE, provenance)
+    bounds = bounds.or_else(bundle.uncertainty.bounds if bundle.uncertainty else UNSET)
+    uncertainty = Uncertainty(_correlation(usual, factor), UNCERTAIN_ABOVE, provenance, bounds)
     made = replace(bundle, network=network.eval(), uncertainty=uncertainty)
     if made.golden:  # a wider last layer may round differently
         made = replace(made, golden=self_test.record(Estimator(made), made.golden.counts, made.golden.tolerance))

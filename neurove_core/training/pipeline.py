@@ -16,6 +16,7 @@ from typing import Any
 
 from neurove_core.files import make_writable
 from neurove_core.models import bundle
+from neurove_core.models.bounds import UNSET, Bounds
 from neurove_core.models.bundle import Bundle
 from neurove_core.training import calibration, loop, validation
 from neurove_core.training.config import TrainingConfig
@@ -115,6 +116,7 @@ def calibrate(
     sequences: int = calibration.SEQUENCES,
     workers: int = 1,
     on_progress: OnProgress = lambda *_: None,
+    bounds: Bounds = UNSET,
 ) -> dict[str, Any]:
     """Simulate the missing calibration sequences, fit a model's uncertainty on them, and write the bundle.
 
@@ -126,6 +128,7 @@ def calibrate(
         sequences: how many sequences the uncertainty is fitted on.
         workers: number of processes that simulate.
         on_progress: called after each sequence.
+        bounds: absolute bounds for the flag `uncertain`; by default those that the model has.
 
     Returns:
         the coverage of the fitted intervals; see `calibration.Calibration.report`.
@@ -138,7 +141,7 @@ def calibrate(
     _check_count("workers", workers)
     for done, name in enumerate(calibration.fill(config, data, sequences, workers), 1):
         on_progress("simulated to calibrate", done, sequences, name)
-    made = calibration.calibrate(model, config, data, sequences)
+    made = calibration.calibrate(model, config, data, sequences, bounds)
     bundle.save(made.bundle, out)
     return made.report
 

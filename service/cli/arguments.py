@@ -134,6 +134,17 @@ def metres(text: str) -> float:
     return value
 
 
+def sigma(text: str) -> float:
+    """A standard deviation above 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r}: give a finite number above 0")
+    return value
+
+
 def sensor_size(text: str) -> Sensor:
     """A sensor size from the text WIDTHxHEIGHT."""
     width, _, height = text.partition("x")

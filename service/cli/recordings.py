@@ -74,7 +74,9 @@ def _named(streams: tuple[str, ...] | None) -> str:
 
 def _line(stream: dict[str, Any]) -> str:
     lost = [f"{stream[name]:,} {name}" for name in ("missing", "dropped", "refused", "restarts") if stream[name]]
-    return ", ".join([f"{stream['packets']:,} packets, {stream['events']:,} events", *(lost or ["nothing lost"])])
+    held = [f"{stream['packets']:,} packets, {stream['events']:,} events"]
+    held += [f"{stream['samples']:,} IMU samples"] if stream["imu_packets"] else []
+    return ", ".join([*held, *(lost or ["nothing lost"])])
 
 
 @contextlib.contextmanager

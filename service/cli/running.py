@@ -89,12 +89,19 @@ def drive(args: argparse.Namespace) -> int:
     if args.json:
         sensor = {"width": recording.sensor.width, "height": recording.sensor.height}
         found = [fault.as_json() for fault in faults.found]
-        played = {"packets": sent.packets, "events": sent.events, "broken": broken, "faults": found}
+        played = {
+            "packets": sent.packets,
+            "events": sent.events,
+            "samples": sent.samples,
+            "broken": broken,
+            "faults": found,
+        }
         print(json.dumps({"sensor": sensor, **played, "behind_s": round(sent.behind_s, 3)}))
     else:
         about = f"{recording.name} ({recording.sensor})"
         late = f", up to {sent.behind_s:.1f} s behind real time" if sent.behind_s > BEHIND_S else ""
-        print(f"{player.label}: {sent.packets:,} packets, {sent.events:,} events of {about}{late}")
+        inertial = f" and {sent.samples:,} IMU samples" if sent.samples else ""
+        print(f"{player.label}: {sent.packets:,} packets, {sent.events:,} events{inertial} of {about}{late}")
     if sent.broken:
         print(f"neurove: {broken}", file=sys.stderr)
     tell_faults(recording)

@@ -13,6 +13,7 @@ from neurove_service.cli.arguments import (
     check_folder,
     command,
     count,
+    sigma,
     tell_faults,
 )
 from neurove_service.cli.bars import event_count, progress
@@ -60,15 +61,17 @@ def calibrate(args: argparse.Namespace) -> int:
 
     from neurove_core import models
     from neurove_core.models import bundle
+    from neurove_core.models.bounds import Bounds
     from neurove_core.training import config as configs
     from neurove_core.training import pipeline
 
     torch.set_num_threads(1)
     config, model = configs.load(args.config), models.find(args.model)
+    bounds = Bounds(args.uncertain_m_s, args.uncertain_rad_s)
     out: Path = args.out or Path(f"{model.name}{bundle.SUFFIX}")
     data: Path = args.data or Path("runs") / config.name / "data"
     with progress() as show:
-        report = pipeline.calibrate(model, config, data, out, args.calibration_sequences, args.workers, show)
+        report = pipeline.calibrate(model, config, data, out, args.calibration_sequences, args.workers, show, bounds)
     if args.json:
         print(json.dumps({"bundle": str(out), **report}))
         return 0
@@ -208,6 +211,10 @@ def add_calibrate(parser: argparse.ArgumentParser) -> None:
     _add_calibration(parser, "")
     _add_workers(parser)
     parser.add_argument("--out", type=Path, metavar="FILE", help="bundle to write; default NAME.safetensors")
+    about = "estimates with a smaller linear sigma are never `uncertain` [m/s]; default: the node decides"
+    parser.add_argument("--uncertain-m-s", type=sigma, metavar="S", help=about)
+    about = "the same for the angular sigma [rad/s]"
+    parser.add_argument("--uncertain-rad-s", type=sigma, metavar="S", help=about)
 
 
 def add_evaluate(parser: argparse.ArgumentParser) -> None:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from neurove_core import self_test
 from neurove_core.estimator import Estimator
+from neurove_core.models.bounds import UNSET, Bounds
 from neurove_core.models.bundle import Bundle
 from neurove_protocol.errors import Conflict, InvalidField, NeuroVEError, NothingBefore
 from neurove_service import logs
@@ -35,6 +36,7 @@ class Rules(NamedTuple):
     probation: TrialLimits = TrialLimits(divergence=3.0)  # wide, because the node rolls back without an operator
     prime_s: float = 15.0  # maximum wait for windows that a bundle needs beyond those that are kept [s]
     warm_up_share: float = 1.0  # bound of the 99th percentile of the time for a window, as a share of its duration
+    bounds: Bounds = UNSET  # of sigma, for the flag `uncertain`; they take precedence over those of a bundle
 
 
 class Context(NamedTuple):
@@ -167,7 +169,7 @@ class Change:
         if self._plan.shapes.need_child(found.config, free):
             self._report("compiling", "code for a network of this shape, in a process of its own")
             precompile.in_child(found.config, self._plan.closing)
-        estimator = Estimator(found)
+        estimator = Estimator(found, bounds=self._rules.bounds)
         self._report("loaded", f"{found.info.parameters:,} parameters")
         admission.check_first_windows(estimator, share)
         estimator.warm_up()

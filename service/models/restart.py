@@ -2,6 +2,7 @@
 
 from neurove_core import self_test
 from neurove_core.estimator import Estimator
+from neurove_core.models.bounds import Bounds
 from neurove_core.models.bundle import Bundle
 from neurove_protocol.errors import BadModel, UnknownModel, Untrained
 from neurove_service import logs
@@ -46,9 +47,9 @@ def kept(library: Library, digest: str, trained_only: bool) -> Bundle | None:
         return None
 
 
-def try_again(shared: SharedPlan, tried: Bundle) -> None:
+def try_again(shared: SharedPlan, tried: Bundle, bounds: Bounds) -> None:
     """Let a model serve whose probation waited for windows before the restart; `resume` goes on with the probation."""
-    first, estimator = shared.current.active.estimator, Estimator(tried)
+    first, estimator = shared.current.active.estimator, Estimator(tried, bounds=bounds)
     try:
         estimator.warm_up()
         self_test.check(estimator)

@@ -58,7 +58,7 @@ class ModelSlot:
     ) -> None:
         library = Library(models_dir, pushed)
         active, previous = (restart.kept(library, digest, trained_only) if digest else None for digest in kept)
-        estimator = Estimator(restart.first(library, model, active, trained_only))
+        estimator = Estimator(restart.first(library, model, active, trained_only), bounds=rules.bounds)
         name, takes = estimator.bundle.name, "up to 30 s at the first start on a machine"
         log.info("compiling the kernels of the model; `ready` follows", model=name, takes=takes)
         estimator.warm_up()
@@ -74,7 +74,7 @@ class ModelSlot:
         self._context = Context(self._shared, library, rules, on_changed, free_bytes, trained_only, on_trial)
         tried = restart.kept(library, trial, trained_only) if trial else None
         if tried is not None and tried.digest != estimator.bundle.digest:
-            restart.try_again(self._shared, tried)
+            restart.try_again(self._shared, tried, rules.bounds)
 
     def resume(self) -> None:
         """Go on with the probation that waited for windows before a restart; does nothing without one."""

@@ -4,6 +4,7 @@ import threading
 from collections.abc import Callable
 
 from neurove_core.geometry.tables import TABLES
+from neurove_core.models.bounds import Bounds
 from neurove_core.models.bundle import Bundle
 from neurove_protocol.control import STATUS_SCHEMA, ChunkRequest
 from neurove_protocol.errors import NeuroVEError
@@ -43,6 +44,7 @@ def _rules(config: ServiceConfig) -> Rules:
         prime_s=config.prime_s,
         shadow=TrialLimits(config.shadow_divergence),
         probation=TrialLimits(config.probation_divergence),
+        bounds=Bounds(config.uncertain_m_s, config.uncertain_rad_s),
     )
 
 

@@ -1,5 +1,6 @@
 import pytest
 
+from neurove_core.models.bounds import UNCERTAIN_M_S, UNCERTAIN_RAD_S
 from neurove_service.config import ClientConfig, ConfigError, ServiceConfig, load
 
 
@@ -12,6 +13,11 @@ def test_each_layer_overrides_the_previous_one_and_is_named_as_the_source(tmp_pa
     assert (config.node, config.queue_s, config.max_streams, config.model) == ("of-file", 4.0, 7, "default")
     assert origin["node"] == f"file {file}"
     assert (origin["queue_s"], origin["max_streams"], origin["model"]) == ("environment", "flag", "default")
+
+
+def test_the_help_of_the_bounds_of_sigma_gives_the_values_that_hold_without_them():
+    for field, bound in (("uncertain_m_s", UNCERTAIN_M_S), ("uncertain_rad_s", UNCERTAIN_RAD_S)):
+        assert f"or {bound} [" in str(ServiceConfig.model_fields[field].description)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,8 @@ import torch
 from neurove_core import self_test
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
 from neurove_core.estimator import Estimator, Push
-from neurove_core.models import bundle
+from neurove_core.models import bounds, bundle
+from neurove_core.models.bounds import Bounds
 from neurove_core.models.bundle import PER_HEIGHT
 from neurove_core.models.uncertainty import Uncertainty, coverage, half_width
 from neurove_core.training import calibration
@@ -143,15 +144,55 @@ def test_streams_in_one_batch_have_the_same_covariances_as_alone(precision):
             np.testing.assert_allclose(other.covariance, one.covariance, rtol=1e-4)
 
 
-def test_an_estimate_is_uncertain_where_its_sigma_is_too_large_for_its_speed():
-    unsure = Uncertainty(torch.eye(6), 0.5, "a test")
-    covariance = unsure.covariance(np.log([0.31, 1e-6, 0.4, 1, 1, 1]), np.ones(6))
-    assert unsure.is_uncertain(
-        np.full((2, 6), 0.0), covariance
-    )  # sigma 0.51 of a stationary camera, whose speed counts as 0.5 m/s
-    assert unsure.is_uncertain(np.array([[0, 0, 0.9, 0, 0, 0]]), covariance)
-    assert not unsure.is_uncertain(np.array([[0, 0, 1.1, 0, 0, 0]]), covariance)
+def sigmas(linear, angular):
+    """Covariance with this sigma of each part, the root of the sum of its three variances."""
+    return np.diag([linear**2 / 3] * 3 + [angular**2 / 3] * 3)
+
+
+def at(speed=0.0, rate=0.0):
+    return np.array([[0, 0, speed, 0, rate, 0]] * 2, float)
+
+
+def test_an_estimate_is_uncertain_where_its_sigma_exceeds_the_relative_and_the_absolute_bound():
+    unsure = Uncertainty(torch.eye(6), 0.5, "a test", Bounds(0.3, 0.1))
+    assert not unsure.is_uncertain(at(0.0), sigmas(0.29, 0.09))  # stationary
+    assert unsure.is_uncertain(at(0.0), sigmas(0.31, 0.09))
+    assert not unsure.is_uncertain(at(0.65), sigmas(0.31, 0.09))  # small compared with its speed
+    assert unsure.is_uncertain(at(0.60), sigmas(0.31, 0.09))
+    assert unsure.is_uncertain(at(5.0), sigmas(0.31, 0.11))  # the angular part alone
+    assert not unsure.is_uncertain(at(5.0, 0.25), sigmas(0.31, 0.11))
+    assert unsure.is_uncertain(at(0.6, 9.0), sigmas(0.31, 0.11))  # each part against its own bounds
     assert np.isfinite(unsure.covariance(np.full(6, 1e30), np.ones(6))).all()
+
+
+def test_the_bounds_of_a_node_take_precedence_over_those_of_a_bundle_and_those_over_the_defaults():
+    usual = Uncertainty(torch.eye(6), 0.3, "a test")
+    own = replace(usual, bounds=Bounds(m_s=0.5))
+    given = sigmas(bounds.UNCERTAIN_M_S * 1.1, bounds.UNCERTAIN_RAD_S * 0.9)
+    assert usual.is_uncertain(at(), given)
+    assert not own.is_uncertain(at(), given)
+    assert own.is_uncertain(at(), given, Bounds(m_s=0.01))
+    assert own.is_uncertain(at(), sigmas(0.1, bounds.UNCERTAIN_RAD_S * 1.1))
+
+
+def test_an_estimator_flags_by_the_bounds_that_it_was_given(made):
+    events, camera = make_events(3_000, sensor=SENSOR, duration_us=60_000), TWO_METRES
+    for given, flagged in ((Bounds(1e9, 1e9), False), (Bounds(1e-9, 1e-9), True)):
+        small = replace(made.bundle, uncertainty=replace(made.bundle.uncertainty, uncertain_above=1e-9))
+        estimator = Estimator(small, bounds=given)
+        found = estimator.push(events, estimator.initial_state(SENSOR, camera), 60_000).estimates
+        assert {one.uncertain for one in found} == {flagged}
+
+
+def test_a_bundle_stores_its_bounds_only_where_they_are_set(made, tmp_path):
+    plain = made.bundle.to_bytes()
+    assert b"uncertain_m_s" not in plain  # the digests of older bundles depend on it
+    errors = list(wild(np.random.default_rng(0), 16))
+    bounded = with_uncertainty(made.bundle, errors, "a test", Bounds(m_s=0.4)).bundle
+    bundle.save(bounded, tmp_path / "a.safetensors")
+    assert bundle.load(tmp_path / "a.safetensors").uncertainty.bounds == Bounds(0.4, None)
+    again = with_uncertainty(bounded, errors, "a test", Bounds(rad_s=0.2)).bundle
+    assert again.uncertainty.bounds == Bounds(0.4, 0.2)
 
 
 def test_a_calibrated_bundle_is_saved_and_loaded_unchanged(made, tmp_path):

@@ -8,9 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neurove_core.models import bundle
+from neurove_core.models.bounds import Bounds
 from neurove_core.models.uncertainty import Uncertainty
 from neurove_protocol import CameraInfo, Flag, Sensor
 from neurove_protocol.errors import InvalidField
+from neurove_service.models.change import Rules
 from neurove_service.models.slot import ModelSlot
 from neurove_service.node.health import stream_status
 from neurove_service.streams.intake import Arrival
@@ -247,6 +249,19 @@ def test_an_estimate_of_a_calibrated_model_has_a_covariance_and_the_flag_uncerta
         assert estimates[-1].covariance == tuple(torch.eye(6).flatten().tolist())
         assert estimates[-1].sigma == (1,) * 6
         assert type(estimates[-1]).decode(estimates[-1].encode()) == estimates[-1]
+
+
+def test_a_nodes_bounds_decide_what_is_uncertain_also_after_a_change_of_the_model(tmp_path):
+    for seed, name in ((1, "one"), (2, "two")):
+        plain = bundle.untrained(seed, SMALL, name)
+        network = copy.deepcopy(plain.network)
+        network.add_spread()  # sigma is 1 in every axis
+        unsure = replace(plain, network=network, uncertainty=Uncertainty(torch.eye(6), 1e-6, "a test"))
+        bundle.save(unsure, tmp_path / f"{name}.safetensors")
+    slot = ModelSlot("one", tmp_path, Rules(bounds=Bounds(m_s=2.0, rad_s=2.0)))
+    for _ in range(2):
+        assert flagged(feed(Stream("cam0", slot), make_packets(60)), Flag.UNCERTAIN) == []
+        slot.activate("two")
 
 
 def test_an_estimate_of_a_model_without_calibration_has_no_covariance(stream):
