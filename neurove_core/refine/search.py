@@ -26,6 +26,7 @@ _STEPS: Final = 5  # of one level
 _MAX_STEP_CELLS: Final = 3.0  # of motion over the window
 _TOLERANCE_CELLS: Final = 0.04
 _KEPT: Final = 2  # guesses that are followed after the coarsest level
+_MAX_APART_CELLS: Final = 4.0  # of one block, so that one moving thing does not decide
 _APART_CELLS: Final = 1.0  # guesses that end nearer to each other are one
 
 
@@ -130,24 +131,27 @@ def _newton(here: Found, prior: Gaussian, scale: float) -> Array:
     return step * min(1.0, _MAX_STEP_CELLS / size) if size > 0 else step
 
 
-def disagreement(found: Found) -> tuple[float, float]:
-    """How far the parts of the image move against the motion that was found, and how far noise alone makes them.
+class Agreement(NamedTuple):
+    """How well the parts of the image agree with one motion."""
 
-    The root mean square over blocks of 3 x 3 tiles, weighted by what the events say about each.
+    apart: float  # root mean square motion of blocks of tiles against the motion, over the window [rad]
+    noise: float  # what it is by noise alone
+    sharp: float  # share of the events in blocks whose alignment is at a maximum
 
-    Returns:
-        both as motion over the window [rad].
-    """
-    blocks = [_blocks(one) for one in (found.tiles.events, found.tiles.gradient, found.tiles.hessian, found.tiles.square)]
-    events, gradient, hessian, square = blocks
+
+def agreement(found: Found) -> Agreement:
+    """Compare the motion of blocks of 3 x 3 tiles, weighted by what the events tell about each."""
+    tiles = found.tiles
+    events, gradient, hessian, square = map(_blocks, (tiles.events, tiles.gradient, tiles.hessian, tiles.square))
     weights, vectors = np.linalg.eigh(-hessian)
-    weights = np.maximum(weights, 0.1 * np.maximum(weights[:, 1:], 1e-9))
-    along = np.einsum("kij,ki->kj", vectors, gradient)
-    noise = np.einsum("kij,kil,klj->kj", vectors, square, vectors)
-    seen = events >= 30
-    total = float(weights[seen].sum()) or 1.0
-    moved = np.minimum((along / weights) ** 2, 16.0) * weights
-    return tuple(float(np.sqrt(max(one[seen].sum(), 0) / total)) / found.grid.focal for one in (moved, noise / weights))
+    large = weights[:, 1] > 0.02 * max(float(weights.max()), 1e-9)
+    weights = np.maximum(weights, 0.1 * weights[:, 1:])[large]
+    along = np.einsum("kij,ki->kj", vectors, gradient)[large]
+    noise = np.einsum("kij,kil,klj->kj", vectors, square, vectors)[large]
+    total = max(float(weights.sum()), 1e-9)
+    moved = np.minimum((along / weights) ** 2, _MAX_APART_CELLS**2) * weights
+    apart, by_noise = (float(np.sqrt(one.sum() / total)) / found.grid.focal for one in (moved, noise / weights))
+    return Agreement(apart, by_noise, float(events[large].sum() / max(events.sum(), 1)))
 
 
 def _blocks(values: Array) -> Array:
