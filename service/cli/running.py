@@ -7,12 +7,14 @@ import math
 import sys
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from neurove_protocol.errors import EXIT_FAILURE, InvalidField
 from neurove_service import logs
 from neurove_service.cli.arguments import (
     add_client_flags,
+    add_force,
     add_lens_flags,
     add_playback_flags,
     add_service_flags,
@@ -20,6 +22,7 @@ from neurove_service.cli.arguments import (
     client_config,
     command,
     flags,
+    refuse_existing,
     subcommand,
     tell_faults,
 )
@@ -156,6 +159,8 @@ def demo(args: argparse.Namespace) -> int:
     logs.configure("warning")
     opened = open_source(args.source, args.sensor, args.topic, args.time_unit)
     recording = with_lens(opened, args.calibration, args.height)
+    if args.screenshot:
+        refuse_existing("demo", "--screenshot", args.screenshot, args.source, force=args.force)
     endless = recording.endless
     shown = console(stderr=args.json)
     duration_s = args.seconds
@@ -238,7 +243,8 @@ def add_demo(parser: argparse.ArgumentParser) -> None:
     add_playback_flags(parser, f"seconds of the source to play; default: until its end or Ctrl-C, {most}")
     about = "bundle to serve, or the name of a built-in model; default `default`"
     parser.add_argument("--model", metavar="BUNDLE", help=about)
-    parser.add_argument("--screenshot", metavar="FILE", help="write the last live table as SVG")
+    parser.add_argument("--screenshot", type=Path, metavar="FILE", help="write the last live table as SVG")
+    add_force(parser, "FILE")
 
 
 def add_serve(parser: argparse.ArgumentParser) -> None:
