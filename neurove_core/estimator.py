@@ -4,7 +4,7 @@
 one batch; `estimates` runs over a whole recording. Windows and encoding are the same as in training.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -23,6 +23,9 @@ from neurove_core.models.bundle import PER_HEIGHT, Bundle, LinearUnit
 from neurove_core.networks.kinds import State
 from neurove_core.networks.neurove import NetworkState, NeuroVE
 from neurove_core.networks.runner import Runner
+from neurove_core.refine.rotation import Filter, Given, Rate, refine
+from neurove_core.refine.search import compile_kernels
+from neurove_core.refine.view import View
 from neurove_protocol import CameraInfo, Events, Sensor
 from neurove_protocol.errors import BadModel
 from neurove_protocol.events import EventPacket, PacketLimits, WireEvents, encode_packet
@@ -42,6 +45,8 @@ class StreamState(NamedTuple):
     age: int  # windows since the network state began
     end_us: int | None = None  # end of the newest window that the network has processed
     low_activity_below: float = 0.0  # a window with fewer visible events is flagged low_activity
+    view: View | None = None  # for the refinement; None where estimates are not refined
+    filter: Filter | None = None  # of the refinement
 
 
 class WindowEstimate(NamedTuple):
@@ -87,6 +92,10 @@ class _Progress:
     lost: tuple[int, int, int] = (0, 0, 0)  # late events, events outside, skipped windows
     estimates: list[WindowEstimate] = field(default_factory=list)
 
+    def refine(self, refine_one: Callable[..., tuple[WindowEstimate, StreamState]]) -> None:
+        for index, window in enumerate(self.windows):
+            self.estimates[index], self.state = refine_one(window, self.estimates[index], self.state)
+
 
 class Estimator:
     """A loaded model that serves any number of streams. It holds no stream's state and is safe to share.
@@ -95,10 +104,15 @@ class Estimator:
         bundle: the model; its network is put into evaluation mode.
         runner: runs the network; by default the fastest one. `PlainRunner(bundle.network)` runs the network itself.
         bounds: absolute bounds of sigma for `uncertain`; they take precedence over those of the bundle.
+        refine: whether to refine the angular part of estimates by the events, see `refine.rotation`. It needs the
+            CameraInfo of a stream and a bundle with an uncertainty that does not refuse it.
     """
 
-    def __init__(self, bundle: Bundle, runner: Runner | None = None, bounds: Bounds = UNSET) -> None:
+    def __init__(
+        self, bundle: Bundle, runner: Runner | None = None, bounds: Bounds = UNSET, *, refine: bool = False
+    ) -> None:
         self.bundle = bundle
+        self._refines = refine and bundle.uncertainty is not None and bundle.metadata.refine == "auto"
         self._bounds = bounds
         self.config = bundle.config
         self.network = bundle.network.eval().requires_grad_(requires_grad=False)
@@ -119,7 +133,8 @@ class Estimator:
         per_pixel = self.config.low_activity_per_pixel * np.count_nonzero(lut >= 0)
         least = max(float(self.config.low_activity_events), float(per_pixel))
         network = self.network.initial_state()
-        return StreamState(sensor, camera, lut, WindowsState(), network, 0, low_activity_below=least)
+        view = View.of(camera) if self._refines and camera is not None else None
+        return StreamState(sensor, camera, lut, WindowsState(), network, 0, low_activity_below=least, view=view)
 
     def estimates(self, recording: Recording, camera: CameraInfo | None = None) -> Iterator[WindowEstimate]:
         """Estimates of all complete windows of a recording, in order, as the service answers its packets.
@@ -161,20 +176,47 @@ class Estimator:
         """
         streams = [self._begin(push) for push in pushes]
         self._answer(streams)
+        for stream in streams:
+            stream.refine(self.refine)
         return [PushResult(stream.estimates, stream.state, *stream.lost) for stream in streams]
 
     def to_windows(self, events: Events | WireEvents, state: StreamState, horizon_us: int) -> Pushed:
         """The first half of push: the windows that some events complete, not yet processed by the network."""
-        return windows.push(events, horizon_us, state.windows, state.lut, self.config.window, self.config.canonical)
+        about = state.windows, state.lut, self.config.window, self.config.canonical
+        return windows.push(events, horizon_us, *about, sampled=state.view is not None)
 
     def follow(self, complete: Iterable[Window], state: StreamState) -> tuple[list[WindowEstimate], StreamState]:
         """The second half of push: estimate windows that this model, or one with the same windows, has made.
 
-        Where a window does not begin at the end of the one before, the network state is reset, unless it is bridged.
+        These are the network's estimates; `refine` is the last step of a push. Where a window does not begin at the end
+        of the one before, the network state is reset, unless it is bridged.
         """
         stream = _Progress(state, tuple(complete))
         self._answer([stream])
         return stream.estimates, stream.state
+
+    def refine(
+        self, window: Window, estimate: WindowEstimate, state: StreamState, gyro: Rate | None = None
+    ) -> tuple[WindowEstimate, StreamState]:
+        """The last step of push: the angular part of an estimate, refined by the sample of its window.
+
+        Args:
+            window: the window; without a sample the estimate stays as it is.
+            estimate: the network's.
+            state: of the stream.
+            gyro: mean angular velocity of the window by a gyroscope, where there is one.
+        """
+        if window.sample is None or state.view is None or estimate.covariance is None:
+            return estimate, state
+        network = estimate.twists.mean(axis=0), estimate.covariance, estimate.low_activity
+        height_m = (state.camera.height_m if state.camera else None) or 1.0
+        about = window.start_us, self.config.window.duration_us, window.sample, state.view
+        found = refine(Given(*about, *network, state.filter, height_m, gyro))
+        source: Source = "refined" if found.outcome == "accepted" else "network" if gyro is None else "gyro"
+        if source != "network":
+            estimate = _with_rate(estimate, found.rate, source)
+            estimate = estimate._replace(uncertain=self._is_uncertain(estimate.twists, estimate.covariance))
+        return estimate, state._replace(filter=found.filter)
 
     def has_same_windows(self, other: "Estimator") -> bool:
         """Whether both models use the same windows and canonical camera, so that one can use the other's windows."""
@@ -215,17 +257,10 @@ class Estimator:
             BadModel: the model computes numbers that are not finite.
         """
         sensor = Sensor(self.config.canonical.width, self.config.canonical.height)
-        duration = self.config.window.duration_us
-        t = np.arange(0, 4 * duration, max(1, duration // 500))
-        rng = np.random.default_rng(0)
-        x, y, p = (rng.integers(0, high, t.size) for high in (sensor.width, sensor.height, 2))
-        events = Events.from_columns(t, x, y, p)
-        packet = EventPacket("warm", 0, sensor, 0, events)
-        from_wire = read_packet(
-            encode_packet(packet), PacketLimits(max_side_px=max(sensor.width, sensor.height))
-        ).events
-        state = self.initial_state(sensor)
-        for given in (events, from_wire):
+        state = self.initial_state(sensor, _warm_camera(sensor) if self._refines else None)
+        if state.view is not None:
+            compile_kernels(state.view.grid)
+        for given in _warm_events(sensor, self.config.window.duration_us):
             answer = self.push(given, state._replace(windows=WindowsState()), 0)
             state = answer.state
             finite = all(np.isfinite(estimate.twists).all() for estimate in answer.estimates)
@@ -246,7 +281,6 @@ class Estimator:
     ) -> WindowEstimate:
         metres, age = _to_metres(before.camera, self.bundle.linear_unit), before.age
         twists, covariance = twists * metres, self._covariance(network, metres)
-        unsure = self.bundle.uncertainty
         return WindowEstimate(
             start_us=window.start_us,
             end_us=window.start_us + self.config.window.duration_us,
@@ -257,10 +291,46 @@ class Estimator:
             low_activity=window.events - window.outside < before.low_activity_below,
             saturated=bool(window.counts.max() == 255),
             covariance=covariance,
-            uncertain=covariance is not None
-            and unsure is not None
-            and unsure.is_uncertain(twists, covariance, self._bounds),
+            uncertain=self._is_uncertain(twists, covariance),
         )
+
+    def _is_uncertain(self, twists: NDArray[np.float64], covariance: NDArray[np.float64] | None) -> bool:
+        unsure = self.bundle.uncertainty
+        return covariance is not None and unsure is not None and unsure.is_uncertain(twists, covariance, self._bounds)
+
+
+def _with_rate(estimate: WindowEstimate, rate: Rate, source: Source) -> WindowEstimate:
+    """The estimate with another angular part, of all of its bins; it does not correlate with the linear part."""
+    twists, covariance = estimate.twists.copy(), np.zeros((6, 6))
+    twists[:, 3:] = rate.w_rad_s
+    assert estimate.covariance is not None
+    covariance[:3, :3] = estimate.covariance[:3, :3]
+    covariance[3:, 3:] = (rate.covariance + rate.covariance.T) / 2
+    return estimate._replace(twists=twists, covariance=covariance, source=source)
+
+
+def _warm_events(sensor: Sensor, duration_us: int) -> tuple[Events, WireEvents]:
+    """The events of four windows, as columns and in the layout of a packet."""
+    t = np.arange(0, 4 * duration_us, max(1, duration_us // 500))
+    rng = np.random.default_rng(0)
+    x, y, p = (rng.integers(0, high, t.size) for high in (sensor.width, sensor.height, 2))
+    events = Events.from_columns(t, x, y, p)
+    data = encode_packet(EventPacket("warm", 0, sensor, 0, events))
+    return events, read_packet(data, PacketLimits(max_side_px=max(sensor.width, sensor.height))).events
+
+
+def _warm_camera(sensor: Sensor) -> CameraInfo:
+    focal, middle_x, middle_y = float(sensor.width), sensor.width / 2, sensor.height / 2
+    return CameraInfo(
+        stream="warm",
+        lens="pinhole",
+        width=sensor.width,
+        height=sensor.height,
+        fx=focal,
+        fy=focal,
+        cx=middle_x,
+        cy=middle_y,
+    )
 
 
 def _to_metres(camera: CameraInfo | None, unit: LinearUnit) -> NDArray[np.float64]:

@@ -67,7 +67,8 @@ class Tables:
         """
         sensor = camera.sensor
         key = ("rays", sensor, *_lens(camera))
-        return cast("NDArray[np.float32]", self._shared(key, sensor, 2 * table_bytes(sensor), lambda: ray_table(camera)))
+        made = self._shared(key, sensor, 2 * table_bytes(sensor), lambda: ray_table(camera))
+        return cast("NDArray[np.float32]", made)
 
     def _shared(self, key: _Key, sensor: Sensor, needed: int, make: Callable[[], _Table]) -> _Table:
         with self._lock:

@@ -44,7 +44,8 @@ class Sampler:
         self._start_us = start_us
         self._seen = self._kept = 0
         self._stride = 1
-        self._columns = Sample(np.empty(capacity, np.int32), np.empty(capacity, np.uint16), np.empty(capacity, np.uint16))
+        column = np.empty(capacity, np.uint16)
+        self._columns = Sample(np.empty(capacity, np.int32), column, column.copy())
 
     def add(self, events: Events | WireEvents) -> None:
         """Add the next events of the window; with equal results for columns and for the layout of a packet."""
@@ -59,7 +60,8 @@ class Sampler:
 
     def sample(self) -> Sample:
         """The sample of the events so far."""
-        return Sample(*(column[: self._kept].copy() for column in self._columns))
+        t_us, x, y = self._columns
+        return Sample(t_us[: self._kept].copy(), x[: self._kept].copy(), y[: self._kept].copy())
 
 
 def sample_reference(events: Events, start_us: int, capacity: int = CAPACITY) -> Sample:
@@ -102,7 +104,7 @@ def _keep(
     stride: int,
     out: Sample,
 ) -> tuple[int, int]:  # pragma: no cover (machine code)
-    """Keep the events whose number in the window is a multiple of the stride; returns how many there are, and the stride.
+    """Keep the events whose number in the window is a multiple of the stride; returns their number, and the stride.
 
     Args:
         t: times [us], with `begin` added relative to the start of the window.

@@ -11,7 +11,8 @@ these few numbers, see `motion`; the compiled loops do not depend on the paramet
 Source: Gallego and Scaramuzza 2017 (contrast maximisation for the angular velocity).
 """
 
-from typing import Any, Final, NamedTuple
+from collections.abc import Callable
+from typing import Final, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,8 @@ from neurove_core.compiled import compile_with, compiled
 
 Floats = NDArray[np.float32]
 Array = NDArray[np.float64]
+P = ParamSpec("P")
+R = TypeVar("R")
 
 COLUMNS: Final = 12
 ROWS: Final = 9
@@ -149,7 +152,7 @@ def _cells_reference(ray: Array, grid: Grid) -> tuple[Array, Array]:
     return grid.focal * (ray[:, 0] - grid.left), grid.focal * (ray[:, 1] - grid.top)
 
 
-def _compiled_fast(function: Any) -> Any:
+def _compiled_fast(function: Callable[P, R]) -> Callable[P, R]:
     return compile_with(function, fastmath={"contract", "reassoc", "nsz", "arcp"})
 
 

@@ -26,16 +26,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.ingest.sample import Sample
-from neurove_core.refine.alignment import Rays
+from neurove_core.refine.alignment import Grid, Rays
 from neurove_core.refine.search import Agreement, Found, Gaussian, agreement, search
 from neurove_core.refine.view import View
 
 Array = NDArray[np.float64]
 
-Outcome = Literal["accepted", "few events", "narrow", "disagreeing", "out of range", "contradicted", "moving", "no gain"]
+Outcome = Literal[
+    "accepted", "few events", "narrow", "disagreeing", "out of range", "contradicted", "moving", "no gain"
+]
 
 MIN_EVENTS: Final = 500
-MIN_SPREAD: Final = 0.08
+MIN_SPREAD: Final = 0.04
 """Effective share of 16 x 16 tiles of the view that hold the events: (sum n)^2 / (256 sum n^2)."""
 
 MAX_APART: Final = 2.0
@@ -50,7 +52,9 @@ MAX_SPEED: Final = 1.0
 """Largest linear velocity over the height of the camera [1/s], where it is above _CERTAIN times its sigma."""
 
 _CERTAIN: Final = 2.0
-_NETWORK_SCALE: Final = 1.2  # of the network's sigma in the prior: its errors have heavier tails than a normal distribution
+_NETWORK_SCALE: Final = (
+    1.2  # of the network's sigma in the prior: its errors have heavier tails than a normal distribution
+)
 _NETWORK_FLOOR: Final = 0.02  # [rad/s]
 _SHIFT_SIGMA: Final = 0.1  # of the translation over depth, when nothing is known [1/s]
 _SHIFT_KEPT: Final = 0.95  # share of it that goes on to the next window
@@ -100,7 +104,7 @@ class Refined(NamedTuple):
 
 
 def refine(given: Given) -> Refined:
-    """Refine the angular velocity of a window; the answer is the network's, or the gyroscope's, if it is not accepted."""
+    """Refine the angular velocity of a window; if it is not accepted, it is the network's, or that of the gyroscope."""
     known = given.gyro or Rate(given.twist[3:], _with_floor(given.covariance[3:, 3:]))
     before = _predicted(given.before, given.start_us, given.window_us)
     not_accepted = Rate(known.w_rad_s, given.covariance[3:, 3:] if given.gyro is None else known.covariance)
@@ -110,12 +114,19 @@ def refine(given: Given) -> Refined:
     speed, sigma = np.linalg.norm(given.twist[:3]), np.sqrt(np.trace(given.covariance[:3, :3]))
     if speed > MAX_SPEED * given.height_m and speed > _CERTAIN * sigma:
         return Refined(not_accepted, "moving", before)
-    if spread(rays) < MIN_SPREAD:
+    if spread(rays, given.view.grid) < MIN_SPREAD:
         return Refined(not_accepted, "narrow", before)
+    try:
+        return _searched(given, known, before, not_accepted, rays)
+    except np.linalg.LinAlgError:  # events that make no finite Hessian
+        return Refined(not_accepted, "few events", None)
+
+
+def _searched(given: Given, known: Rate, before: Filter | None, not_accepted: Rate, rays: Rays) -> Refined:
     seconds = given.window_us / 1e6
     prior = _prior(known, before, seconds)
     found = search(rays, given.view.grid, prior, _guesses(given.twist[3:], known, before, seconds))
-    covariance = np.linalg.inv(found.information / _DISPERSION + prior.information) / seconds**2
+    covariance = np.asarray(np.linalg.inv(found.information / _DISPERSION + prior.information) / seconds**2, np.float64)
     outcome = _outcome(found, agreement(found), rays, known, covariance, seconds)
     if outcome != "accepted":
         return Refined(not_accepted, outcome, before)
@@ -123,16 +134,12 @@ def refine(given: Given) -> Refined:
     return Refined(Rate(motion[:3], covariance[:3, :3]), outcome, Filter(motion, covariance, end_us))
 
 
-def spread(rays: Rays) -> float:
-    """Effective share of 16 x 16 tiles of the view that hold the events."""
-    tile = [_sixteenths(column) for column in (rays.y, rays.x)]
-    counts = np.bincount(tile[0] * 16 + tile[1], minlength=256).astype(np.float64)
+def spread(rays: Rays, grid: Grid) -> float:
+    """Effective share of 16 x 16 tiles of the image that hold the events."""
+    column = ((rays.x - grid.left) * (16 * grid.focal / grid.width)).astype(np.int64).clip(0, 15)
+    row = ((rays.y - grid.top) * (16 * grid.focal / grid.height)).astype(np.int64).clip(0, 15)
+    counts = np.bincount(row * 16 + column, minlength=256).astype(np.float64)
     return float(counts.sum() ** 2 / (256 * (counts**2).sum()))
-
-
-def _sixteenths(column: NDArray[np.float32]) -> NDArray[np.int64]:
-    low, high = float(column.min()), float(column.max())
-    return np.minimum(((column - low) * (16 / max(high - low, 1e-6))).astype(np.int64), 15)
 
 
 def _with_floor(covariance: Array) -> Array:
@@ -167,15 +174,13 @@ def _prior(known: Rate, before: Filter | None, seconds: float) -> Gaussian:
 
 
 def _guesses(network: Array, known: Rate, before: Filter | None, seconds: float) -> list[Array]:
-    """Where the search begins: the network, twice its rate (it tends to the mean), the gyroscope, and the last motion."""
+    """Where the search begins: the network or gyroscope, twice the network (it is often low), and the last motion."""
     rates = [known.w_rad_s, 2 * network]
     guesses = [np.concatenate([rate, np.zeros(3)]) * seconds for rate in rates]
     return guesses if before is None else [*guesses, before.motion * seconds]
 
 
-def _outcome(
-    found: Found, parts: Agreement, rays: Rays, known: Rate, covariance: Array, seconds: float
-) -> Outcome:
+def _outcome(found: Found, parts: Agreement, rays: Rays, known: Rate, covariance: Array, seconds: float) -> Outcome:
     turn, shift = float(np.linalg.norm(found.motion[:3])), float(np.linalg.norm(found.motion[3:]))
     inside = float(found.tiles.events.sum()) / rays.x.size
     if turn > MAX_TURN_RAD or shift > MAX_SHIFT or inside < MIN_INSIDE:

@@ -81,6 +81,12 @@ def measure(rays: Rays, grid: Grid, motion: Array) -> Tiles:
     return tiles(rays, motion, grid, image(rays, motion, grid))
 
 
+def compile_kernels(grid: Grid) -> None:
+    """Compile the kernels of the search, so that the first window does not wait for it."""
+    some = np.linspace(-0.5, 0.5, 16).astype(np.float32)
+    search(Rays(some, some, some), grid, Gaussian(np.zeros(6), np.eye(6)), [np.zeros(6)])
+
+
 def jacobian(x: Array, y: Array) -> Array:
     """Motion of the image (..., 2) of points at x/z, y/z (K,), by the six numbers of a motion: (K, 2, 6)."""
     zero, one = np.zeros_like(x), np.ones_like(x)

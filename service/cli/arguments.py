@@ -61,6 +61,12 @@ def add_lens_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--height", type=metres, metavar="M", help="height of the camera above the ground [m]")
 
 
+def add_refine_flag(parser: argparse.ArgumentParser) -> None:
+    """Add whether the angular part of estimates is refined."""
+    about = "refine the angular velocity by the events of each window; default auto: if the lens is known"
+    parser.add_argument("--refine", choices=("auto", "off"), default="auto", help=about)
+
+
 def add_playback_flags(parser: argparse.ArgumentParser, seconds_help: str) -> None:
     """Add how fast and how long a source is played."""
     parser.add_argument(

@@ -255,6 +255,8 @@ def status_notes(status: StreamStatus) -> Iterator[str]:
         yield f"{status.stream}: {status.verdict}: {status.why}"
     if status.refusal and status.refusal not in status.why:
         yield f"{status.stream}: refused: {status.refusal}"
+    if status.unrefined_windows:
+        yield f"{status.stream}: {status.unrefined_windows:,} windows not refined, because the node was behind"
     if status.uncounted_packets:
         count = f"{status.uncounted_packets:,} packets have the sequence number 0"
         yield f"{status.stream}: {count}, so losses on the way to the node are not counted"
