@@ -55,6 +55,10 @@ _CERTAIN: Final = 2.0
 _NETWORK_SCALE: Final = (
     1.2  # of the network's sigma in the prior: its errors have heavier tails than a normal distribution
 )
+_REPEATED: Final = 3.0
+"""Factor of the network's sigma while the filter runs: errors of the network last for many windows, and the filter has
+the earlier answers already."""
+
 _NETWORK_FLOOR: Final = 0.02  # [rad/s]
 _SHIFT_SIGMA: Final = 0.1  # of the translation over depth, when nothing is known [1/s]
 _SHIFT_KEPT: Final = 0.95  # share of it that goes on to the next window
@@ -162,8 +166,8 @@ def _predicted(before: Filter | None, start_us: int, window_us: int) -> Filter |
 
 def _prior(known: Rate, before: Filter | None, seconds: float) -> Gaussian:
     """The prior of the motion over the window: the product of the network's and the filter's."""
-    information = np.zeros((6, 6))
-    information[:3, :3] = np.linalg.inv(known.covariance)
+    information, scale = np.zeros((6, 6)), 1.0 if before is None else _REPEATED**2
+    information[:3, :3] = np.linalg.inv(known.covariance * scale)
     weighted = np.concatenate([information[:3, :3] @ known.w_rad_s, np.zeros(3)])
     information[3:, 3:] = np.eye(3) / _SHIFT_SIGMA**2
     if before is not None:
