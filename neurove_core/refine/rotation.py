@@ -60,11 +60,11 @@ _REPEATED: Final = 3.0
 the earlier answers already."""
 
 _NETWORK_FLOOR: Final = 0.02  # [rad/s]
-_SHIFT_SIGMA: Final = 0.1  # of the translation over depth, when nothing is known [1/s]
+_SHIFT_SIGMA: Final = 0.05  # of the translation over depth, when nothing is known [1/s]
 _SHIFT_KEPT: Final = 0.95  # share of it that goes on to the next window
 _TURN_NOISE: Final = 0.1  # growth of sigma of the angular velocity per window [rad/s]
 _TURN_NOISE_SHARE: Final = 0.3  # the same, as a share of the angular velocity
-_SHIFT_NOISE: Final = 0.02  # growth of sigma of the translation over depth [1/s]
+_SHIFT_NOISE: Final = 0.016  # growth of sigma of the translation over depth [1/s]
 _DISPERSION: Final = 2.0  # variance of the events' gradient over that of independent events
 _LOST_SIGMA: Final = 0.5  # the filter begins again above this [rad/s]
 
