@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from neurove_core.engine.runner import runner_of
 from neurove_core.geometry.tables import TABLES
 from neurove_core.ingest import windows
+from neurove_core.ingest.channels import Recent, remembered, with_history
 from neurove_core.ingest.windows import Pushed, Window, WindowsState
 from neurove_core.ingest.wire import read_packet
 from neurove_core.io.packets import slices
@@ -47,6 +48,7 @@ class StreamState(NamedTuple):
     low_activity_below: float = 0.0  # a window with fewer visible events is flagged low_activity
     view: View | None = None  # for the refinement; None where estimates are not refined
     filter: Filter | None = None  # of the refinement
+    recent: Recent = ()  # counts of earlier windows, for models with a history
 
 
 class WindowEstimate(NamedTuple):
@@ -63,6 +65,7 @@ class WindowEstimate(NamedTuple):
     covariance: NDArray[np.float64] | None = None  # (6, 6) of each of these twists, from the bundle's calibration
     uncertain: bool = False  # the linear or the angular sigma exceeds both its bounds, see Uncertainty.is_uncertain
     source: Source = "network"  # of the angular part
+    gyro_disagrees: bool = False  # the events and the gyroscope of the camera disagree
 
 
 class PushResult(NamedTuple):
@@ -137,7 +140,7 @@ class Estimator:
         return StreamState(sensor, camera, lut, WindowsState(), network, 0, low_activity_below=least, view=view)
 
     def estimates(self, recording: Recording, camera: CameraInfo | None = None) -> Iterator[WindowEstimate]:
-        """Estimates of all complete windows of a recording, in order, as the service answers its packets.
+        """Estimates of all complete windows of a recording by its events alone, as the service answers its packets.
 
         Args:
             recording: source of events, see `open_source`.
@@ -196,7 +199,7 @@ class Estimator:
         return stream.estimates, stream.state
 
     def refine(
-        self, window: Window, estimate: WindowEstimate, state: StreamState, gyro: Rate | None = None
+        self, window: Window, estimate: WindowEstimate, state: StreamState
     ) -> tuple[WindowEstimate, StreamState]:
         """The last step of push: the angular part of an estimate, refined by the sample of its window.
 
@@ -204,19 +207,22 @@ class Estimator:
             window: the window; without a sample the estimate stays as it is.
             estimate: the network's.
             state: of the stream.
-            gyro: mean angular velocity of the window by a gyroscope, where there is one.
         """
         if window.sample is None or state.view is None or estimate.covariance is None:
             return estimate, state
-        network = estimate.twists.mean(axis=0), estimate.covariance, estimate.low_activity
         height_m = (state.camera.height_m if state.camera else None) or 1.0
-        about = window.start_us, self.config.window.duration_us, window.sample, state.view
-        found = refine(Given(*about, *network, state.filter, height_m, gyro))
-        source: Source = "refined" if found.outcome == "accepted" else "network" if gyro is None else "gyro"
-        if source != "network":
-            estimate = _with_rate(estimate, found.rate, source)
-            estimate = estimate._replace(uncertain=self._is_uncertain(estimate.twists, estimate.covariance))
+        about = window.start_us, self.config.window.duration_us, window.sample, state.view, estimate.twists.mean(axis=0)
+        found = refine(Given(*about, estimate.covariance, estimate.low_activity, state.filter, height_m))
+        if found.outcome == "accepted":
+            twists, covariance = _with_rate(estimate.twists, estimate.covariance, found.rate)
+            uncertain = self.is_uncertain(twists, covariance)
+            estimate = estimate._replace(twists=twists, covariance=covariance, source="refined", uncertain=uncertain)
         return estimate, state._replace(filter=found.filter)
+
+    def is_uncertain(self, twists: NDArray[np.float64], covariance: NDArray[np.float64]) -> bool:
+        """Whether sigma exceeds the bounds, see `Uncertainty.is_uncertain`; False for a model without uncertainty."""
+        unsure = self.bundle.uncertainty
+        return unsure is not None and unsure.is_uncertain(twists, covariance, self._bounds)
 
     def has_same_windows(self, other: "Estimator") -> bool:
         """Whether both models use the same windows and canonical camera, so that one can use the other's windows."""
@@ -234,7 +240,7 @@ class Estimator:
             due = [stream for stream in streams if turn < len(stream.windows)]
             for stream in due:
                 self._reset_after_gap(stream, stream.windows[turn])
-            counts = [stream.windows[turn].counts for stream in due]
+            counts = [with_history(stream.windows[turn].counts, stream.state.recent, self.config) for stream in due]
             steps = self._runner.run(counts, [stream.state.network for stream in due])
             for stream, (twists, network) in zip(due, steps, strict=True):
                 self._take(stream, stream.windows[turn], twists * self._scale + self._offset, network)
@@ -242,13 +248,14 @@ class Estimator:
     def _reset_after_gap(self, stream: _Progress, window: Window) -> None:
         """Reset the network state where a window does not follow the one before it."""
         if stream.state.end_us not in (None, window.start_us) and not window.bridged:
-            stream.state = stream.state._replace(network=self.network.initial_state(), age=0)
+            stream.state = stream.state._replace(network=self.network.initial_state(), age=0, recent=())
 
     def _take(self, stream: _Progress, window: Window, twists: NDArray[np.float64], network: State) -> None:
         state = stream.state
         stream.estimates.append(self._estimate(window, twists, network, state))
         end_us = window.start_us + self.config.window.duration_us
-        stream.state = state._replace(network=network, age=state.age + 1, end_us=end_us)
+        recent = remembered(window.counts, state.recent, self.config)
+        stream.state = state._replace(network=network, age=state.age + 1, end_us=end_us, recent=recent)
 
     def warm_up(self) -> None:
         """Compile all code and run all parts, so that the first packet does not wait for it.
@@ -291,22 +298,18 @@ class Estimator:
             low_activity=window.events - window.outside < before.low_activity_below,
             saturated=bool(window.counts.max() == 255),
             covariance=covariance,
-            uncertain=self._is_uncertain(twists, covariance),
+            uncertain=covariance is not None and self.is_uncertain(twists, covariance),
         )
 
-    def _is_uncertain(self, twists: NDArray[np.float64], covariance: NDArray[np.float64] | None) -> bool:
-        unsure = self.bundle.uncertainty
-        return covariance is not None and unsure is not None and unsure.is_uncertain(twists, covariance, self._bounds)
 
-
-def _with_rate(estimate: WindowEstimate, rate: Rate, source: Source) -> WindowEstimate:
-    """The estimate with another angular part, of all of its bins; it does not correlate with the linear part."""
-    twists, covariance = estimate.twists.copy(), np.zeros((6, 6))
+def _with_rate(
+    twists: NDArray[np.float64], covariance: NDArray[np.float64], rate: Rate
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Twists (n, 6) and covariance (6, 6) with another angular part, which does not correlate with the linear part."""
+    twists, joint = twists.copy(), np.zeros((6, 6))
     twists[:, 3:] = rate.w_rad_s
-    assert estimate.covariance is not None
-    covariance[:3, :3] = estimate.covariance[:3, :3]
-    covariance[3:, 3:] = (rate.covariance + rate.covariance.T) / 2
-    return estimate._replace(twists=twists, covariance=covariance, source=source)
+    joint[:3, :3], joint[3:, 3:] = covariance[:3, :3], (rate.covariance + rate.covariance.T) / 2
+    return twists, joint
 
 
 def _warm_events(sensor: Sensor, duration_us: int) -> tuple[Events, WireEvents]:

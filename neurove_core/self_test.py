@@ -58,7 +58,8 @@ def record(estimator: Estimator, counts: NDArray[np.uint8], tolerance: float = T
 def answers(estimator: Estimator, counts: NDArray[np.uint8]) -> NDArray[np.float64]:
     """Twists (T, n, 6) of a model for windows (T, 2n, H, W), from the zero state."""
     config = estimator.config
-    sensor = Sensor(config.canonical.width, config.canonical.height)  # each pixel is one cell of the grid
+    fine = config.canonical.fine
+    sensor = Sensor(fine.width, fine.height)  # each pixel is one part of a cell of the grid
     state = estimator.push(Events.empty(), estimator.initial_state(sensor), 0).state  # windows begin at time 0
     twists = []
     for index, window in enumerate(counts):
@@ -70,8 +71,10 @@ def answers(estimator: Estimator, counts: NDArray[np.uint8]) -> NDArray[np.float
 
 
 def _events(counts: NDArray[np.uint8], start_us: int, config: ModelConfig) -> Events:
-    """Events that give these counts (2n, H, W), all at the beginning of their bins."""
-    channel, y, x = np.nonzero(counts)
-    times = counts[channel, y, x]
-    columns: list[NDArray[Any]] = [start_us + channel // 2 * config.window.bin_us, x, y, channel % 2]
+    """Events that give these counts of a window, all at the beginning of their bins."""
+    at, y, x = np.nonzero(counts)
+    times, n = counts[at, y, x], config.canonical.subcells
+    channel, part = np.divmod(at, config.canonical.parts)
+    place = (x * n + part % n, y * n + part // n)
+    columns: list[NDArray[Any]] = [start_us + channel // 2 * config.window.bin_us, *place, channel % 2]
     return Events.from_columns(*(np.repeat(column, times) for column in columns))

@@ -105,7 +105,7 @@ TABLES = Tables()
 
 
 def _key(canonical: CanonicalConfig, sensor: Sensor, camera: CameraInfo | None) -> _Key:
-    grid = (canonical.width, canonical.height, canonical.hfov_deg)
+    grid = (canonical.width, canonical.height, canonical.hfov_deg, canonical.subcells)
     if camera is None:
         return (*grid, sensor)
     return (*grid, sensor, camera.sensor, *_lens(camera))

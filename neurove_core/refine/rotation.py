@@ -70,7 +70,7 @@ _LOST_SIGMA: Final = 0.5  # the filter begins again above this [rad/s]
 
 
 class Rate(NamedTuple):
-    """An angular velocity with its covariance, such as that of a gyroscope."""
+    """An angular velocity with its covariance."""
 
     w_rad_s: Array  # (3,)
     covariance: Array  # (3, 3)
@@ -96,7 +96,6 @@ class Given(NamedTuple):
     low_activity: bool
     before: Filter | None
     height_m: float = 1.0  # of the camera, or what the linear part assumes
-    gyro: Rate | None = None  # takes the place of the network where it is given
 
 
 class Refined(NamedTuple):
@@ -108,10 +107,10 @@ class Refined(NamedTuple):
 
 
 def refine(given: Given) -> Refined:
-    """Refine the angular velocity of a window; if it is not accepted, it is the network's, or that of the gyroscope."""
-    known = given.gyro or Rate(given.twist[3:], _with_floor(given.covariance[3:, 3:]))
+    """Refine the angular velocity of a window; if it is not accepted, it is the network's."""
+    known = Rate(given.twist[3:], _with_floor(given.covariance[3:, 3:]))
     before = _predicted(given.before, given.start_us, given.window_us)
-    not_accepted = Rate(known.w_rad_s, given.covariance[3:, 3:] if given.gyro is None else known.covariance)
+    not_accepted = Rate(known.w_rad_s, given.covariance[3:, 3:])
     rays = given.view.rays_of(given.sample, given.window_us)
     if given.low_activity or rays.x.size < MIN_EVENTS:
         return Refined(not_accepted, "few events", before)
@@ -129,7 +128,7 @@ def refine(given: Given) -> Refined:
 def _searched(given: Given, known: Rate, before: Filter | None, not_accepted: Rate, rays: Rays) -> Refined:
     seconds = given.window_us / 1e6
     prior = _prior(known, before, seconds)
-    found = search(rays, given.view.grid, prior, _guesses(given.twist[3:], known, before, seconds))
+    found = search(rays, given.view.grid, prior, _guesses(known, before, seconds))
     covariance = np.asarray(np.linalg.inv(found.information / _DISPERSION + prior.information) / seconds**2, np.float64)
     outcome = _outcome(found, agreement(found), rays, known, covariance, seconds)
     if outcome != "accepted":
@@ -177,10 +176,9 @@ def _prior(known: Rate, before: Filter | None, seconds: float) -> Gaussian:
     return Gaussian(np.linalg.solve(information, weighted) * seconds, information / seconds**2)
 
 
-def _guesses(network: Array, known: Rate, before: Filter | None, seconds: float) -> list[Array]:
-    """Where the search begins: the network or gyroscope, twice the network (it is often low), and the last motion."""
-    rates = [known.w_rad_s, 2 * network]
-    guesses = [np.concatenate([rate, np.zeros(3)]) * seconds for rate in rates]
+def _guesses(known: Rate, before: Filter | None, seconds: float) -> list[Array]:
+    """Where the search begins: the network, twice its rate (it is often low), and the last motion."""
+    guesses = [np.concatenate([rate, np.zeros(3)]) * seconds for rate in (known.w_rad_s, 2 * known.w_rad_s)]
     return guesses if before is None else [*guesses, before.motion * seconds]
 
 

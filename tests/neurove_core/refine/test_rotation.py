@@ -5,7 +5,7 @@ import pytest
 
 from neurove_core.ingest.sample import Sample
 from neurove_core.refine import rotation
-from neurove_core.refine.rotation import Filter, Given, Rate, refine
+from neurove_core.refine.rotation import Filter, Given, refine
 from neurove_core.refine.view import MAX_PIXELS, View
 from neurove_protocol import CameraInfo
 from tests.neurove_core.evaluation.test_contrast import of_rotation, of_slide
@@ -94,15 +94,6 @@ def test_a_fast_drive_leaves_the_answer_of_the_network():
     rejected("moving", v=(0.0, 0.0, 8.0))
     assert refine(given(v=(0.0, 0.0, 8.0), height_m=10.0)).outcome == "accepted"
     assert refine(given(v=(0.0, 0.0, 1.3), covariance=np.diag([1, 1, 1, 0.3, 0.3, 0.3]) ** 2)).outcome == "accepted"
-
-
-def test_a_gyroscope_takes_the_place_of_the_network():
-    gyro = Rate(W + 0.02, np.eye(3) * 1e-6)
-    found = refine(given(gyro=gyro))
-    np.testing.assert_allclose(found.rate.w_rad_s, gyro.w_rad_s, atol=0.01)
-    without_events = refine(given(gyro=gyro, low_activity=True))
-    np.testing.assert_array_equal(without_events.rate.w_rad_s, gyro.w_rad_s)
-    np.testing.assert_array_equal(without_events.rate.covariance, gyro.covariance)
 
 
 def test_the_result_depends_on_nothing_but_what_is_given():
