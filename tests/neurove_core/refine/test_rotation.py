@@ -74,9 +74,9 @@ def test_few_events_or_low_activity_leave_the_answer_of_the_network():
 
 
 def test_events_in_one_place_leave_the_answer_of_the_network():
-    rejected(
-        "narrow", sample=part(TURNING, np.abs(TURNING.x.astype(int) - 120) + np.abs(TURNING.y.astype(int) - 90) < 46)
-    )
+    dense = sample_of(of_rotation(ECD, W, 0.05, points=12000))
+    near = np.abs(dense.x.astype(int) - 120) + np.abs(dense.y.astype(int) - 90) < 30
+    rejected("narrow", sample=part(dense, near))
 
 
 def test_two_halves_that_turn_differently_leave_the_answer_of_the_network():
