@@ -16,7 +16,7 @@ The refined motion is accepted if
 - the events stay in the image, and the motion is at most MAX_TURN_RAD and MAX_SHIFT over the window;
 - the network does not contradict it: MAX_SIGMAS;
 - the network is not certain that the camera moves fast, which moves near and far things differently: MAX_SPEED;
-- the events tell more than the network.
+- the result is more certain than the network.
 Else the network's answer stands.
 """
 

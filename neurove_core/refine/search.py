@@ -146,7 +146,7 @@ class Agreement(NamedTuple):
 
 
 def agreement(found: Found) -> Agreement:
-    """Compare the motion of blocks of 3 x 3 tiles, weighted by what the events tell about each."""
+    """Compare the motion of blocks of 3 x 3 tiles, weighted by the information of each."""
     tiles = found.tiles
     events, gradient, hessian, square = map(_blocks, (tiles.events, tiles.gradient, tiles.hessian, tiles.square))
     weights, vectors = np.linalg.eigh(-hessian)
