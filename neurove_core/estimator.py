@@ -27,6 +27,7 @@ from neurove_core.networks.runner import Runner
 from neurove_core.refine.rotation import Filter, Given, Rate, refine
 from neurove_core.refine.search import compile_kernels
 from neurove_core.refine.view import View
+from neurove_core.timescales import Answer, Longer, chosen, followed, jobs, slowed
 from neurove_protocol import CameraInfo, Events, Sensor
 from neurove_protocol.errors import BadModel
 from neurove_protocol.events import EventPacket, PacketLimits, WireEvents, encode_packet
@@ -49,6 +50,7 @@ class StreamState(NamedTuple):
     view: View | None = None  # for the refinement; None where estimates are not refined
     filter: Filter | None = None  # of the refinement
     recent: Recent = ()  # counts of earlier windows, for models with a history
+    longer: Longer = Longer()  # for models with longer windows
 
 
 class WindowEstimate(NamedTuple):
@@ -86,6 +88,10 @@ class Push(NamedTuple):
     horizon_us: int
 
 
+Refined = tuple[WindowEstimate, StreamState]
+"""A refined estimate, and the state of the stream after it."""
+
+
 @dataclass
 class _Progress:
     """One stream during a push."""
@@ -95,7 +101,7 @@ class _Progress:
     lost: tuple[int, int, int] = (0, 0, 0)  # late events, events outside, skipped windows
     estimates: list[WindowEstimate] = field(default_factory=list)
 
-    def refine(self, refine_one: Callable[..., tuple[WindowEstimate, StreamState]]) -> None:
+    def refine(self, refine_one: Callable[..., Refined]) -> None:
         for index, window in enumerate(self.windows):
             self.estimates[index], self.state = refine_one(window, self.estimates[index], self.state)
 
@@ -177,7 +183,7 @@ class Estimator:
         Args:
             pushes: at most one packet of each stream.
         """
-        streams = [self._begin(push) for push in pushes]
+        streams = [_begin(push, self.to_windows(*push)) for push in pushes]
         self._answer(streams)
         for stream in streams:
             stream.refine(self.refine)
@@ -198,9 +204,7 @@ class Estimator:
         self._answer([stream])
         return stream.estimates, stream.state
 
-    def refine(
-        self, window: Window, estimate: WindowEstimate, state: StreamState
-    ) -> tuple[WindowEstimate, StreamState]:
+    def refine(self, window: Window, estimate: WindowEstimate, state: StreamState) -> Refined:
         """The last step of push: the angular part of an estimate, refined by the sample of its window.
 
         Args:
@@ -228,12 +232,6 @@ class Estimator:
         """Whether both models use the same windows and canonical camera, so that one can use the other's windows."""
         return (self.config.window, self.config.canonical) == (other.config.window, other.config.canonical)
 
-    def _begin(self, push: Push) -> _Progress:
-        pushed = self.to_windows(*push)
-        outside = sum(window.outside for window in pushed.windows)
-        lost = (pushed.late_events, outside, pushed.skipped_windows)
-        return _Progress(push.state._replace(windows=pushed.state), pushed.windows, lost)
-
     def _answer(self, streams: list[_Progress]) -> None:
         """Run all windows of some streams: the first window of each in one batch, then the second, and so on."""
         for turn in range(max((len(stream.windows) for stream in streams), default=0)):
@@ -245,14 +243,30 @@ class Estimator:
             for stream, (twists, network) in zip(due, steps, strict=True):
                 self._take(stream, stream.windows[turn], twists * self._scale + self._offset, network)
 
+    def _chosen(self, stream: _Progress, window: Window, answer: Answer) -> Answer:
+        """The answer of the time scale that fits the motion; longer windows run on the way."""
+        if not self.config.scales:
+            return answer
+        wanted, longer = jobs(window.counts, stream.state.longer, self.network, self.config)
+        runs = self._runner.run([job.counts for job in wanted], [job.state for job in wanted]) if wanted else []
+        longer = followed(longer, [(job, state) for job, (_, state) in zip(wanted, runs, strict=True)], self.config)
+        stream.state = stream.state._replace(longer=longer)
+        answers = [answer]
+        for job, (twists, state) in zip(wanted, runs, strict=True):
+            answers.append(Answer(slowed(twists * self._scale + self._offset, job.scale), state, job.scale))
+        return chosen(answers, longer.windows, self.config.scale_bounds)
+
     def _reset_after_gap(self, stream: _Progress, window: Window) -> None:
         """Reset the network state where a window does not follow the one before it."""
         if stream.state.end_us not in (None, window.start_us) and not window.bridged:
-            stream.state = stream.state._replace(network=self.network.initial_state(), age=0, recent=())
+            stream.state = stream.state._replace(
+                network=self.network.initial_state(), age=0, recent=(), longer=Longer()
+            )
 
     def _take(self, stream: _Progress, window: Window, twists: NDArray[np.float64], network: State) -> None:
+        answer = self._chosen(stream, window, Answer(twists, network))
         state = stream.state
-        stream.estimates.append(self._estimate(window, twists, network, state))
+        stream.estimates.append(self._estimate(window, answer, state))
         end_us = window.start_us + self.config.window.duration_us
         recent = remembered(window.counts, state.recent, self.config)
         stream.state = state._replace(network=network, age=state.age + 1, end_us=end_us, recent=recent)
@@ -264,30 +278,22 @@ class Estimator:
             BadModel: the model computes numbers that are not finite.
         """
         sensor = Sensor(self.config.canonical.width, self.config.canonical.height)
-        state = self.initial_state(sensor, _warm_camera(sensor) if self._refines else None)
-        if state.view is not None:
-            compile_kernels(state.view.grid)
-        for given in _warm_events(sensor, self.config.window.duration_us):
-            answer = self.push(given, state._replace(windows=WindowsState()), 0)
-            state = answer.state
-            finite = all(np.isfinite(estimate.twists).all() for estimate in answer.estimates)
-            if not (finite and state.network.finite()):  # a membrane of nan never fires, so the answer does not show it
-                raise BadModel(self.bundle.name, "it computes numbers that are not finite")
+        if not _is_finite(self, self.initial_state(sensor, _warm_camera(sensor) if self._refines else None)):
+            raise BadModel(self.bundle.name, "it computes numbers that are not finite")
 
-    def _covariance(self, state: State, metres: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Covariance (6, 6) of the twists of the window that led to this state, in the units of the estimate."""
+    def _covariance(self, answer: Answer, metres: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Covariance (6, 6) of the twists of an answer, in the units of the estimate."""
+        state = answer.network
         if not isinstance(self.network, NeuroVE) or not isinstance(state, NetworkState):
             return None
         log_sigma = self.network.log_sigma(state)
         if self.bundle.uncertainty is None or log_sigma is None:
             return None
-        return self.bundle.uncertainty.covariance(log_sigma[0].double().numpy(), self._scale * metres)
+        return self.bundle.uncertainty.covariance(log_sigma[0].double().numpy(), self._scale * metres / answer.scale)
 
-    def _estimate(
-        self, window: Window, twists: NDArray[np.float64], network: State, before: StreamState
-    ) -> WindowEstimate:
+    def _estimate(self, window: Window, answer: Answer, before: StreamState) -> WindowEstimate:
         metres, age = _to_metres(before.camera, self.bundle.linear_unit), before.age
-        twists, covariance = twists * metres, self._covariance(network, metres)
+        twists, covariance = answer.twists * metres, self._covariance(answer, metres)
         return WindowEstimate(
             start_us=window.start_us,
             end_us=window.start_us + self.config.window.duration_us,
@@ -302,6 +308,12 @@ class Estimator:
         )
 
 
+def _begin(push: Push, pushed: Pushed) -> _Progress:
+    outside = sum(window.outside for window in pushed.windows)
+    lost = (pushed.late_events, outside, pushed.skipped_windows)
+    return _Progress(push.state._replace(windows=pushed.state), pushed.windows, lost)
+
+
 def _with_rate(
     twists: NDArray[np.float64], covariance: NDArray[np.float64], rate: Rate
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -310,6 +322,19 @@ def _with_rate(
     twists[:, 3:] = rate.w_rad_s
     joint[:3, :3], joint[3:, 3:] = covariance[:3, :3], (rate.covariance + rate.covariance.T) / 2
     return twists, joint
+
+
+def _is_finite(estimator: Estimator, state: StreamState) -> bool:
+    """Whether the estimates of some events are finite; this compiles all code."""
+    if state.view is not None:
+        compile_kernels(state.view.grid)
+    for given in _warm_events(state.sensor, estimator.config.window.duration_us):
+        answer = estimator.push(given, state._replace(windows=WindowsState()), 0)
+        state = answer.state
+        finite = all(np.isfinite(estimate.twists).all() for estimate in answer.estimates)
+        if not (finite and state.network.finite()):  # a membrane of nan never fires, so the answer does not show it
+            return False
+    return True
 
 
 def _warm_events(sensor: Sensor, duration_us: int) -> tuple[Events, WireEvents]:
