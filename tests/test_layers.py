@@ -47,7 +47,7 @@ MAY_IMPORT = {
         "engine models estimator self_test io io.formats sim sources"
     ),
     "neurove_core.bench": (
-        "config compiled figures geometry spiking ingest networks engine models estimator sim sources"
+        "config compiled figures geometry spiking ingest networks engine models refine estimator sim sources"
     ),
     "neurove_core.experiments": (
         "config files extras figures spiking ingest networks engine models estimator io sim sources evaluation training"
