@@ -267,8 +267,11 @@ def _window_means(
 
 def _stationary_rotation(name: str, estimator: Estimator, folder: Path) -> Measurement:
     series = _estimate_series(estimator, folder / name)
-    rates = np.linalg.norm(series.twist[series.later(*_STATIONARY_S), 3:], axis=1)
-    return Measurement(float(rates.max()), {"median": float(np.median(rates))})
+    speeds, rates = (
+        np.linalg.norm(series.twist[series.later(*_STATIONARY_S), part], axis=1) for part in (slice(0, 3), slice(3, 6))
+    )
+    made_of = {"median": float(np.median(rates)), "speed at 1 m [m/s]": float(np.median(speeds))}
+    return Measurement(float(rates.max()), made_of)
 
 
 def _gyro_sign(name: str, estimator: Estimator, folder: Path) -> Measurement:
@@ -306,6 +309,10 @@ def _check(
 
 
 _UNIT, _SHAPES = "the pan-tilt unit", "the gyro, less its bias"
+_TURNING, _SPEED = "turning at rest [rad/s]", "speed at rest at 1 m [m/s]"
+STATIONARY_CHECKS: Final = (_TURNING, _SPEED)
+"""Checks of the three recordings of a stationary camera, one for each."""
+
 _REST: Final = "a stationary camera"
 
 CHECKS: Final = (
@@ -325,7 +332,7 @@ CHECKS: Final = (
     _check("ecd/shapes_rotation_1.43s.txt", "yaw, RMS error [rad/s]", _SHAPES, (-math.inf, 0.06), _profile_error),
     _check(
         "ecd/shapes_rotation_1.43s.txt",
-        "turning at rest [rad/s]",
+        _TURNING,
         _REST,
         (-math.inf, STATIONARY_RAD_S),
         _stationary_rotation,
@@ -341,7 +348,7 @@ CHECKS: Final = (
         _check(f"aedat4/{name}.aedat4", what, _REST, span, measure)
         for name in ("davis346", "dvxplorer")
         for what, span, measure in (
-            ("speed at rest at 1 m [m/s]", (-math.inf, STATIONARY_M_S), _stationary_speed),
+            (_SPEED, (-math.inf, STATIONARY_M_S), _stationary_speed),
             ("share of windows flagged low activity", (0.5, math.inf), _low_activity),
         )
     ),

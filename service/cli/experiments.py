@@ -95,6 +95,30 @@ def reproduce_real(args: argparse.Namespace) -> int:
     return EXIT_FAILURE
 
 
+def reproduce_motion(args: argparse.Namespace) -> int:
+    """Evaluate a model on slow and fast drives, constant motion, rooms and real events, against what is asked of it."""
+    import torch
+
+    from neurove_core import models
+    from neurove_core.estimator import Estimator
+    from neurove_core.experiments.motion import run, sets
+
+    groups = args.sets.split(",") if args.sets else (*sets.GROUPS, sets.REAL)
+    if args.recordings and not args.recordings.is_dir():
+        raise InvalidField("reproduce", "--recordings", str(args.recordings), "it is not a folder")
+    for folder in (args.out, args.data):
+        _check_out(folder)
+    torch.set_num_threads(1)
+    estimator = Estimator(models.find(args.model))
+    with progress() as show:
+        found = run.run(estimator, groups, args.recordings, args.data, show, quick=args.quick)
+    results = {"model": estimator.bundle.info.model_dump()} | _made_by() | {"quick": args.quick} | found
+    print(json.dumps(results) if args.json else run.markdown(results), end="" if not args.json else "\n")
+    for file in run.save(results, args.out) if args.out else []:
+        print(f"wrote {file}", file=sys.stderr)
+    return 0
+
+
 def _real_rows(model: str, recordings: Path, out: Path | None) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Run all checks of a model, print the name of each, and write them into `out`.
 
@@ -184,6 +208,7 @@ def add_reproduce(parser: Parser) -> None:
     """Add the commands of `neurove reproduce`."""
     commands = parser.add_commands()
     _add_firing(subcommand(commands, "firing", reproduce_firing))
+    _add_motion(subcommand(commands, "motion", reproduce_motion))
     _add_repriming(subcommand(commands, "repriming", reproduce_repriming))
     _add_sine(subcommand(commands, "sine", reproduce_sine))
     _add_real(subcommand(commands, "real", reproduce_real))
@@ -193,6 +218,20 @@ def add_reproduce(parser: Parser) -> None:
 def _add_firing(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, metavar="N", help="seed of the first of ten runs; default 0")
     _add_out(parser, "folder for table and figure (PNG, SVG)")
+
+
+def _add_motion(parser: argparse.ArgumentParser) -> None:
+    about = "file of a bundle, or the name of a built-in model; default `default`"
+    parser.add_argument("model", nargs="?", default="default", metavar="BUNDLE", help=about)
+    about = "folder of real recordings and trajectories; without it their rows are skipped"
+    parser.add_argument("--recordings", type=Path, metavar="DIR", help=about)
+    about = "folder that keeps the simulated events, about 3 GB for all sets; default runs/motion"
+    parser.add_argument("--data", type=Path, default=Path("runs/motion"), metavar="DIR", help=about)
+    about = "sets to evaluate, separated by commas; default: all"
+    parser.add_argument("--sets", metavar="SET,...", help=about)
+    about = "one second of one recording per set through a tiny camera, to check that the command works"
+    parser.add_argument("--quick", action="store_true", help=about)
+    _add_out(parser, "folder for motion.json and motion.md")
 
 
 def _add_repriming(parser: argparse.ArgumentParser) -> None:
