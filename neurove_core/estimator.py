@@ -60,6 +60,7 @@ class WindowEstimate(NamedTuple):
     covariance: NDArray[np.float64] | None = None  # (6, 6) of each of these twists, from the bundle's calibration
     uncertain: bool = False  # the linear or the angular sigma exceeds both its bounds, see Uncertainty.is_uncertain
     source: Source = "network"  # of the angular part
+    gyro_disagrees: bool = False  # the events and the gyroscope of the camera disagree
 
 
 class PushResult(NamedTuple):
@@ -124,7 +125,7 @@ class Estimator:
         return StreamState(sensor, camera, lut, WindowsState(), network, 0, low_activity_below=least)
 
     def estimates(self, recording: Recording, camera: CameraInfo | None = None) -> Iterator[WindowEstimate]:
-        """Estimates of all complete windows of a recording, in order, as the service answers its packets.
+        """Estimates of all complete windows of a recording by its events alone, as the service answers its packets.
 
         Args:
             recording: source of events, see `open_source`.
@@ -177,6 +178,11 @@ class Estimator:
         stream = _Progress(state, tuple(complete))
         self._answer([stream])
         return stream.estimates, stream.state
+
+    def is_uncertain(self, twists: NDArray[np.float64], covariance: NDArray[np.float64]) -> bool:
+        """Whether sigma exceeds the bounds, see `Uncertainty.is_uncertain`; False for a model without uncertainty."""
+        unsure = self.bundle.uncertainty
+        return unsure is not None and unsure.is_uncertain(twists, covariance, self._bounds)
 
     def has_same_windows(self, other: "Estimator") -> bool:
         """Whether both models use the same windows and canonical camera, so that one can use the other's windows."""
