@@ -16,6 +16,7 @@ from neurove_protocol.errors import EXIT_FAILURE, InvalidField, NeuroVEError
 from neurove_protocol.imu import decode_imu, encode_imu
 from neurove_service import logs
 from neurove_service.cli.arguments import (
+    add_axes_flag,
     add_force,
     add_lens_flags,
     add_recording_flags,
@@ -151,6 +152,7 @@ def estimate(args: argparse.Namespace) -> int:
 
     from neurove_core import models
     from neurove_core.estimator import Estimator
+    from neurove_core.io.axes import with_axes
     from neurove_core.io.calibration import lens_of
     from neurove_core.io.formats.estimate_files import WRITERS, estimate_file
     from neurove_core.sources import open_source
@@ -159,7 +161,7 @@ def estimate(args: argparse.Namespace) -> int:
     path: Path = args.out
     if path.suffix not in WRITERS:
         raise InvalidField("estimate", "--out", str(path), f"its name must end in {', '.join(WRITERS)}")
-    recording = open_source(args.source, args.sensor, args.topic, args.time_unit)
+    recording = with_axes(open_source(args.source, args.sensor, args.topic, args.time_unit), args.imu_axes)
     if recording.endless and args.seconds in (None, math.inf):
         raise InvalidField("estimate", "RECORDING", args.source, "it never ends: give --seconds S")
     refuse_existing("estimate", "--out", path, args.source, force=args.force)
@@ -265,6 +267,7 @@ def add_estimate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--model", default="default", metavar="BUNDLE", help=about)
     add_lens_flags(parser)
     add_recording_flags(parser)
+    add_axes_flag(parser)
     parser.add_argument("--no-imu", action="store_true", help="use the events alone, not the inertial samples")
     parser.add_argument("--seconds", type=duration, metavar="S", help="seconds of the recording to read; default: all")
     add_force(parser, "FILE")
