@@ -48,8 +48,8 @@ MAY_IMPORT = {
         "config compiled figures geometry spiking ingest networks engine models estimator sim sources"
     ),
     "neurove_core.experiments": (
-        "config files extras figures geometry spiking ingest networks engine models estimator io sim sources evaluation "
-        "training"
+        "config files extras figures geometry spiking ingest networks engine models estimator io sim sources "
+        "evaluation training"
     ),
     "neurove_core": "spiking models estimator sources",
     # neurove_service
