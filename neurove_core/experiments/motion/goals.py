@@ -17,6 +17,8 @@ class Goal(NamedTuple):
     what: str
     must: tuple[Span, ...]
     goal: tuple[Span, ...]
+    must_text: str = ""  # by default, the spans
+    goal_text: str = ""
 
 
 def row(goal: Goal, found: Sequence[float] | None, skipped: str | None = None) -> dict[str, Any]:
@@ -33,7 +35,8 @@ def row(goal: Goal, found: Sequence[float] | None, skipped: str | None = None) -
     reached = None
     if found is not None:
         reached = "goal" if _within(found, goal.goal) else "must" if _within(found, goal.must) else "no"
-    texts = {"group": goal.group, "what": goal.what, "must": _text(goal.must), "goal": _text(goal.goal)}
+    texts = {"group": goal.group, "what": goal.what, "must": goal.must_text or _text(goal.must)}
+    texts["goal"] = goal.goal_text or _text(goal.goal)
     return texts | {"found": None if found is None else list(found), "reached": reached, "skipped": skipped}
 
 
@@ -64,11 +67,11 @@ def at_least(group: str, what: str, must: float, goal: float) -> Goal:
 
 def around(group: str, what: str, values: Sequence[float], must: Sequence[float], goal: Sequence[float]) -> Goal:
     """A figure with true values, and how far each may be off."""
-    spans = [
+    first, second = (
         tuple((round(value - off, 6), round(value + off, 6)) for value, off in zip(values, offs, strict=True))
         for offs in (must, goal)
-    ]
-    return Goal(group, what, *spans)
+    )
+    return Goal(group, what, first, second)
 
 
 GOALS: Final = (
@@ -90,7 +93,13 @@ GOALS: Final = (
 def forward_goals(heights_m: Sequence[float], speeds_m_s: Sequence[float]) -> list[Goal]:
     """A constant speed: within 15 % or 0.1 m/s, and within 5 %."""
     must, goal = [max(0.15 * speed, 0.1) for speed in speeds_m_s], [0.05 * speed for speed in speeds_m_s]
-    return [around("forward", f"vz at {height:g} m [m/s]", speeds_m_s, must, goal) for height in heights_m]
+    wanted = ", ".join(f"{speed:g}" for speed in speeds_m_s)
+    return [
+        around("forward", f"vz at {height:g} m [m/s]", speeds_m_s, must, goal)._replace(
+            must_text=f"{wanted}; within 15 % or 0.1", goal_text="within 5 %"
+        )
+        for height in heights_m
+    ]
 
 
 UNCERTAIN: Final = at_most("forward", "share of uncertain estimates", 0.1, 0.0)
