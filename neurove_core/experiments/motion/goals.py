@@ -80,6 +80,7 @@ GOALS: Final = (
     at_most("drives", "v_a RMSE [deg/s]", 1.5, 0.8),
     at_least("drives", "pitch rate, correlation", 0.7, 0.9),
     at_least("drives", "roll rate, correlation", 0.7, 0.9),
+    at_most("aided", "v_a RE", 0.1, 0.05),
     at_most("slow", "v_l RE", 0.06, 0.04),
     at_most("streets", "v_l RE", 0.06, 0.04),
     at_most("cameras", "v_l RE", 0.08, 0.05),

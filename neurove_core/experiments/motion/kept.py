@@ -17,6 +17,7 @@ from neurove_core.io.recording import CHUNK_EVENTS, EventsOnly
 from neurove_core.sim.simulate import Simulation
 from neurove_protocol import CameraInfo, Events, Sensor
 from neurove_protocol.errors import InvalidField
+from neurove_protocol.imu import Imu
 
 _FORMAT: Final = 1  # of the files, and of what the simulator makes of the same values
 _KEY_POINTS: Final = 16  # positions of a trajectory that enter the key of its file
@@ -44,6 +45,15 @@ class KeptRecording(EventsOnly):
         """False."""
         return False
 
+    @property
+    def streams(self) -> tuple[str, ...]:
+        """Those of the simulation."""
+        return self.simulation.streams
+
+    def imu(self) -> Iterator[Imu]:
+        """The samples of the simulated unit, if there is one."""
+        return self.simulation.imu()
+
     def camera(self, stream: str) -> CameraInfo:
         """The lens and its height above the ground."""
         return self.simulation.camera(stream)
@@ -64,7 +74,8 @@ class KeptRecording(EventsOnly):
 def kept(item: Item, folder: Path) -> KeptRecording:
     """The recording of an item; it is simulated and written into the folder if it is not there.
 
-    A file has two uint32 per event: the time [us], and twice the number of the pixel plus the polarity.
+    The file does not depend on the inertial unit, whose samples are made anew. It has two uint32 per event: the time
+    [us], and twice the number of the pixel plus the polarity.
 
     Raises:
         InvalidField: the file cannot be written.

@@ -54,7 +54,8 @@ def run(
         recording = kept(item, data)
         truth = recording.twists()
         assert truth is not None  # a simulation with an end has its truth
-        found.setdefault(item.group, []).append((item.name, evaluate(estimate_recording(estimator, recording), truth)))
+        estimates = estimate_recording(estimator, recording, inertial="imu" in recording.streams)
+        found.setdefault(item.group, []).append((item.name, evaluate(estimates, truth)))
     rows = simulated_rows(found, groups)
     if sets.REAL in groups:
         rows += _real_rows(estimator, recordings)

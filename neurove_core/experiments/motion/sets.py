@@ -12,6 +12,7 @@ import numpy as np
 
 from neurove_core import models
 from neurove_core.experiments.velocity.held_out import HEIGHT_M, held_out_scenarios
+from neurove_core.sim.inertial import ImuConfig
 from neurove_core.sim.motion.trajectory import Trajectory, driving, parse_trajectory, rotation, slider
 from neurove_core.sim.render.camera import DEFAULT_CAMERA, named_camera
 from neurove_core.sim.simulate import Simulation, simulate
@@ -38,6 +39,7 @@ GROUPS: Final = {
     "cameras": "drives that turn, five other lenses and resolutions",
     "heights": "drives that turn, camera at 0.3 to 2.5 m",
     "drives": "the ten drives of heldout.txt, 24 s each",
+    "aided": "the same with the samples of a simulated gyroscope (bias 0.01, noise 0.003 rad/s) and accelerometer",
 }
 """The sets, cheapest first, with their descriptions."""
 
@@ -118,9 +120,10 @@ def _items_of(group: str, recordings: Path | None) -> Iterator[Item]:
             yield Item(
                 group, f"{speed:g} m/s at {height_m:g} m", _simulated("street", trajectory, height_m, 5010 + number)
             )
-    elif group == "drives":
+    elif group in ("drives", "aided"):
+        unit = ImuConfig() if group == "aided" else None
         for url in (Path(models.__file__).parent / "heldout.txt").read_text().split():
-            yield Item(group, url.removeprefix("sim://"), simulation_of(url))
+            yield Item(group, url.removeprefix("sim://"), replace(simulation_of(url), imu_config=unit))
     else:
         for scenario in held_out_scenarios():
             if scenario.group == _OF_VELOCITY[group]:
