@@ -44,7 +44,7 @@ MAY_IMPORT = {
     "neurove_core.evaluation": "compiled figures geometry networks models estimator inertial aided io",
     "neurove_core.training": (
         "config files extras figures geometry ingest networks "
-        "engine models estimator self_test io io.formats sim sources"
+        "engine models estimator self_test io io.formats sim sources timescales"
     ),
     "neurove_core.bench": (
         "config compiled figures geometry spiking ingest networks engine models estimator sim sources"
