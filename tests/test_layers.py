@@ -42,6 +42,9 @@ MAY_IMPORT = {
         "config files extras figures geometry ingest networks "
         "engine models estimator self_test io io.formats sim sources"
     ),
+    "neurove_core.adaptation": (
+        "config files geometry models estimator io io.formats sources evaluation training"
+    ),
     "neurove_core.bench": (
         "config compiled figures geometry spiking ingest networks engine models estimator sim sources"
     ),
