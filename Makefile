@@ -23,7 +23,7 @@ test: $(VENV)/installed $(VENV)/packages
 	$(BIN)/pytest --numprocesses $(JOBS) --dist loadgroup --no-loadscope-reorder --cov --cov-report=term
 
 picture: $(VENV)/installed  # the picture in README, of a simulated street with its truth
-	@$(BIN)/neurove demo "sim://street?seed=7&seconds=8" --screenshot service/pictures/demo.svg
+	@$(BIN)/neurove demo "sim://street?seed=7&seconds=8" --force --screenshot service/pictures/demo.svg
 
 format: $(VENV)/installed
 	$(BIN)/ruff format .

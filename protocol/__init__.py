@@ -7,6 +7,7 @@ README.md in this folder is the contract.
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.events import EVENT_DTYPE, EventPacket, Events, Sensor
+from neurove_protocol.imu import Imu, ImuPacket
 from neurove_protocol.velocity import Flag, HostTime, Trace, Twist, TwistEstimate
 
 __all__ = [
@@ -16,6 +17,8 @@ __all__ = [
     "Events",
     "Flag",
     "HostTime",
+    "Imu",
+    "ImuPacket",
     "NeuroVEError",
     "Sensor",
     "Trace",

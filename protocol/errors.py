@@ -169,14 +169,23 @@ class UnknownFormat(InputError):
 
 
 class BlobLength(InputError):
-    """The event blob is not n times the record size of its format."""
+    """A blob is not n times the size of one record."""
 
     code = "blob_length"
 
-    def __init__(self, got: int, n: int, record_bytes: int) -> None:
+    def __init__(
+        self,
+        got: int,
+        n: int,
+        record_bytes: int,
+        *,
+        what: str = "event packet",
+        field: str = "data",
+        items: str = "events",
+    ) -> None:
         super().__init__(
-            f"event packet: data is {got} bytes, n={n} events of {record_bytes} bytes need {n * record_bytes}",
-            field="data",
+            f"{what}: {field} is {got} bytes, n={n} {items} of {record_bytes} bytes need {n * record_bytes}",
+            field=field,
             value=got,
             bound=n * record_bytes,
         )
@@ -196,9 +205,9 @@ class TimeBackwards(InputError):
 
     code = "time_backwards"
 
-    def __init__(self, index: int, before_us: int, t_us: int) -> None:
+    def __init__(self, index: int, before_us: int, t_us: int, item: str = "event") -> None:
         super().__init__(
-            f"event {index} at t={t_us} us comes after t={before_us} us: time runs backwards",
+            f"{item} {index} at t={t_us} us comes after t={before_us} us: time runs backwards",
             index=index,
             value=t_us,
             bound=before_us,

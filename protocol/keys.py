@@ -63,6 +63,10 @@ class Keys:
         """CameraInfo of a stream; put at start and answered on query by the driver."""
         return self._of_stream(stream, "camera")
 
+    def imu(self, stream: str = "*") -> str:
+        """IMU packets of a stream; driver to service."""
+        return self._of_stream(stream, "imu")
+
     def velocity(self, stream: str = "*") -> str:
         """Twist estimates of a stream; service to anyone."""
         return self._of_stream(stream, "velocity")
@@ -126,7 +130,7 @@ class Keys:
         return check_name("node", name)
 
     def stream_of(self, key: str) -> str:
-        """The stream that a concrete stream key (events, camera, velocity, status) belongs to.
+        """The stream that a concrete stream key (events, camera, imu, velocity, status) belongs to.
 
         Raises:
             InvalidField: the key is not below this prefix, or its stream is no valid name.

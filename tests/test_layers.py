@@ -68,7 +68,7 @@ MAY_IMPORT = {
         "core:config core:geometry core:ingest core:networks core:models core:estimator logs guard"
     ),
     "neurove_service.models": (
-        "core:config core:files core:ingest core:networks core:models core:estimator core:self_test logs streams"
+        "core:config core:files core:ingest core:networks core:models core:estimator core:self_test logs guard streams"
     ),
     "neurove_service.clients": (
         "core:config core:geometry core:ingest core:io core:io.formats core:bench logs config transport"

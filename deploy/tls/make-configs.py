@@ -58,19 +58,20 @@ Rule = tuple[str, list[str], list[str]]
 def _rules(role: str, name: str, prefix: str) -> list[Rule]:
     """List what a participant may send (IN) and receive (OUT): flow, kinds of message, key expressions."""
     node = f"{prefix}/@node/*"
-    events, camera = f"{prefix}/*/events", f"{prefix}/*/camera"
+    events, camera, imu = f"{prefix}/*/events", f"{prefix}/*/camera", f"{prefix}/*/imu"
     results = [f"{prefix}/*/velocity", f"{prefix}/*/status"]
     asked = [f"{node}/health", f"{node}/models"]
     change, chunks = f"{node}/model/**", f"{prefix}/@push/**"
     own = f"{prefix}/@node/{name}"
-    if role == "driver":  # events and camera of its own stream
+    if role == "driver":  # events, camera and IMU of its own stream
+        published = [f"{prefix}/{name}/{kind}" for kind in ("events", "camera", "imu")]
         return [
-            *_publishes([f"{prefix}/{name}/events", f"{prefix}/{name}/camera"], heard_as=[events, camera]),
+            *_publishes(published, heard_as=[events, camera, imu]),
             *_answers([f"{prefix}/{name}/camera"], asked_as=[camera]),
         ]
     if role == "node":  # everything that the service does, under its own name
         return [
-            *_hears([events, camera]),
+            *_hears([events, camera, imu]),
             *_asks([camera, chunks]),
             *_publishes(results, heard_as=results),
             *_answers([f"{own}/health", f"{own}/models", f"{own}/model/**"], asked_as=[*asked, change]),
@@ -86,8 +87,8 @@ def _rules(role: str, name: str, prefix: str) -> list[Rule]:
         (IN, ["liveliness_query", "declare_liveliness_subscriber"], tokens),
         (OUT, ["liveliness_token"], tokens),
     ]
-    if role == "recorder":  # as a consumer, and events
-        return [*reads, *_hears([events, camera]), *_asks([camera])]
+    if role == "recorder":  # as a consumer, and what drivers publish
+        return [*reads, *_hears([events, camera, imu]), *_asks([camera])]
     if role == "operator":  # as a consumer, and model changes
         return [*reads, *_asks([change]), *_answers([chunks], asked_as=[chunks])]
     return reads if role == "consumer" else []

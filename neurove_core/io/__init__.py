@@ -7,8 +7,9 @@ folder explains how to add a format.
 from neurove_core.io.errors import BrokenRecording, MissingFilter, MissingGeometry, RecordingError, UnknownSource
 from neurove_core.io.faults import Fault, Faults, Reason, Tally
 from neurove_core.io.format import Format, UrlFormat
-from neurove_core.io.recording import EventsOnly, Frame, Imu, Recording, Triggers, refuse_topic
+from neurove_core.io.recording import EventsOnly, Frame, Recording, Triggers, refuse_topic
 from neurove_core.io.units import DoubtfulUnit, Timed, TimeSample
+from neurove_protocol.imu import Imu
 
 __all__ = [
     "BrokenRecording",

@@ -27,10 +27,11 @@ from neurove_core.extras import MissingExtra
 from neurove_core.files import pointer_fault
 from neurove_core.geometry.motion import Poses, Twists
 from neurove_core.io.faults import Faults
-from neurove_core.io.recording import Frame, Imu, Recording, Triggers
+from neurove_core.io.recording import Frame, Recording, Triggers
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
+from neurove_protocol.imu import Imu
 
 MAX_BYTES: Final = 256 << 10
 """Longest calibration file [bytes]; one of a camera has some 2 kB."""

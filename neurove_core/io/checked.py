@@ -9,9 +9,10 @@ from neurove_core.geometry.motion import Poses, Twists
 from neurove_core.io.errors import BrokenRecording
 from neurove_core.io.faults import Reason, Tally
 from neurove_core.io.order import Order, T, Where
-from neurove_core.io.recording import CHUNK_EVENTS, Imu, Recording, in_chunks
+from neurove_core.io.recording import CHUNK_EVENTS, Recording, in_chunks
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
+from neurove_protocol.imu import Imu
 
 V = TypeVar("V")
 

@@ -13,20 +13,13 @@ from neurove_core.io.errors import UnknownSource
 from neurove_core.io.faults import Faults
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.events import Events, Sensor
+from neurove_protocol.imu import Imu
 
 CHUNK_EVENTS: Final = 1 << 18
 """Maximum number of events in one chunk. An event has 13 bytes, so a chunk has at most 3.4 MB."""
 
 BLOCK_BYTES: Final = 4 << 20
 """Size of the blocks in which a file is read [bytes]."""
-
-
-class Imu(NamedTuple):
-    """Samples of an inertial measurement unit (IMU), ordered by time, in SI units."""
-
-    t: NDArray[np.int64]  # (N,) sensor clock [us]
-    accel_m_s2: NDArray[np.float64]  # (N, 3) specific force
-    gyro_rad_s: NDArray[np.float64]  # (N, 3)
 
 
 class Triggers(NamedTuple):

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from neurove_core.geometry.motion import Twists
 from neurove_core.io.errors import BrokenRecording
 from neurove_core.io.faults import Fault
-from neurove_core.io.recording import Imu, Recording
+from neurove_core.io.recording import Recording
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
+from neurove_protocol.imu import Imu
 
 PEAK_US: Final = 10_000
 """Length of the intervals for the peak rate [us]. The first interval starts at the first event."""

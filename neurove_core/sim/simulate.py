@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from neurove_core.geometry.motion import Twists
 from neurove_core.io.recording import EventsOnly, in_chunks
+from neurove_core.sim import inertial
 from neurove_core.sim.motion.trajectory import Mounted, Trajectory
 from neurove_core.sim.render.camera import Camera, Rays, rays_of
 from neurove_core.sim.render.cull import Candidates, candidates_of
@@ -34,6 +35,7 @@ from neurove_core.sim.world.textures import make_textures
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
+from neurove_protocol.imu import Imu
 
 INTERVAL_US: Final = 20_000
 """Time that is simulated at once; the events of one interval are a chunk."""
@@ -88,6 +90,7 @@ class Simulation(EventsOnly):
     seed: int
     duration_s: float  # infinite for one without end
     next_trajectory: Callable[[int], CameraPath] | None = None  # trajectory number 1, 2, ...; None: there is only one
+    imu_config: inertial.ImuConfig | None = None  # of the inertial unit; None: the camera has none
     motion_px: float = MOTION_PX  # a larger bound is faster, and less exact in the times of events; training uses one
 
     @property
@@ -107,8 +110,8 @@ class Simulation(EventsOnly):
 
     @property
     def streams(self) -> tuple[str, ...]:
-        """Events and twists. An endless simulation has no twists here; `steps` has them."""
-        return ("events",) if self.endless else ("events", "twists")
+        """Events, imu if there is a unit, and twists. An endless simulation has no twists here; `steps` has them."""
+        return ("events", *["imu"] * (self.imu_config is not None), *["twists"] * (not self.endless))
 
     def camera(self, stream: str) -> CameraInfo:
         """The lens and its height above the ground."""
@@ -125,6 +128,20 @@ class Simulation(EventsOnly):
             return None
         t_us = np.arange(0, round(self.duration_s * 1e6) + 1, 1_000_000 // TRUTH_HZ, dtype=np.int64)
         return Twists(t_us, self.trajectory.twist(t_us / 1e6))
+
+    def imu(self) -> Iterator[Imu]:
+        """The samples of the inertial unit in the optical frame, with gravity, bias and noise; see `inertial`."""
+        if self.imu_config is None:
+            return
+        if self.next_trajectory is None:
+            stop = round(min(self.duration_s, self.trajectory.duration_s) * 1e6)
+            yield from inertial.samples(self.trajectory, stop, self.imu_config, self.seed)
+            return
+        shift_us, trajectory = 0, self.trajectory
+        for number in itertools.count(1):
+            end_us = stop_us(trajectory)
+            yield from inertial.samples(trajectory, end_us, self.imu_config, self.seed, shift_us)
+            shift_us, trajectory = shift_us + end_us, self.next_trajectory(number)
 
     def steps(self, start_s: float = 0.0) -> Iterator[Step]:
         """All intervals with their events and truth, including intervals without events.

@@ -7,6 +7,7 @@ from urllib.parse import parse_qsl, urlsplit
 from neurove_core.io.errors import UnknownSource
 from neurove_core.io.format import UrlFormat
 from neurove_core.io.recording import refuse_topic
+from neurove_core.sim.inertial import ImuConfig
 from neurove_core.sim.motion.curves import Mounted, Trajectory
 from neurove_core.sim.motion.trajectory import parse_trajectory
 from neurove_core.sim.render.camera import DEFAULT_CAMERA, DEFAULT_HEIGHT_M, named_camera
@@ -28,7 +29,8 @@ TRAJECTORY_OF: Final = {
 """Default trajectory of each scene."""
 
 _SEEDED: Final = ("driving", "handheld")
-_FIELDS: Final = ("trajectory", "seed", "camera", "height", "pitch", "seconds")
+_UNIT: Final = ("imu", "gyro_bias", "gyro_noise", "imu_offset_ms")
+_FIELDS: Final = ("trajectory", "seed", "camera", "height", "pitch", "seconds", *_UNIT)
 
 
 def simulation_of(url: str, sensor: Sensor | None = None) -> Simulation:
@@ -42,7 +44,9 @@ def simulation_of(url: str, sensor: Sensor | None = None) -> Simulation:
 
     Args:
         url: its host is the scene; its parameters are trajectory, seed, camera, height [m], pitch [deg] and seconds,
-            each with a default. Parameters of the trajectory follow its name, with `&` written as `%26`.
+            each with a default. With imu=HZ the camera has an inertial unit of that rate, with gyro_bias and gyro_noise
+            [rad/s] and a clock that is late by imu_offset_ms. Parameters of the trajectory follow its name, with `&`
+            written as `%26`.
         sensor: if given, it must be that of the camera.
 
     Raises:
@@ -75,7 +79,35 @@ def simulation_of(url: str, sensor: Sensor | None = None) -> Simulation:
     first = trajectory(0)
     next_trajectory = trajectory if math.isinf(seconds) and text in _SEEDED else None
     duration_s = math.inf if next_trajectory else min(seconds, first.duration_s)
-    return Simulation(scene, make_scene, first, camera, PixelConfig(), seed, duration_s, next_trajectory)
+    unit = _unit(url, query)
+    return Simulation(scene, make_scene, first, camera, PixelConfig(), seed, duration_s, next_trajectory, unit)
+
+
+def _unit(url: str, query: dict[str, str]) -> ImuConfig | None:
+    """The inertial unit of a URL; None without the parameter imu."""
+    given = [field for field in _UNIT if field in query]
+    if "imu" not in query:
+        if given:
+            raise InvalidField(url, given[0], query[given[0]], "it needs imu=HZ, the rate of the inertial unit")
+        return None
+    usual = ImuConfig()
+    values = {}
+    for field, default, low, high in (
+        ("imu", usual.rate_hz, 10.0, 10_000.0),
+        ("gyro_bias", usual.gyro_bias_rad_s, 0.0, 1.0),
+        ("gyro_noise", usual.gyro_noise_rad_s, 0.0, 1.0),
+        ("imu_offset_ms", 0.0, -1000.0, 1000.0),
+    ):
+        value = values[field] = _number(url, query, field, default)
+        if not low <= value <= high:
+            raise InvalidField(url, field, query[field], f"must be {low:g} to {high:g}")
+    offset_us = round(values["imu_offset_ms"] * 1000)
+    return usual._replace(
+        rate_hz=values["imu"],
+        gyro_bias_rad_s=values["gyro_bias"],
+        gyro_noise_rad_s=values["gyro_noise"],
+        offset_us=offset_us,
+    )
 
 
 def _seed(url: str, text: str) -> int:

@@ -208,6 +208,11 @@ def refuse_existing(what: str, field: str, path: Path, source: str | None, *, fo
         raise InvalidField(what, field, str(path), "the file exists; --force replaces it")
 
 
+def add_force(parser: argparse.ArgumentParser, name: str) -> None:
+    """Add --force, which lets a command replace the file that it writes."""
+    parser.add_argument("--force", action="store_true", help=f"replace {name} if it exists")
+
+
 def check_folder(what: str, field: str, path: Path) -> None:
     """Create a folder for results, and refuse one that cannot be written, before the work begins.
 

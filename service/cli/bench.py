@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from neurove_protocol.errors import EXIT_FAILURE, NeuroVEError
-from neurove_service.cli.arguments import command, commit
+from neurove_service.cli.arguments import add_force, command, commit, refuse_existing
 
 if TYPE_CHECKING:
     from neurove_core.bench import Row
@@ -41,6 +41,8 @@ def bench(args: argparse.Namespace) -> int:
     from neurove_core.bench import chart, machine
 
     torch.set_num_threads(1)
+    for suffix in (".png", ".svg") if args.plot else ():
+        refuse_existing("bench", "--plot", args.plot.with_suffix(suffix), None, force=args.force)
     stamp = machine.stamp(commit())
     print(stamp, file=sys.stderr)
     rows: list[Row] = []
@@ -120,6 +122,7 @@ def add_bench(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("what", nargs="*", type=_benchmark, metavar="WHAT", help=f"any of {names}; default: all")
     parser.add_argument("--peers", action="store_true", help="measure the peers of the extra 'bench' too")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw a chart as FILE.png and FILE.svg")
+    add_force(parser, "FILE.png and FILE.svg")
     parser.add_argument(
         "--quick", action="store_true", help="small input, once, to compare the answers; its times mean nothing"
     )

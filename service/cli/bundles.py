@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neurove_protocol.errors import EXIT_FAILURE, BadModel, InvalidField, Untrusted
-from neurove_service.cli.arguments import Run, seed, subcommand
+from neurove_service.cli.arguments import Run, add_force, refuse_existing, seed, subcommand
 from neurove_service.cli.bundle_views import fields, lines, release_line
 from neurove_service.cli.parser import Parser
 
@@ -44,6 +44,7 @@ def new(args: argparse.Namespace) -> int:
     path: Path = args.file
     if path.suffix != bundle.SUFFIX:
         raise InvalidField("bundle new", "FILE", str(path), f"its name must end in {bundle.SUFFIX}")
+    refuse_existing("bundle new", "FILE", path, None, force=args.force)
     made = bundle.untrained(args.seed, name=path.stem)
     try:
         bundle.save(made, path)
@@ -62,6 +63,7 @@ def average(args: argparse.Namespace) -> int:
     path: Path = args.out
     if path.suffix != bundle.SUFFIX:
         raise InvalidField("bundle average", "--out", str(path), f"its name must end in {bundle.SUFFIX}")
+    refuse_existing("bundle average", "--out", path, None, force=args.force)
     made = averaging.average([bundle.from_bytes(_bundle(file), file.name) for file in args.files])
     try:
         bundle.save(made, path)
@@ -131,6 +133,7 @@ def sign(args: argparse.Namespace) -> int:
 
     key = signing_keys.read_private(_read(args.key, signing_keys.MAX_KEY_BYTES), str(args.key))
     data, path = _bundle(args.bundle), args.bundle.with_name(args.bundle.name + manifest.SUFFIX)
+    refuse_existing("bundle sign", "file", path, None, force=args.force)
     bundle.from_bytes(data, args.bundle.name)  # sign nothing that no node would load
     signature = manifest.sign(data, key, release=args.release, allow_downgrade=args.allow_downgrade)
     try:
@@ -222,17 +225,20 @@ def add_bundle(parser: Parser) -> None:
     one = subcommand(commands, "new", new, as_json=False)
     one.add_argument("file", type=Path, metavar="FILE", help="bundle to write, ending in .safetensors")
     one.add_argument("--seed", type=seed, default=0, metavar="N", help="seed of the weights; default 0")
+    add_force(one, "FILE")
     one = subcommand(commands, "inspect", inspect)
     one.add_argument("file", type=Path, metavar="BUNDLE", help="bundle to show, with BUNDLE.sig if it exists")
     _add_trust(one, default=[])
     one = subcommand(commands, "average", average)
     one.add_argument("files", type=Path, nargs="+", metavar="BUNDLE", help="2 to 8 bundles of one network")
     one.add_argument("--out", type=Path, required=True, metavar="FILE", help="bundle to write")
+    add_force(one, "FILE")
     one = subcommand(commands, "sign", sign)
     one.add_argument("bundle", type=Path, metavar="BUNDLE", help="bundle to sign")
     one.add_argument("--key", type=Path, required=True, metavar="KEY", help="private key from `neurove bundle keygen`")
     one.add_argument("--release", type=_release, metavar="N", help="release counter; default: that of the bundle")
     one.add_argument("--allow-downgrade", action="store_true", help="let nodes accept it after a higher release")
+    add_force(one, "BUNDLE.sig")
     one = subcommand(commands, "verify", verify)
     one.add_argument("bundle", type=Path, metavar="BUNDLE", help="bundle to check, with BUNDLE.sig next to it")
     _add_trust(one, required=True)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from neurove_protocol.control import CHUNK_SCHEMA, ActivateReply, ModelInfo, ProgressReply, PushReply
-from neurove_protocol.errors import EXIT_FAILURE, EXIT_PARTIAL, NeuroVEError
+from neurove_protocol.errors import EXIT_FAILURE, EXIT_PARTIAL, InvalidField, NeuroVEError
 from neurove_service.cli.arguments import add_client_flags, client_config, command, seconds
 from neurove_service.cli.waiting import Wait, add_wait
 from neurove_service.config import ClientConfig
@@ -35,13 +35,16 @@ def push(args: argparse.Namespace) -> int:
     from neurove_service.clients import ask
     from neurove_service.clients.push_source import PushSource
 
+    if args.force is not None and not args.activate:
+        raise InvalidField("push", "--force", args.force, "it is about the model change: give --activate too")
     with PushSource(args.bundle) as source:
 
         def change(transport: Any, config: ClientConfig, node: str) -> Outcome:
             done = _shown(args, ask.push(transport, config, source.request, node, _progress(args)))
             if not args.activate:
                 return done
-            return _shown(args, ask.activate(transport, config, source.digest, node, on_progress=_progress(args)))
+            wanted = {"force": args.force, "on_progress": _progress(args)}
+            return _shown(args, ask.activate(transport, config, source.digest, node, **wanted))
 
         return _each(
             args,
@@ -173,6 +176,7 @@ def add_push(parser: argparse.ArgumentParser) -> None:
     _add_nodes(command(parser, push))
     parser.add_argument("bundle", type=Path, metavar="BUNDLE", help="bundle to send, with BUNDLE.sig if it exists")
     parser.add_argument("--activate", action="store_true", help="make it the active model too")
+    _add_force(parser)
 
 
 def add_activate(parser: argparse.ArgumentParser) -> None:
@@ -184,8 +188,7 @@ def add_activate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--shadow", type=seconds, default=0.0, metavar="S", help=about)
     about = "change these streams only; default: all streams"
     parser.add_argument("--canary", type=_streams, default=(), metavar="STREAM,...", help=about)
-    about = "do not refuse the model for a difference from the active one; the reason is logged on the node"
-    parser.add_argument("--force", type=_reason, metavar="REASON", help=about)
+    _add_force(parser)
 
 
 def add_rollback(parser: argparse.ArgumentParser) -> None:
@@ -200,6 +203,11 @@ def _add_nodes(parser: argparse.ArgumentParser) -> None:
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--node", help="name of one node; default: the only node that is alive")
     where.add_argument("--all", action="store_true", help="change every node, one after the other")
+
+
+def _add_force(parser: argparse.ArgumentParser) -> None:
+    about = "do not refuse the model for a difference from the active one; the reason is logged on the node"
+    parser.add_argument("--force", type=_reason, metavar="REASON", help=about)
 
 
 def _add_expect(parser: argparse.ArgumentParser) -> None:

@@ -50,7 +50,7 @@ def run(
     model: str | None,
     stop: threading.Event,
     console: Console,
-    screenshot: str | None = None,
+    screenshot: Path | None = None,
     truth: Truth | None = None,
 ) -> dict[str, Any]:
     """Run driver, service and consumer on any source, and return a summary.
@@ -231,12 +231,12 @@ def _drained(
     return status
 
 
-def _draw(board: Board, file: str) -> None:
+def _draw(board: Board, file: Path) -> None:
     """Write the last table as a picture that loads nothing from the network."""
     console = Console(record=True, width=100, file=io.StringIO())
     console.print(board)
     svg = console.export_svg(title="neurove demo")
-    write_atomically(Path(file), re.sub(r"@font-face \{.*?\}", "", svg, flags=re.DOTALL).encode())
+    write_atomically(file, re.sub(r"@font-face \{.*?\}", "", svg, flags=re.DOTALL).encode())
 
 
 def _summary(source: str, sent: dict[str, Any], status: StreamStatus | None, board: Board) -> dict[str, Any]:

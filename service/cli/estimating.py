@@ -14,6 +14,7 @@ from neurove_protocol import CameraInfo, EventPacket, TwistEstimate
 from neurove_protocol.errors import EXIT_FAILURE, InvalidField, NeuroVEError
 from neurove_service import logs
 from neurove_service.cli.arguments import (
+    add_force,
     add_lens_flags,
     add_recording_flags,
     command,
@@ -243,4 +244,4 @@ def add_estimate(parser: argparse.ArgumentParser) -> None:
     add_lens_flags(parser)
     add_recording_flags(parser)
     parser.add_argument("--seconds", type=duration, metavar="S", help="seconds of the recording to read; default: all")
-    parser.add_argument("--force", action="store_true", help="replace FILE if it exists")
+    add_force(parser, "FILE")

@@ -15,6 +15,7 @@ from neurove_protocol.errors import EXIT_FAILURE, InvalidField, NeuroVEError
 from neurove_protocol.keys import check_name
 from neurove_service.cli.arguments import (
     add_client_flags,
+    add_force,
     add_lens_flags,
     add_recording_flags,
     client_config,
@@ -74,7 +75,9 @@ def _named(streams: tuple[str, ...] | None) -> str:
 
 def _line(stream: dict[str, Any]) -> str:
     lost = [f"{stream[name]:,} {name}" for name in ("missing", "dropped", "refused", "restarts") if stream[name]]
-    return ", ".join([f"{stream['packets']:,} packets, {stream['events']:,} events", *(lost or ["nothing lost"])])
+    held = [f"{stream['packets']:,} packets, {stream['events']:,} events"]
+    held += [f"{stream['samples']:,} IMU samples"] if stream["imu_packets"] else []
+    return ", ".join([*held, *(lost or ["nothing lost"])])
 
 
 @contextlib.contextmanager
@@ -160,6 +163,8 @@ def info(args: argparse.Namespace) -> int:
 
     opened = open_source(args.source, args.sensor, args.topic, args.time_unit)
     recording = with_lens(opened, args.calibration, args.height)
+    if args.plot:
+        refuse_existing("info", "--plot", args.plot, args.source, force=args.force)
     duration_s = args.seconds if args.seconds is not None else (_ENDLESS_S if recording.endless else None)
     surveyed = summary.survey(recording, duration_s)
     if args.plot:
@@ -228,7 +233,7 @@ def add_convert(parser: argparse.ArgumentParser) -> None:
         "out", type=Path, metavar="OUT", help="file to write, ending in .mcap (packet log) or .h5 (DSEC)"
     )
     add_recording_flags(parser)
-    parser.add_argument("--force", action="store_true", help="replace OUT if it exists")
+    add_force(parser, "OUT")
 
 
 def add_info(parser: argparse.ArgumentParser) -> None:
@@ -240,6 +245,7 @@ def add_info(parser: argparse.ArgumentParser) -> None:
     most = f"default: all, of an endless source {_ENDLESS_S:.0f} s"
     parser.add_argument("--seconds", type=duration, metavar="S", help=f"seconds of the source to read; {most}")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw events, rate and truth (.png or .svg)")
+    add_force(parser, "FILE")
 
 
 def add_simulate(parser: argparse.ArgumentParser) -> None:
@@ -249,7 +255,7 @@ def add_simulate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", metavar="SCENE", help=scenes)
     about = "file to write: .mcap (packet log) or .h5 (DSEC); .npz for carla"
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help=about)
-    parser.add_argument("--force", action="store_true", help="replace FILE if it exists")
+    add_force(parser, "FILE")
     parser.add_argument("--seconds", type=seconds, default=10.0, metavar="S", help="seconds to simulate; default 10 s")
     about = "seed of scene, trajectory and pixels; default 0"
     parser.add_argument("--seed", type=int, default=0, metavar="N", help=about)

@@ -7,12 +7,14 @@ import math
 import sys
 import threading
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from neurove_protocol.errors import EXIT_FAILURE, InvalidField
 from neurove_service import logs
 from neurove_service.cli.arguments import (
     add_client_flags,
+    add_force,
     add_lens_flags,
     add_playback_flags,
     add_service_flags,
@@ -20,6 +22,7 @@ from neurove_service.cli.arguments import (
     client_config,
     command,
     flags,
+    refuse_existing,
     subcommand,
     tell_faults,
 )
@@ -89,12 +92,19 @@ def drive(args: argparse.Namespace) -> int:
     if args.json:
         sensor = {"width": recording.sensor.width, "height": recording.sensor.height}
         found = [fault.as_json() for fault in faults.found]
-        played = {"packets": sent.packets, "events": sent.events, "broken": broken, "faults": found}
+        played = {
+            "packets": sent.packets,
+            "events": sent.events,
+            "samples": sent.samples,
+            "broken": broken,
+            "faults": found,
+        }
         print(json.dumps({"sensor": sensor, **played, "behind_s": round(sent.behind_s, 3)}))
     else:
         about = f"{recording.name} ({recording.sensor})"
         late = f", up to {sent.behind_s:.1f} s behind real time" if sent.behind_s > BEHIND_S else ""
-        print(f"{player.label}: {sent.packets:,} packets, {sent.events:,} events of {about}{late}")
+        inertial = f" and {sent.samples:,} IMU samples" if sent.samples else ""
+        print(f"{player.label}: {sent.packets:,} packets, {sent.events:,} events{inertial} of {about}{late}")
     if sent.broken:
         print(f"neurove: {broken}", file=sys.stderr)
     tell_faults(recording)
@@ -149,6 +159,8 @@ def demo(args: argparse.Namespace) -> int:
     logs.configure("warning")
     opened = open_source(args.source, args.sensor, args.topic, args.time_unit)
     recording = with_lens(opened, args.calibration, args.height)
+    if args.screenshot:
+        refuse_existing("demo", "--screenshot", args.screenshot, args.source, force=args.force)
     endless = recording.endless
     shown = console(stderr=args.json)
     duration_s = args.seconds
@@ -231,7 +243,8 @@ def add_demo(parser: argparse.ArgumentParser) -> None:
     add_playback_flags(parser, f"seconds of the source to play; default: until its end or Ctrl-C, {most}")
     about = "bundle to serve, or the name of a built-in model; default `default`"
     parser.add_argument("--model", metavar="BUNDLE", help=about)
-    parser.add_argument("--screenshot", metavar="FILE", help="write the last live table as SVG")
+    parser.add_argument("--screenshot", type=Path, metavar="FILE", help="write the last live table as SVG")
+    add_force(parser, "FILE")
 
 
 def add_serve(parser: argparse.ArgumentParser) -> None:

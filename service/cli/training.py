@@ -7,12 +7,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from neurove_protocol.errors import InvalidField
 from neurove_service.cli.arguments import (
+    add_force,
     add_lens_flags,
     add_recording_flags,
     check_folder,
     command,
     count,
+    refuse_existing,
     sigma,
     tell_faults,
 )
@@ -30,12 +33,15 @@ def train(args: argparse.Namespace) -> int:
     import torch
 
     from neurove_core import models
+    from neurove_core.models import bundle
     from neurove_core.training import config as configs
     from neurove_core.training import loop, pipeline
 
     torch.set_num_threads(args.threads)
     config = configs.load(args.config)
     out: Path = args.out or Path("runs") / config.name
+    if not args.resume:
+        _refuse_run(out, (out / loop.CHECKPOINT, out / f"{config.name}{bundle.SUFFIX}"), force=args.force)
     with progress() as show:
         path = pipeline.train(
             config,
@@ -55,6 +61,13 @@ def train(args: argparse.Namespace) -> int:
     return 0
 
 
+def _refuse_run(out: Path, results: tuple[Path, ...], *, force: bool) -> None:
+    """Refuse a folder that holds a run: its checkpoint or its model would be replaced."""
+    if not force and any(path.exists() for path in results):
+        bound = "the folder holds a run; --resume continues it, --force replaces it"
+        raise InvalidField("training", "--out", str(out), bound)
+
+
 def calibrate(args: argparse.Namespace) -> int:
     """Fit the uncertainty of a trained model on new simulated sequences; its estimates stay the same."""
     import torch
@@ -69,6 +82,7 @@ def calibrate(args: argparse.Namespace) -> int:
     config, model = configs.load(args.config), models.find(args.model)
     bounds = Bounds(args.uncertain_m_s, args.uncertain_rad_s)
     out: Path = args.out or Path(f"{model.name}{bundle.SUFFIX}")
+    refuse_existing("calibrate", "--out", out, None, force=args.force)
     data: Path = args.data or Path("runs") / config.name / "data"
     with progress() as show:
         report = pipeline.calibrate(model, config, data, out, args.calibration_sequences, args.workers, show, bounds)
@@ -189,6 +203,7 @@ def add_train(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="DIR", help=about)
     parser.add_argument("--data", type=Path, metavar="DIR", help="folder for the sequences; default OUT/data")
     parser.add_argument("--resume", action="store_true", help="continue from the checkpoint in OUT, if it exists")
+    add_force(parser, "a run in OUT")
     about = "initialise weights from BUNDLE, a file or `default`, instead of randomly"
     parser.add_argument("--start", metavar="BUNDLE", help=about)
     about = "number of devices that share each batch; default 1"
@@ -211,6 +226,7 @@ def add_calibrate(parser: argparse.ArgumentParser) -> None:
     _add_calibration(parser, "")
     _add_workers(parser)
     parser.add_argument("--out", type=Path, metavar="FILE", help="bundle to write; default NAME.safetensors")
+    add_force(parser, "FILE")
     about = "estimates with a smaller linear sigma are never `uncertain` [m/s]; default: the node decides"
     parser.add_argument("--uncertain-m-s", type=sigma, metavar="S", help=about)
     about = "the same for the angular sigma [rad/s]"

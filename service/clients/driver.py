@@ -7,11 +7,14 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 from neurove_core.io import BrokenRecording, Recording
+from neurove_core.io.imu_feed import ImuFeed, Turn
 from neurove_core.io.packets import Slice, slices
-from neurove_protocol import CameraInfo, EventPacket, Events
+from neurove_protocol import CameraInfo, EventPacket, Events, ImuPacket
 from neurove_protocol.camera import SCHEMA as CAMERA_SCHEMA
 from neurove_protocol.events import SCHEMA as EVENTS_SCHEMA
 from neurove_protocol.events import encode_packet
+from neurove_protocol.imu import SCHEMA as IMU_SCHEMA
+from neurove_protocol.imu import encode_imu
 from neurove_protocol.keys import Keys
 from neurove_service.clients.pace import Lag, OnBehind, ignore_behind
 from neurove_service.transport import Transport
@@ -27,15 +30,23 @@ class PlaySummary(NamedTuple):
     first_us: int | None  # sensor clock; None before the first packet
     last_us: int | None  # of the newest event
     broken: BrokenRecording | None  # where and why the recording ended early; None if it did not
+    samples: int = 0  # of the inertial unit
     behind_s: float = 0.0  # the latest packet was published that long after it was due
 
 
-def repeated(recording: Recording) -> Iterator[Events]:
-    """The recording in an endless loop; the times of each turn continue those of the turn before."""
+def repeated(recording: Recording, turns: list[Turn] | None = None) -> Iterator[Events]:
+    """The recording in an endless loop; the times of each turn continue those of the turn before.
+
+    Args:
+        recording: it must have an end.
+        turns: each turn is appended when it begins.
+    """
     shift_us, end_us, first_us = 0, 0, None
     while True:
-        for chunk in recording.chunks():
+        for number, chunk in enumerate(recording.chunks()):
             first_us = int(chunk.t[0]) if first_us is None else first_us
+            if number == 0 and turns is not None:
+                turns.append(Turn(int(chunk.t[0]) + shift_us, shift_us))
             end_us = int(chunk.t[-1]) + shift_us
             yield chunk._replace(t=chunk.t + shift_us)
         if first_us is None:
@@ -60,6 +71,9 @@ class Driver:
         self._recording, self._stream, self._lens = recording, stream, lens
         self._transport, self._keys = transport, keys
         self._publisher = transport.publisher(keys.events(stream), EVENTS_SCHEMA)
+        has_imu = "imu" in recording.streams
+        self._imu_publisher = transport.publisher(keys.imu(stream), IMU_SCHEMA) if has_imu else None
+        self._imu_seq = 0
         self._announce_camera()
 
     def _announce_camera(self) -> None:
@@ -105,7 +119,7 @@ class Driver:
             on_behind: called once if the source or this machine cannot keep up.
         """
         lag = Lag(speed, on_behind)
-        chunks = repeated(self._recording) if loop and not self._recording.endless else self._recording.chunks()
+        chunks, inertial = self._source(loop=loop)
         sent = PlaySummary(0, 0, None, None, None)
         began = 0.0
         try:
@@ -116,14 +130,32 @@ class Driver:
                 elapsed_s = (piece.end_us - first_us - piece.skipped_us) / 1e6
                 if elapsed_s > duration_s or _stopped(stop, began + elapsed_s / speed):
                     break
+                samples = sent.samples + self._send_samples(inertial, piece.end_us)
                 self._send(sent.packets, piece)
                 lag.sent(began + elapsed_s / speed, elapsed_s)
                 last_us = int(piece.events.t[-1]) if piece.events.n else sent.last_us
                 events = sent.events + piece.events.n
-                sent = PlaySummary(sent.packets + 1, events, first_us, last_us, None, lag.most_s)
+                sent = PlaySummary(sent.packets + 1, events, first_us, last_us, None, samples, lag.most_s)
         except BrokenRecording as error:
             return sent._replace(broken=error)
         return sent
+
+    def _source(self, *, loop: bool) -> tuple[Iterator[Events], ImuFeed]:
+        """The events, and the inertial samples in step with them."""
+        if not loop or self._recording.endless:
+            return self._recording.chunks(), ImuFeed(self._recording)
+        turns: list[Turn] = []
+        return repeated(self._recording, turns), ImuFeed(self._recording, turns)
+
+    def _send_samples(self, inertial: ImuFeed, end_us: int) -> int:
+        """Publish the inertial samples before this time [us]; return their number."""
+        if self._imu_publisher is None:
+            return 0
+        samples = inertial.until(end_us)
+        if samples.n:
+            self._imu_publisher.put(encode_imu(ImuPacket(self._stream, self._imu_seq, samples)))
+            self._imu_seq += 1
+        return samples.n
 
     def _send(self, seq: int, piece: Slice) -> None:
         packet = EventPacket(self._stream, seq, self._recording.sensor, piece.t0_us, piece.events)

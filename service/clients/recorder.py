@@ -11,6 +11,7 @@ from neurove_core.io.formats.packet_log.reader import LIMITS
 from neurove_core.io.formats.packet_log.writer import PacketWriter
 from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.events import decode_packet
+from neurove_protocol.imu import decode_imu
 from neurove_protocol.keys import Keys
 from neurove_service import logs
 from neurove_service.transport import Transport
@@ -26,7 +27,7 @@ _POLL_S = 0.1
 
 class _Message(NamedTuple):
     stream: str
-    kind: str  # events or camera
+    kind: str  # events, imu or camera
     payload: bytes
     received_ns: int  # monotonic clock
 
@@ -42,6 +43,8 @@ class StreamSummary:
     dropped: int = 0  # by this recorder, because the disk was too slow; also counted in missing
     refused: int = 0  # packets that cannot be decoded; they are in the file too
     restarts: int = 0  # sequence numbers that are lower than expected
+    imu_packets: int = 0  # of the inertial unit; its losses count as the others do
+    samples: int = 0
     first_us: int | None = None
     last_us: int | None = None
 
@@ -96,12 +99,13 @@ class Recorder:
         self._writer, self._keys, self._streams = writer, keys, streams
         self._inbox = _Inbox(cap=queue_bytes)
         self._summaries: dict[str, StreamSummary] = {}
-        self._next: dict[str, int] = {}
+        self._next: dict[tuple[str, str], int] = {}  # stream and kind -> number of its next packet
         self._cameras: dict[str, bytes] = {}
         self._unix_ns = time.time_ns() - time.monotonic_ns()  # one clock for the whole file, which never jumps
         for stream in streams or ("*",):
             transport.subscribe(keys.events(stream), self._receiver("events"))
             transport.subscribe(keys.camera(stream), self._receiver("camera"))
+            transport.subscribe(keys.imu(stream), self._receiver("imu"))
             for answer in transport.ask(
                 keys.camera(stream), b"", _ASK_S
             ):  # of drivers that published before this subscription
@@ -149,6 +153,9 @@ class Recorder:
             if message.kind == "events":
                 self._writer.write(message.stream, message.payload, log_ns)
                 self._count(message)
+            elif message.kind == "imu":
+                self._writer.add(message.stream, "imu", message.payload, log_ns)
+                self._count_samples(message)
             elif self._cameras.get(message.stream) != message.payload:
                 self._cameras[message.stream] = message.payload
                 self._writer.add(message.stream, "camera", message.payload, log_ns)
@@ -169,16 +176,35 @@ class Recorder:
                 log.warning("packet refused", stream=message.stream, why=error.message)
             summary.refused += 1
             return
-        expected = self._next.get(message.stream, packet.seq)
-        if packet.seq > expected:
-            summary.missing += packet.seq - expected
-        elif packet.seq < expected:
-            summary.restarts += 1
-        self._next[message.stream] = packet.seq + 1
+        self._follow(message, packet.seq, summary)
         summary.events += packet.events.n
         first_us = int(packet.events.t[0]) if packet.events.n else packet.t0_us
         summary.first_us = first_us if summary.first_us is None else summary.first_us
         summary.last_us = int(packet.events.t[-1]) if packet.events.n else packet.t0_us
+
+    def _count_samples(self, message: _Message) -> None:
+        summary = self._summary(message.stream)
+        summary.imu_packets += 1
+        summary.bytes += len(message.payload)
+        try:
+            packet = decode_imu(message.payload)
+        except NeuroVEError as error:
+            if not summary.refused:
+                log.warning("packet refused", stream=message.stream, why=error.message)
+            summary.refused += 1
+            return
+        self._follow(message, packet.seq, summary)
+        summary.samples += packet.samples.n
+
+    def _follow(self, message: _Message, seq: int, summary: StreamSummary) -> None:
+        """Count the numbers that are missing before a packet."""
+        key = message.stream, message.kind
+        expected = self._next.get(key, seq)
+        if seq > expected:
+            summary.missing += seq - expected
+        elif seq < expected:
+            summary.restarts += 1
+        self._next[key] = seq + 1
 
 
 def as_json(summaries: dict[str, StreamSummary]) -> dict[str, Any]:

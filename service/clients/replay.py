@@ -7,13 +7,15 @@ import time
 from dataclasses import dataclass, field
 
 from neurove_core.io import BrokenRecording
-from neurove_core.io.formats.packet_log.reader import LIMITS, McapRecording, RecordedPacket
+from neurove_core.io.formats.packet_log.reader import LIMITS, McapRecording, RecordedMessage, RecordedPacket
 from neurove_core.io.order import MAX_GAP_US
 from neurove_protocol.camera import SCHEMA as CAMERA_SCHEMA
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.events import SCHEMA as EVENTS_SCHEMA
 from neurove_protocol.events import EventPacket, decode_packet
+from neurove_protocol.imu import SCHEMA as IMU_SCHEMA
+from neurove_protocol.imu import decode_imu
 from neurove_protocol.keys import Keys
 from neurove_service.clients.driver import POLL_S, PlaySummary
 from neurove_service.clients.pace import Lag, OnBehind, ignore_behind
@@ -75,6 +77,9 @@ class Replay:
         self._publishers: dict[str, Publisher] = {
             name: transport.publisher(keys.events(name), EVENTS_SCHEMA) for name in names
         }
+        self._imu_publishers: dict[str, Publisher] = {
+            name: transport.publisher(keys.imu(name), IMU_SCHEMA) for name in names if recording.has_imu(name)
+        }
         cameras = recording.cameras() if lens is None else {name: _named(lens, name) for name in names}
         for name, payload in cameras.items():
             if name in self._publishers:
@@ -129,7 +134,11 @@ class Replay:
         sent = PlaySummary(0, 0, None, None, None)
         pace, lag = Pace(speed), Lag(speed, on_behind)
         try:
-            for recorded in self._recording.packets(self._only):
+            for message in self._recording.driven(self._only):
+                if message.kind == "imu":
+                    sent = sent._replace(samples=sent.samples + self._send_samples(message))
+                    continue
+                recorded = RecordedPacket(message.stream, message.payload, message.log_ns)
                 packet = _read(recorded)
                 if packet is not None:
                     due, elapsed_s = pace.due(recorded, packet)
@@ -144,6 +153,18 @@ class Replay:
         except BrokenRecording as error:
             return sent._replace(broken=error)
         return sent
+
+    def _send_samples(self, message: RecordedMessage) -> int:
+        """Publish an IMU packet in its recorded order; return its number of samples.
+
+        Older files of `neurove convert` hold samples without stream and number, which are not sent.
+        """
+        try:
+            n = decode_imu(message.payload).samples.n
+        except NeuroVEError:
+            return 0
+        self._imu_publishers[message.stream].put(message.payload)
+        return n
 
 
 def _named(lens: CameraInfo, stream: str) -> bytes:

@@ -13,8 +13,9 @@ from neurove_core import self_test
 from neurove_core.estimator import Estimator
 from neurove_core.models.bounds import UNSET, Bounds
 from neurove_core.models.bundle import Bundle
-from neurove_protocol.errors import Conflict, InvalidField, NeuroVEError, NothingBefore
+from neurove_protocol.errors import Conflict, InternalError, InvalidField, NeuroVEError, NothingBefore
 from neurove_service import logs
+from neurove_service.guard import Guard
 from neurove_service.models import admission, precompile, swap
 from neurove_service.models.library import MIN_DIGEST, Library
 from neurove_service.models.plan import Plan, SharedPlan
@@ -47,6 +48,7 @@ class Context(NamedTuple):
     rules: Rules
     on_changed: Callable[[Bundle], None]
     free_bytes: Callable[[], int | None]
+    guard: Guard
     trained_only: bool = False  # untrained models are refused
     on_trial: OnTrial = no_trial
 
@@ -84,13 +86,15 @@ class Change:
                 else:
                     candidate = self._prepare(found, canary, shadow_s)
                 before = self._switch(candidate, canary)
+                limits = self._limits(self._rules.probation, candidate)
+                context, probation_s = self._context, self._rules.probation_s
+                calls = context.on_changed, self._on_progress, context.on_trial
+                Probation(self._plan, candidate, probation_s, limits, context.guard, *calls).start()
             except BaseException:
-                self._end_trial()
+                if candidate is not None:  # without its probation it must not serve
+                    self._plan.fault(candidate, "its change ended by an internal error")
+                self._plan.end_trial()
                 raise
-            limits = self._limits(self._rules.probation, candidate)
-            context, probation_s = self._context, self._rules.probation_s
-            calls = context.on_changed, self._on_progress, context.on_trial
-            Probation(self._plan, candidate, probation_s, limits, *calls).start()
             return before.estimator.bundle, candidate
 
     def rollback(self, expect: str | None) -> tuple[Bundle, Serving]:
@@ -117,12 +121,13 @@ class Change:
             try:
                 self._prime(serving, frozenset())
             except BaseException:
-                self._end_trial()
+                self._plan.end_trial()
                 raise
             self._plan.set(Plan(serving), f"{removed.name} was rolled back")
             self._plan.previous = None
             self._report("rolled_back", f"to {previous.name}; it was primed, because it did not run in standby")
-        self._context.on_changed(estimator.bundle)
+        with self._context.guard.at("saving the active model", model=estimator.bundle.name):
+            self._context.on_changed(estimator.bundle)
         return removed, serving
 
     def _is_active(self, found: Bundle) -> bool:
@@ -143,19 +148,27 @@ class Change:
 
     @contextlib.contextmanager
     def _reporting(self, model: str) -> Iterator[None]:
-        """Report an error as the last step."""
+        """Report an error as the last step. A bug is counted and refuses the change like any other error."""
         try:
             yield
         except NeuroVEError as error:
-            self._plan.last_change = f"{model} was refused: {error.message}"
-            self._report("refused", error.message)
+            self._refuse(model, error)
             raise
+        except Exception as error:
+            self._context.guard.caught("model change", error, model=model)
+            refused = InternalError()
+            self._refuse(model, refused)
+            raise refused from error
+
+    def _refuse(self, model: str, error: NeuroVEError) -> None:
+        self._plan.last_change = f"{model} was refused: {error.message}"
+        self._report("refused", error.message)
 
     def _prepare(self, found: Bundle, canary: frozenset[str], shadow_s: float) -> Serving:
         """A model that is ready to serve: loaded, fast enough, primed, and compared in shadow if requested."""
         self._report("verified", f"{found.name} {found.digest[:12]}")
         estimator = self._load(found)
-        self._accept_trial()
+        self._plan.accept_trial()
         candidate = Serving(estimator, self._plan.epoch + 1)
         self._prime(candidate, canary)
         if shadow_s > 0:
@@ -178,21 +191,6 @@ class Change:
         p99_ms = admission.check_speed(estimator, share)
         self._report("warmed", f"p99 {p99_ms:.1f} ms for a window of {found.config.window.duration_us / 1e3:g} ms")
         return estimator
-
-    def _accept_trial(self) -> None:
-        """End a probation: its model passes."""
-        with self._plan.condition:
-            if self._plan.current.phase == "probation":
-                self._plan.set(Plan(self._plan.current.active))
-
-    def _end_trial(self) -> None:
-        """Stop the standby model of a refused change; a canary continues as before."""
-        with self._plan.condition:
-            plan = self._plan.current
-            if plan.phase in ("priming", "shadow"):
-                self._plan.set(Plan(plan.active))
-            elif plan.promoting:
-                self._plan.set(plan._replace(promoting=False))
 
     def _prime(self, candidate: Serving, canary: frozenset[str]) -> None:
         """Run a model over the newest windows of its streams; a promoted canary over those of all other streams."""

@@ -131,6 +131,21 @@ class SharedPlan:
         self.previous = None
         self.set(Plan(Serving(proven.estimator, self.epoch)), summary)
 
+    def accept_trial(self) -> None:
+        """End a probation: its model passes."""
+        with self.condition:
+            if self.current.phase == "probation":
+                self.set(Plan(self.current.active))
+
+    def end_trial(self) -> None:
+        """Stop the standby model of a refused change; a canary continues as before."""
+        with self.condition:
+            plan = self.current
+            if plan.phase in ("priming", "shadow"):
+                self.set(Plan(plan.active))
+            elif plan.promoting:
+                self.set(plan._replace(promoting=False))
+
     def fault(self, serving: Serving, why: str) -> None:
         """Roll back a model on probation at once, on all streams; does nothing if it is not on probation any more."""
         name = serving.estimator.bundle.name

@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 from neurove_core.models.bundle import Bundle
 from neurove_service import logs
+from neurove_service.guard import Guard
 from neurove_service.models import swap
 from neurove_service.models.plan import Plan, SharedPlan
 from neurove_service.models.progress import OnProgress, Progress
@@ -35,6 +36,7 @@ class Probation:
         candidate: the model.
         probation_s: duration of the probation [s]; 0: it passes at once; a canary has no end of its own.
         limits: the limits of the model.
+        guard: counts internal errors; one in the probation itself rolls the model back.
         on_changed: called with the model to save: the candidate after its probation, or the model after a rollback.
         on_progress: called with the last step.
         on_trial: called when the probation begins to wait for windows, and when they have come.
@@ -46,6 +48,7 @@ class Probation:
         candidate: Serving,
         probation_s: float,
         limits: TrialLimits,
+        guard: Guard,
         on_changed: Callable[[Bundle], None],
         on_progress: OnProgress,
         on_trial: OnTrial = no_trial,
@@ -55,14 +58,32 @@ class Probation:
         self._deadline = time.monotonic() + probation_s
         self._windows = 0  # that the model has answered; without enough of them no time ends its probation
         self._began = self._told = False
-        self._limits = limits
-        self._on_changed, self._on_progress, self._on_trial = on_changed, on_progress, on_trial
+        self._limits, self._guard = limits, guard
+        self._changed, self._on_progress, self._trial = on_changed, on_progress, on_trial
 
     def start(self) -> None:
         """Start the thread."""
         threading.Thread(target=self._run, name="probation", daemon=True).start()
 
     def _run(self) -> None:
+        try:
+            self._watch()
+        except Exception as error:  # noqa: BLE001  # without its watch the model must not serve
+            self._guard.caught("probation", error, model=self._candidate.estimator.bundle.name)
+            self._plan.fault(self._candidate, "its probation ended by an internal error")
+        if not self._plan.closing.is_set():
+            with self._guard.at("end of a probation"):
+                self._end()
+
+    def _on_changed(self, model: Bundle) -> None:
+        with self._guard.at("saving the active model", model=model.name):
+            self._changed(model)
+
+    def _on_trial(self, tried: Bundle | None, proven: Bundle) -> None:
+        with self._guard.at("saving the active model", model=proven.name):
+            self._trial(tried, proven)
+
+    def _watch(self) -> None:
         while (plan := self._still_tried()) is not None:
             if self._is_late() and not self._told:
                 self._wait_for_windows(plan)
@@ -76,8 +97,6 @@ class Probation:
                 if self._plan.current is plan:
                     left_s = self._deadline - time.monotonic()
                     self._plan.condition.wait(min(swap.POLL_S, left_s) if left_s > 0 else swap.POLL_S)
-        if not self._plan.closing.is_set():
-            self._end()
 
     def _still_tried(self) -> Plan | None:
         """The plan, if the model is still tried in the same phase; at the end of its probation it passes."""

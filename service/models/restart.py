@@ -70,4 +70,4 @@ def resume(context: Context) -> None:
     judged = judgement(model, active, passed=active.digest in context.plan.passed, force=None)
     limits = context.rules.probation.and_of(model)._replace(compared=judged.compared)
     calls = context.on_changed, silent, context.on_trial
-    Probation(context.plan, plan.tried, context.rules.probation_s, limits, *calls).start()
+    Probation(context.plan, plan.tried, context.rules.probation_s, limits, context.guard, *calls).start()

@@ -8,6 +8,7 @@ from neurove_core.models.bundle import Bundle
 from neurove_protocol.control import ModelInfo
 from neurove_protocol.errors import Untrained
 from neurove_service import logs
+from neurove_service.guard import Guard
 from neurove_service.models import admission, restart
 from neurove_service.models.change import Change, Context, Rules
 from neurove_service.models.library import Available, Files, Library, nothing_pushed
@@ -37,6 +38,7 @@ class ModelSlot:
         trained_only: whether the node refuses untrained models.
         trial: digest of the model whose probation waited for windows; it serves first, on probation.
         on_trial: see `probation.OnTrial`.
+        guard: counts internal errors of a model change.
 
     Raises:
         BadModel, UnknownModel: the first model cannot be loaded.
@@ -55,6 +57,7 @@ class ModelSlot:
         trained_only: bool = False,
         trial: str | None = None,
         on_trial: OnTrial = no_trial,
+        guard: Guard | None = None,
     ) -> None:
         library = Library(models_dir, pushed)
         active, previous = (restart.kept(library, digest, trained_only) if digest else None for digest in kept)
@@ -71,7 +74,9 @@ class ModelSlot:
             self._shared.passed.add(estimator.bundle.digest)
         self._first = estimator
         self.closing = self._shared.closing  # set when the node stops; a probation then ends without a last step
-        self._context = Context(self._shared, library, rules, on_changed, free_bytes, trained_only, on_trial)
+        self._context = Context(
+            self._shared, library, rules, on_changed, free_bytes, guard or Guard(), trained_only, on_trial
+        )
         tried = restart.kept(library, trial, trained_only) if trial else None
         if tried is not None and tried.digest != estimator.bundle.digest:
             restart.try_again(self._shared, tried, rules.bounds)
@@ -175,7 +180,7 @@ class ModelSlot:
             concerned.
 
         Raises:
-            UnknownModel, BadModel, Untrained, Conflict, NoMemory, TooSlow, Diverged: nothing changed.
+            UnknownModel, BadModel, Untrained, Conflict, NoMemory, TooSlow, Diverged, InternalError: nothing changed.
         """
         with self._shared.one_change(on_progress):
             return Change(self._context, on_progress).activate(model, expect, shadow_s, canary, force)

@@ -94,6 +94,7 @@ class Service:
             trained_only=bool(config.trusted_keys),
             trial=last.trial if last else None,
             on_trial=self._save_trial,
+            guard=self._guard,
         )
         self._slot.resume()
 

@@ -137,9 +137,11 @@ class Handlers:
             ended: list[Progress] = []
 
             def on_progress(progress: Progress) -> None:
-                report_step(progress)
-                if progress.step in ("done", "rolled_back", "waiting"):
-                    ended.append(progress)
+                try:
+                    report_step(progress)
+                finally:
+                    if progress.step in ("done", "rolled_back", "waiting"):
+                        ended.append(progress)
 
             for info in self._slot.available().models:
                 if info.name == wanted.model or info.digest.startswith(wanted.model):

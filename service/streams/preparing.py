@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from neurove_protocol import CameraInfo
-from neurove_protocol.errors import NeuroVEError
+from neurove_protocol.errors import InternalError, NeuroVEError
 from neurove_service.guard import Guard
 
 QUICK_PX: Final = 1 << 20
@@ -44,8 +44,10 @@ class Preparing:
         with self._lock:
             self._wanted = camera
             if not self._running:
-                self._running = True
                 threading.Thread(target=self._run, name=f"table {camera.stream}", daemon=True).start()
+                self._running = (
+                    True  # the thread waits for the lock; if the system gives no thread, the next call tries
+                )
 
     def stop(self) -> None:
         """Start no further table, and let go of the present one."""
@@ -66,13 +68,14 @@ class Preparing:
                     if camera is None:
                         self._running = False
                         return
-                table, error = None, None
+                table: object = None
+                error: NeuroVEError | None = InternalError()
                 with self._guard.at("look-up table", stream=camera.stream):
                     try:
-                        table = self._build(camera)
+                        table, error = self._build(camera), None
                     except NeuroVEError as refused:
                         error = refused
                 with self._lock:
-                    if table is not None or error is not None:
-                        self._table, self._prepared = table, Prepared(camera, error)
-            self._done()
+                    self._table, self._prepared = table, Prepared(camera, error)
+            with self._guard.at("look-up table", stream=camera.stream):
+                self._done()

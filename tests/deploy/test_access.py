@@ -133,6 +133,14 @@ class TestWhoMay:
             assert [reply.node for reply in ask.health(transport, anywhere.config(name))] == ["edge1"]
             assert [reply.node for reply in ask.models(transport, anywhere.config(name))] == ["edge1"]
 
+    def test_a_recorder_receives_the_samples_of_an_inertial_unit(self, place):
+        heard = []
+        with place.join("driver-cam0") as driver, place.join("recorder-desk") as recorder:
+            recorder.subscribe(KEYS.imu(), lambda key, payload, _: heard.append((key, payload)))
+            publisher = driver.publisher(KEYS.imu("cam0"), "application/msgpack")
+            wait_until(lambda: publisher.put(b"x") or heard)
+            assert set(heard) == {(KEYS.imu("cam0"), b"x")}
+
     def test_a_recorder_receives_events_and_queries_cameras(self, place):
         heard = []
         with place.join("driver-cam0") as driver, place.join("recorder-desk") as recorder:
@@ -183,6 +191,7 @@ class TestWhoMayNot:
                 KEYS.events("cam1"),
                 KEYS.events("*"),
                 KEYS.camera("*"),
+                KEYS.imu("cam1"),
                 f"{KEYS.prefix}/**",
                 "**",
                 *([] if name == "node-edge2" else [KEYS.velocity("cam0"), KEYS.velocity("*"), KEYS.status("cam0")]),
@@ -253,15 +262,16 @@ class TestWhoMayNot:
             assert KEYS.serves("edge1", "cam9") not in operator.tokens(KEYS.serves(), 1.0)
 
     @pytest.mark.parametrize("name", ["driver-cam0", "consumer-planner", "operator-alice"])
-    def test_only_the_node_and_a_recorder_receive_events(self, place, name):
+    @pytest.mark.parametrize("what", [KEYS.events, KEYS.imu])
+    def test_only_the_node_and_a_recorder_receive_what_a_driver_publishes(self, place, name, what):
         heard, recorded = [], []
         with place.bare(name) as curious, place.join("recorder-desk") as recorder, place.join("driver-cam0") as driver:
-            for key in (KEYS.events(), f"{KEYS.prefix}/**", "**"):
+            for key in (what(), f"{KEYS.prefix}/**", "**"):
                 curious.declare_subscriber(key, lambda sample: heard.append(str(sample.key_expr)))
-            recorder.subscribe(KEYS.events(), lambda key, *_: recorded.append(key))
-            publisher = driver.publisher(KEYS.events("cam0"), "application/msgpack")
+            recorder.subscribe(what(), lambda key, *_: recorded.append(key))
+            publisher = driver.publisher(what("cam0"), "application/msgpack")
             wait_until(lambda: publisher.put(b"x") or len(recorded) >= 5)
-        assert not [key for key in heard if key.endswith("/events")]
+        assert not [key for key in heard if key.endswith(("/events", "/imu"))]
 
 
 def told_by_the_node():

@@ -83,6 +83,16 @@ def test_an_operator_pushes_activates_and_rolls_back_without_a_gap_in_the_estima
         assert status.lost.nonzero() == {}
 
 
+def test_a_push_that_is_forced_gives_its_reason_to_the_node(node, files, run):
+    _, config, _ = node
+    at = ("--connect", config.connect[0])
+    alone = run("push", str(files / "two.safetensors"), *at, "--force", "trial on the bench")
+    assert (alone.code, "give --activate too" in alone.err, alone.err.count("\n")) == (2, True, 1)
+    forced = run("push", str(files / "two.safetensors"), *at, "--activate", "--force", "trial on the bench")
+    assert (forced.code, "forced (trial on the bench): no difference from default" in forced.out) == (0, True)
+    assert run("rollback", *at).code == 0
+
+
 def keep_driving(transport, config, stop):
     source = Source(transport, config, "cam0")
     for packet in make_packets(20_000, n=20):

@@ -9,6 +9,7 @@ from neurove_core.io.formats.packet_log.writer import PacketWriter
 from neurove_core.sources import open_source
 from neurove_protocol import CameraInfo
 from neurove_protocol.events import decode_packet, encode_packet
+from neurove_protocol.imu import decode_imu
 from neurove_protocol.keys import Keys
 from neurove_service.clients.recorder import Recorder
 from tests.builders import make_packets
@@ -208,3 +209,28 @@ def test_an_existing_recording_is_not_overwritten_and_without_packets_there_is_n
     assert (silent.code, silent.err.count("\n")) == (1, 1)
     assert "nothing was recorded" in silent.err
     assert [one.name for one in tmp_path.iterdir()] == ["old.mcap"]
+
+
+def test_inertial_samples_are_driven_recorded_and_replayed_bit_for_bit(router, tmp_path, run):
+    file = tmp_path / "inertial.mcap"
+    source = "sim://wall?seed=20005&camera=pinhole:24x18:75&seconds=0.4&imu=500"
+    with client(router) as transport:
+        heard = []
+        transport.subscribe(Keys().events(), lambda *_: None)  # a driver waits for it
+        transport.subscribe(Keys().imu(), lambda _, payload, __: heard.append(payload))
+        with running("record", "--connect", router, "--out", str(file), "--json") as recorder:
+            wait_until(lambda: file.with_name("inertial.mcap.part").exists())
+            sent = json.loads(run("drive", source, "--connect", router, "--wait", "20", "--json").out)
+            assert sent["samples"] == 200
+            wait_until(lambda: sum(decode_imu(payload).samples.n for payload in heard) == 200)
+            code, out, _ = recorder.end(signal.SIGINT)
+        summary = json.loads(out)["streams"]["cam0"]
+        assert (code, summary["samples"], summary["missing"]) == (0, 200, 0)
+        assert [decode_imu(payload).seq for payload in heard] == list(range(len(heard)))
+        recording = open_source(str(file))
+        assert "imu" in recording.streams
+        assert sum(batch.n for batch in recording.imu()) == 200
+        before, heard[:] = heard.copy(), []
+        assert "200 IMU samples" in run("drive", str(file), "--connect", router, "--wait", "20").out
+        wait_until(lambda: len(heard) == len(before))
+        assert heard == before

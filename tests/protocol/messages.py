@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import msgpack
+import numpy as np
 from hypothesis import settings
 from hypothesis import strategies as st
 
@@ -29,6 +30,7 @@ from neurove_protocol.control import (
     StreamStatus,
 )
 from neurove_protocol.events import decode_packet, encode_packet
+from neurove_protocol.imu import MAX_ACCEL_M_S2, MAX_GYRO_RAD_S, Imu, ImuPacket, decode_imu, encode_imu
 
 Fields = dict[str, Any]
 Path = tuple[str | int, ...]
@@ -116,6 +118,15 @@ EXAMPLES: dict[str, Fields] = {
         "cy": 133.7,
         "distortion": [-0.048, 0.011, -0.0005, 0.0002],
         "height_m": 0.31,
+    },
+    "ImuPacket": {
+        "v": 1,
+        "stream": "cam0",
+        "seq": 7,
+        "n": 2,
+        "t": struct.pack("<2q", -1_000, 0),
+        "accel_m_s2": struct.pack("<6d", 0.0, -9.75, 0.5, 0.0, -10.0, 0.0),
+        "gyro_rad_s": struct.pack("<6d", 0.0, -0.125, 0.0, 0.0625, 0.0, 0.0),
     },
     "TwistEstimate": {
         "v": 1,
@@ -238,7 +249,8 @@ MODELS: tuple[type[Message], ...] = (
     ErrorReply,
 )
 EVENT_PACKET = Kind("EventPacket", decode_packet, encode_packet, strict=False, optional=frozenset())
-KINDS = (EVENT_PACKET, *map(_kind, MODELS))
+IMU_PACKET = Kind("ImuPacket", decode_imu, encode_imu, strict=False, optional=frozenset())
+KINDS = (EVENT_PACKET, IMU_PACKET, *map(_kind, MODELS))
 BY_NAME = {kind.name: kind for kind in KINDS}
 
 
@@ -462,6 +474,25 @@ def packets(draw: st.DrawFn, max_events: int = 40, max_span_us: int = 2**32 - 1)
     t, x, y, p = zip(*sorted(rows), strict=True) if rows else ((), (), (), ())
     events = Events.from_columns([t0_us + offset for offset in t], x, y, p)
     return EventPacket(draw(names), draw(counts), sensor, t0_us, events)
+
+
+@st.composite
+def imu_packets(draw: st.DrawFn, max_samples: int = 20) -> ImuPacket:
+    """Any valid packet, its numbers at their bounds too."""
+    t = sorted(draw(st.lists(st.integers(-(2**62), 2**62 - 1), min_size=1, max_size=max_samples)))
+    accel, gyro = (
+        draw(st.lists(st.lists(st.floats(-most, most), min_size=3, max_size=3), min_size=len(t), max_size=len(t)))
+        for most in (MAX_ACCEL_M_S2, MAX_GYRO_RAD_S)
+    )
+    return ImuPacket(draw(names), draw(counts), Imu(np.array(t), np.array(accel), np.array(gyro)))
+
+
+def assert_same_imu(left: ImuPacket, right: ImuPacket) -> None:
+    """Bit for bit."""
+    assert (left.stream, left.seq) == (right.stream, right.seq)
+    for name in Imu._fields:
+        a, b = getattr(left.samples, name), getattr(right.samples, name)
+        assert (a.dtype, a.shape, a.tobytes()) == (b.dtype, b.shape, b.tobytes()), name
 
 
 def same(left: object, right: object) -> bool:

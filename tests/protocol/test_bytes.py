@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from neurove_protocol import NeuroVEError
 from neurove_protocol.codec import MAX_ITEMS, MAX_MESSAGE_BYTES, MAX_STRING_BYTES
 from neurove_protocol.errors import InvalidField, Malformed
+from neurove_protocol.imu import MAX_IMU_BYTES
 from tests.protocol.messages import EVENT_PACKET, EXAMPLES, KINDS, MODELS, Kind, bounded, pack
 
 V1 = b"\xa1v\x01"  # the key v and the value 1
@@ -61,7 +62,7 @@ def test_a_duplicate_key_is_malformed_at_any_depth(kind: Kind) -> None:
     assert "duplicate key" in refusal(kind, with_value("added", b"\x82\xa1a\x01\xa1a\x01")).message
 
 
-CAPS = {model.__name__: model.max_bytes for model in MODELS}
+CAPS = {model.__name__: model.max_bytes for model in MODELS} | {"ImuPacket": MAX_IMU_BYTES}
 HEALTH = next(kind for kind in KINDS if kind.name == "HealthReply")
 
 

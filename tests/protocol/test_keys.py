@@ -12,7 +12,7 @@ from neurove_protocol.errors import InvalidField
 from neurove_protocol.keys import DEFAULT_PREFIX, NAME_RULE, Keys, check_name, is_name
 from tests.protocol.messages import bounded, names
 
-STREAM_KEYS: list[Callable[..., str]] = [Keys.events, Keys.camera, Keys.velocity, Keys.status]
+STREAM_KEYS: list[Callable[..., str]] = [Keys.events, Keys.camera, Keys.imu, Keys.velocity, Keys.status]
 NODE_KEYS: list[Callable[..., str]] = [
     Keys.health,
     Keys.models,

@@ -1,6 +1,7 @@
 """Laws that hold for every message of the contract, run over one table of examples."""
 
 import math
+import struct
 from typing import Any
 
 import pytest
@@ -61,6 +62,14 @@ OUT_OF_BOUND: dict[str, dict[str, tuple[Any, ...]]] = {
         "height": (0, -1, 4097),
         "t0_us": (-(1 << 62) - 1, 1 << 62),
         "n": (-1, 1_000_001, 1 << 63),
+    },
+    "ImuPacket": {
+        "stream": ("", "a/b", "@node"),
+        "seq": (-1, 1 << 63),
+        "n": (-1, 0, 4097, 1 << 63),
+        "t": (struct.pack("<2q", 0, 1 << 62), struct.pack("<2q", -(1 << 62) - 1, 0)),
+        "accel_m_s2": tuple(struct.pack("<6d", 0, 0, 0, 0, wrong, 0) for wrong in (NAN, INF, -1.1e4)),
+        "gyro_rad_s": tuple(struct.pack("<6d", wrong, 0, 0, 0, 0, 0) for wrong in (NAN, -INF, 1.1e3)),
     },
     "CameraInfo": {
         "stream": ("", "a/b", "@node"),

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 import msgpack
+import numpy as np
 import pytest
 from pydantic import BaseModel
 
@@ -25,22 +26,26 @@ from neurove_protocol import (
     Events,
     Flag,
     HostTime,
+    Imu,
+    ImuPacket,
     Sensor,
     Trace,
     TwistEstimate,
     camera,
     control,
     events,
+    imu,
     velocity,
 )
 from neurove_protocol.codec import PROTOCOL_VERSION
 from neurove_protocol.control import Latency, Losses, ModelInfo, Verdict
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import DEFAULT_LIMITS, FORMATS, PacketLimits, decode_packet, encode_packet
+from neurove_protocol.imu import decode_imu, encode_imu
 from neurove_protocol.keys import Keys
 from neurove_protocol.velocity import AXES
 from neurove_service.models.progress import Step
-from tests.protocol.messages import KINDS, MODELS, assert_same_packet
+from tests.protocol.messages import KINDS, MODELS, assert_same_imu, assert_same_packet
 from tests.protocol.test_errors import ERRORS
 
 ROOT = Path(__file__).parents[2]
@@ -60,6 +65,11 @@ def packet_of(said: dict[str, Any]) -> EventPacket:
     sensor = Sensor(said["width"], said["height"])
     events = Events.from_columns(t, x, y, p)
     return EventPacket(said["stream"], said["seq"], sensor, said["t0_us"], events)
+
+
+def imu_packet_of(said: dict[str, Any]) -> ImuPacket:
+    t, *columns = (np.array(said[name]) for name in Imu._fields)
+    return ImuPacket(said["stream"], said["seq"], Imu(t, *columns))
 
 
 def section(heading: str) -> str:
@@ -108,6 +118,10 @@ def test_a_dump_decodes_to_the_message_that_the_page_says_and_encodes_back(name:
         assert message["v"] == PROTOCOL_VERSION
         assert_same_packet(decode_packet(data), packet_of(message))
         assert encode_packet(packet_of(message), message["format"]) == data
+    elif name == "ImuPacket":
+        assert (message["v"], message["n"]) == (PROTOCOL_VERSION, len(message["t"]))
+        assert_same_imu(decode_imu(data), imu_packet_of(message))
+        assert encode_imu(imu_packet_of(message)) == data
     else:
         model = BY_NAME[name]
         assert json.loads(model.decode(data).model_dump_json()) == message
@@ -168,7 +182,7 @@ def test_the_table_of_keys_has_all_keys_and_no_other() -> None:
 
 
 def test_the_table_of_encodings_has_all_schemas() -> None:
-    schemas = [events.SCHEMA, camera.SCHEMA, velocity.SCHEMA, control.STATUS_SCHEMA, control.CONTROL_SCHEMA]
+    schemas = [events.SCHEMA, camera.SCHEMA, imu.SCHEMA, velocity.SCHEMA, control.STATUS_SCHEMA, control.CONTROL_SCHEMA]
     schemas += [control.PROGRESS_SCHEMA, control.CHUNK_SCHEMA]
     assert column(table("encoding")) == schemas
     assert all(schema.endswith(f".{PROTOCOL_VERSION}") for schema in schemas if schema != control.CHUNK_SCHEMA)

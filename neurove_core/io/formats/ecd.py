@@ -23,11 +23,12 @@ from neurove_core.io.format import Format
 from neurove_core.io.formats.columns import Unclear
 from neurove_core.io.formats.dialect import ECD, HEAD_BYTES, Dialect, count_lines, detect, is_blank, line_of, pieces
 from neurove_core.io.order import Where
-from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Frame, Imu, refuse_topic
+from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Frame, refuse_topic
 from neurove_core.io.units import SAMPLE, UNITS, TimeSample
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
+from neurove_protocol.imu import Imu
 
 DAVIS240C = Sensor(240, 180)
 """The sensor that recorded the data set."""
@@ -130,7 +131,7 @@ class EcdRecording(EventsOnly):
     def imu(self) -> Iterator[Imu]:
         """The samples of imu.txt, `t ax ay az gx gy gz` [s, m/s2, rad/s]; see `Recording`.
 
-        The axes are those of the IMU. On these cameras they match the optical frame to within a few degrees.
+        The driver rpg_dvs_ros has rotated them into the optical frame; the unit is mounted to within a few degrees.
         """
         if "imu" in self.streams:
             tally = self.faults.begin("imu")

@@ -127,8 +127,8 @@ def test_samples_are_in_si_units_and_special_events_are_triggers(tmp_path):
     recording = open_source(put(tmp_path, "a.aedat", DAVIS240 + body))
     samples = all_samples(recording)
     assert samples.t.tolist() == [20, 60]
-    np.testing.assert_allclose(samples.accel_m_s2, [[0, -9.80665, 0], [9.80665, 0, 0]])
-    np.testing.assert_allclose(samples.gyro_rad_s, [[np.pi, 0, -np.pi / 2], [0, 0, 0]])
+    np.testing.assert_allclose(samples.accel_m_s2, [[0, -9.80665, 0], [-9.80665, 0, 0]])
+    np.testing.assert_allclose(samples.gyro_rad_s, [[-np.pi, 0, np.pi / 2], [0, 0, 0]])
     triggers = all_triggers(recording)
     assert [column.tolist() for column in triggers] == [[10, 12, 30, 40, 50], [0, 0, 1, 3, 4], [1, 0, 1, 0, 0]]
     assert_same(read(recording), EVENTS)

@@ -8,10 +8,11 @@ from neurove_core.io import BrokenRecording, UnknownSource
 from neurove_core.io.formats.packet_log.reader import McapRecording
 from neurove_core.io.formats.packet_log.writer import PacketWriter, write_mcap
 from neurove_core.io.packets import slices
-from neurove_core.io.recording import EventsOnly, Frame, Imu, Triggers
+from neurove_core.io.recording import EventsOnly, Frame, Triggers
 from neurove_core.sources import open_source
 from neurove_protocol import CameraInfo, Events, NeuroVEError, Sensor
 from neurove_protocol.events import decode_packet, encode_packet
+from neurove_protocol.imu import Imu
 from tests.builders import SENSOR, make_events, make_packet, make_packets
 from tests.recordings import assert_same, read, read_broken, shared
 

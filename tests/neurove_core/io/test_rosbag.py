@@ -230,6 +230,16 @@ def camera_message(store, sensor, model="plumb_bob"):
     return store.of(ros_bags.CAMERA, store.header(STAMP_NS), *fields, np.zeros(12), 0, 0, roi)
 
 
+@pytest.mark.parametrize(("encoding", "sign"), [("mono", 1), ("libcaer_cmp", -1)])
+def test_samples_of_libcaer_are_rotated_into_the_optical_frame(tmp_path, encoding, sign):
+    store = ros_bags.Store(2)
+    packet = ros_bags.packet(store, b"", ns=STAMP_NS, seq=0, base_ns=0, encoding=encoding)
+    messages = [(TOPIC, STAMP_NS, packet), next(iter(imu_and_pose(store, 3)))]
+    (imu,) = open_source(str(ros_bags.write_bag(tmp_path / "a", store, messages))).imu()
+    np.testing.assert_allclose(imu.accel_m_s2, [[sign * 1.0, 2.0, sign * 9.8]])
+    np.testing.assert_allclose(imu.gyro_rad_s, [[sign * 0.1, 0.2, sign * 3.0]])
+
+
 @pytest.mark.parametrize("ros", [1, 2])
 def test_imu_poses_and_lens_are_read_on_the_clock_of_the_events(tmp_path, ros):
     store, events = ros_bags.Store(ros), make_events(100, start_us=2_000_000, duration_us=1000)

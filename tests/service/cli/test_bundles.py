@@ -82,7 +82,7 @@ def test_keygen_prints_where_the_keys_are_and_their_use(run):
 
 
 def test_signing_sets_the_release_and_replaces_an_earlier_signature(run, signed):
-    sign = ("sign", "night.safetensors", "--key", "other.key", "--release", "8", "--allow-downgrade")
+    sign = ("sign", "night.safetensors", "--key", "other.key", "--release", "8", "--allow-downgrade", "--force")
     code, out, _ = run(*sign)
     assert code == 0
     assert "night.safetensors.sig: night " in out
@@ -136,7 +136,7 @@ def test_a_signed_bundle_that_fails_its_golden_test_is_refused(run, signed, bund
         tensors["golden.twists"] += 1
 
     (signed / "night.safetensors").write_bytes(with_tensors(edit, bundle_bytes))
-    assert run("sign", "night.safetensors", "--key", "neurove.key")[0] == 0
+    assert run("sign", "night.safetensors", "--key", "neurove.key", "--force")[0] == 0
     code, out, _ = run("verify", "night.safetensors", "--trust", "neurove.pub", "--json")
     assert (code, json.loads(out)["code"]) == (1, "bad_model")
     assert "golden test: window" in json.loads(out)["message"]
@@ -281,5 +281,7 @@ def test_average_writes_a_bundle_and_says_that_it_is_not_calibrated(run, tmp_pat
     code, out, _ = run("average", files[0], "--out", tmp_path / "one.safetensors", "--json")
     assert code == 2
     assert not (tmp_path / "one.safetensors").exists()
-    code, out, _ = run("average", *files, "--out", tmp_path / "mean.safetensors", "--json")
+    code, _, err = run("average", *files, "--out", tmp_path / "mean.safetensors")
+    assert (code, "--force replaces it" in err) == (2, True)
+    code, out, _ = run("average", *files, "--out", tmp_path / "mean.safetensors", "--json", "--force")
     assert (code, json.loads(out)["ok"]) == (0, True)

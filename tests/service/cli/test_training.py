@@ -215,7 +215,7 @@ def test_training_ends_with_a_calibrated_model_and_calibrate_reports_its_coverag
     assert (code, "simulated" in err) == (0, False)
     assert text.startswith(f"wrote {out}\nshare of the truth in the 90% interval")
     assert bundle.load(out).digest == bundle.load(path).digest
-    code, text, _ = run(*arguments, "--calibration-sequences", "16", "--out", str(out), "--json")
+    code, text, _ = run(*arguments, "--calibration-sequences", "16", "--out", str(out), "--json", "--force")
     assert json.loads(text)["groups"]["unchanged"]["vz"]["0.9"] > 0.8
 
 

@@ -6,10 +6,12 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 
 from neurove_core.io.formats.hdf5.sink import Sink
+from neurove_core.models import bundle, signing_keys
 
 
 @pytest.fixture
@@ -54,6 +56,62 @@ def test_a_full_disk_keeps_the_file_that_was_there(run, tmp_path, small_files):
     assert run("convert", RECORDING, file, "--force")[0] == 1
     assert file.read_bytes() == b"before"
     assert list(tmp_path.iterdir()) == [file]
+
+
+TRAINING = """
+name = "tiny"
+[recipe]
+steps = 8
+"""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "file"),
+    [
+        (("convert", RECORDING, "a.h5"), "a.h5"),
+        (("simulate", "wall", "--seconds", "0.2", "--out", "a.h5"), "a.h5"),
+        (("estimate", RECORDING, "--out", "a.csv"), "a.csv"),
+        (("info", RECORDING, "--plot", "a.png"), "a.png"),
+        (("demo", RECORDING, "--screenshot", "a.svg"), "a.svg"),
+        (("bench", "streams", "--plot", "a"), "a.svg"),
+        (("bundle", "new", "a.safetensors"), "a.safetensors"),
+        (("bundle", "average", "one", "two", "--out", "a.safetensors"), "a.safetensors"),
+        (("bundle", "sign", "one", "--key", "key"), "one.sig"),
+        (("calibrate", "default", "--out", "a.safetensors"), "a.safetensors"),
+        (("train", "tiny.toml", "--out", "."), "tiny.safetensors"),
+        (("train", "tiny.toml", "--out", "."), "checkpoint.safetensors"),
+    ],
+)
+def test_a_file_that_exists_is_replaced_only_by_force(run, tmp_path, monkeypatch, arguments, file):
+    pytest.importorskip("h5py")
+    monkeypatch.chdir(tmp_path)
+    Path("one").write_bytes(bundle.untrained(0).to_bytes())
+    keys = signing_keys.new()
+    Path("key").write_bytes(signing_keys.private_pem(keys))
+    Path("tiny.toml").write_text(TRAINING)
+    Path(file).write_bytes(b"before")
+    code, out, err = run(*arguments)
+    assert (code, out, err.count("\n")) == (2, "", 1), err
+    assert "--force replaces it" in err
+    assert Path(file).read_bytes() == b"before"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "file"),
+    [
+        (("bundle", "new", "a.safetensors"), "a.safetensors"),
+        (("bundle", "sign", "one", "--key", "key"), "one.sig"),
+        (("info", RECORDING, "--plot", "a.png"), "a.png"),
+    ],
+)
+def test_force_replaces_the_file(run, tmp_path, monkeypatch, arguments, file):
+    pytest.importorskip("matplotlib")
+    monkeypatch.chdir(tmp_path)
+    Path("one").write_bytes(bundle.untrained(0).to_bytes())
+    Path("key").write_bytes(signing_keys.private_pem(signing_keys.new()))
+    Path(file).write_bytes(b"before")
+    assert run(*arguments, "--force")[0] == 0
+    assert len(Path(file).read_bytes()) > 100
 
 
 def test_half_a_pair_of_keys_is_not_left(run, tmp_path):

@@ -11,7 +11,16 @@ import torch
 from neurove_core.config import WindowConfig
 from neurove_core.models import bundle
 from neurove_protocol import Flag
-from neurove_protocol.errors import Conflict, Diverged, InvalidField, NoMemory, NothingBefore, TooSlow, Untrained
+from neurove_protocol.errors import (
+    Conflict,
+    Diverged,
+    InternalError,
+    InvalidField,
+    NoMemory,
+    NothingBefore,
+    TooSlow,
+    Untrained,
+)
 from neurove_service.models.change import Rules
 from neurove_service.models.slot import ModelSlot
 from neurove_service.streams.comparison import TrialLimits
@@ -306,7 +315,7 @@ def test_a_progress_callback_that_raises_leaves_nothing_running(slots):
         if one.step == "shadow":
             raise RuntimeError("planted")
 
-    with pytest.raises(RuntimeError):
+    with pytest.raises(InternalError):
         slot.activate("two", shadow_s=0.01, on_progress=raises)
     assert slot.plan.phase == "steady"
     assert slot.activate("three")[1].epoch == 1

@@ -53,7 +53,8 @@ def test_an_error_of_a_build_is_a_result_and_a_fault_is_counted():
     assert tables.take() == Prepared(CAMERA, refused)
     tables.start(CAMERA.model_copy(update={"fx": 41.0}))
     assert done.acquire(timeout=20)
-    assert tables.take() is None
+    prepared = tables.take()
+    assert (prepared.camera.fx, prepared.error.code) == (41.0, "internal")
     assert guard.counts == {"look-up table": 1}
 
 

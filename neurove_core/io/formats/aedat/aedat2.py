@@ -9,18 +9,19 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from neurove_core.io.axes import G_M_S2
 from neurove_core.io.checked import Piece, as_recorded, cleaned, ordered
 from neurove_core.io.clock import unwrap_times
 from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.faults import Faults
 from neurove_core.io.format import Format
 from neurove_core.io.order import Where
-from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Imu, refuse_topic
+from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, refuse_topic
 from neurove_protocol.events import Events, Sensor
+from neurove_protocol.imu import Imu
 
 MAX_HEADER_BYTES = 4 << 20  # jAER writes all its preferences there, about 200,000 bytes
 PAIR = np.dtype([("address", ">u4"), ("t", ">u4")])
-G_M_S2 = 9.80665
 
 _MAGIC = b"#!AER-DAT2.0"
 _LINE = re.compile(rb"#[^\x00-\x08\x0e-\x1f\n]*\n")  # a binary pair that begins with '#' has control bytes

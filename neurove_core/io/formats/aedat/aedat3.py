@@ -24,13 +24,15 @@ from typing import Any, BinaryIO, Final, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from neurove_core.io.axes import optical_samples
 from neurove_core.io.checked import Piece, as_recorded, cleaned, ordered
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
 from neurove_core.io.faults import Faults, Reason, Tally
 from neurove_core.io.format import Format
 from neurove_core.io.order import Where
-from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Imu, Triggers
+from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Triggers
 from neurove_protocol.events import Events, Sensor
+from neurove_protocol.imu import Imu
 
 MAX_HEADER_BYTES: Final = 4 << 20
 MAX_PACKET_BYTES: Final = 64 << 20
@@ -55,7 +57,6 @@ CHIPS: Final = {
 }
 """Size of the pixel array by the first part of the name of a source."""
 
-G_M_S2 = 9.80665
 
 _ITEMS: Final = {
     SPECIAL: np.dtype([("data", "<u4"), ("t", "<i4")]),
@@ -191,7 +192,7 @@ class Aedat3Recording(EventsOnly):
         return cleaned(self._events(tally), self.sensor, tally)
 
     def imu(self) -> Iterator[Imu]:
-        """All samples; see `Recording`. The axes are those of the unit, because the file does not give its mounting."""
+        """All samples in the optical frame; see `Recording` and `axes.OPTICAL`."""
         tally = self.faults.begin("imu")
         return ordered(self._samples(tally), tally)
 
@@ -214,7 +215,7 @@ class Aedat3Recording(EventsOnly):
                 why = f"accel {accel[first].tolist()} g, gyro {gyro[first].tolist()} deg/s: not finite"
                 tally.add(Reason.INVALID, where(first), why, int(np.count_nonzero(~finite)))
                 accel, gyro, t, where = accel[finite], gyro[finite], t[finite], _of(where, np.flatnonzero(finite))
-            yield where, Imu(t, accel * G_M_S2, np.radians(gyro))
+            yield where, optical_samples(t, accel, gyro)
 
     def _edges(self, tally: Tally) -> Iterator[tuple[Where, Triggers]]:
         for where, t, rows in self._items(SPECIAL, tally):

@@ -10,23 +10,22 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from neurove_core.io.axes import optical_samples
 from neurove_core.io.checked import as_recorded, cleaned, ordered, until_broken
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
 from neurove_core.io.faults import Faults, Reason, Tally
 from neurove_core.io.format import Format
 from neurove_core.io.formats.aedat.flatbuffer import MAX_PACKET_BYTES, BadPacket, events_of, frame_of, tables_of
-from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Frame, Imu, Triggers
+from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Frame, Triggers
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
+from neurove_protocol.imu import Imu
 
 _MAGIC = b"#!AER-DAT4.0\r\n"
 MAX_HEADER_BYTES = 16 << 20  # a header has about 3,000 bytes
 _PACKET_HEADER = struct.Struct("<ii")  # stream, size of the packet after this header [bytes]
 _PACKET_START = re.compile(rb"\x04\x22\x4d\x18|\x28\xb5\x2f\xfd|(?<=.{8})(?:EVTS|IMUS|TRIG|FRME)", re.DOTALL)
 """First bytes of compressed content, or the identifier at byte 8 of uncompressed content."""
-
-G_M_S2 = 9.80665
-"""Standard gravity: DV writes accelerations in this unit."""
 
 EXTERNAL, GENERATOR, READOUT, EXPOSURE = range(4)
 """Channels of the triggers: the camera's input, its generator, and the readout and exposure of a frame."""
@@ -131,10 +130,7 @@ class Aedat4Recording(EventsOnly):
         return cleaned(self._decoded("events", _events_of, tally), self.sensor, tally)
 
     def imu(self) -> Iterator[Imu]:
-        """All samples; see `Recording`. The axes are those of the unit, because the file does not give its mounting.
-
-        DV writes deg/s and g. A stationary, upright DAVIS346 measures about -9.8 m/s2 in y, as in the optical frame.
-        """
+        """All samples in the optical frame; see `Recording` and `axes.OPTICAL`. DV writes deg/s and g."""
         tally = self.faults.begin("imu")
         return ordered(self._decoded("imu", _imu_of, tally), tally)
 
@@ -201,7 +197,7 @@ def _events_of(packet: bytes) -> Events:
 def _imu_of(packet: bytes) -> Imu:
     t, *numbers = tables_of(packet, b"IMUS", (_T, *_UNITS))
     values = np.stack(numbers, -1).astype(np.float64)
-    return Imu(t, values[:, :3] * G_M_S2, np.radians(values[:, 3:]))
+    return optical_samples(t, values[:, :3], values[:, 3:])
 
 
 def _triggers_of(packet: bytes) -> Triggers:

@@ -15,9 +15,10 @@ from neurove_core.io.errors import BrokenRecording, UnknownSource
 from neurove_core.io.faults import Faults, Reason, Tally
 from neurove_core.io.formats.hdf5.file import FAULTS, Column, check_ratio, opened, read_rows
 from neurove_core.io.order import Where
-from neurove_core.io.recording import CHUNK_EVENTS, EventsOnly, Imu, Recording, later
+from neurove_core.io.recording import CHUNK_EVENTS, EventsOnly, Recording, later
 from neurove_core.io.units import SAMPLE, UNITS, TimeSample, scaled
 from neurove_protocol.events import Events, Sensor
+from neurove_protocol.imu import Imu
 
 _MAX_T_US, _MAX_XY = 1 << 62, 1 << 40
 

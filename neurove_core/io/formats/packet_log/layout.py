@@ -6,7 +6,7 @@ A stream has up to eight channels with the name `<stream>/<kind>` and the messag
 | --- | --- | --- |
 | events | neurove.events.1 | an EventPacket, the published bytes |
 | camera | neurove.camera.1 | a CameraInfo, the published bytes |
-| imu | neurove.imu.1 | up to 4096 samples: columns `t`, `accel_m_s2`, `gyro_rad_s` |
+| imu | neurove.imu.1 | an ImuPacket, the published bytes; older files have its columns without stream and number |
 | triggers | neurove.triggers.1 | edges: `t`, `channel`, `level` |
 | poses | neurove.poses.1 | `t`, `position_m`, `orientation` |
 | twists | neurove.twists.1 | `t`, `twist` |
@@ -27,8 +27,9 @@ import msgpack
 import numpy as np
 
 from neurove_core.geometry.motion import Poses, Twists
-from neurove_core.io.recording import Frame, Imu, Triggers
-from neurove_protocol import camera, events, velocity
+from neurove_core.io.recording import Frame, Triggers
+from neurove_protocol import camera, events, imu, velocity
+from neurove_protocol.imu import Imu
 
 PROFILE: Final = "neurove"
 VERSION: Final = 1
@@ -69,7 +70,7 @@ def schema_of(kind: str) -> tuple[str, str]:
     >>> schema_of("events")
     ('neurove.events.1', 'msgpack')
     """
-    schemas = {"events": events.SCHEMA, "camera": camera.SCHEMA, "velocity": velocity.SCHEMA}
+    schemas = {"events": events.SCHEMA, "camera": camera.SCHEMA, "imu": imu.SCHEMA, "velocity": velocity.SCHEMA}
     wire = schemas.get(kind, f"application/msgpack;neurove.{kind}.{VERSION}")
     encoding, _, name = wire.partition(";")
     return name, encoding.removeprefix("application/")

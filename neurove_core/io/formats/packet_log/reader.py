@@ -16,15 +16,25 @@ from neurove_core.io.format import Format
 from neurove_core.io.formats.containers.mcap import McapFile, Record
 from neurove_core.io.formats.packet_log import layout
 from neurove_core.io.formats.packet_log.layout import PROFILE, BadColumns
-from neurove_core.io.recording import EventsOnly, Frame, Imu, Triggers, later
+from neurove_core.io.recording import EventsOnly, Frame, Triggers, later
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.events import EventPacket, Events, PacketLimits, Sensor, decode_packet
+from neurove_protocol.imu import Imu
 
 LIMITS: Final = PacketLimits(max_events=16_000_000, max_side_px=1 << 15)
 """Limits for packets. Each service sets its own wire limits, and a recording may come from any service."""
 
 T = TypeVar("T")
+
+
+class RecordedMessage(NamedTuple):
+    """One message of a driver, as published."""
+
+    stream: str
+    kind: str  # events or imu
+    payload: bytes
+    log_ns: int  # as in RecordedPacket
 
 
 class RecordedPacket(NamedTuple):
@@ -133,6 +143,25 @@ class McapRecording(EventsOnly):
             name = record.channel.topic.removesuffix("/events")
             yield RecordedPacket(name, record.data, record.log_ns)
 
+    def has_imu(self, stream: str) -> bool:
+        """Whether the file holds inertial samples of a stream."""
+        return f"{stream}/imu" in self.file.topics
+
+    def driven(self, stream: str | None = None) -> Iterator[RecordedMessage]:
+        """Yield what the drivers of one stream, or of all streams, published in turn: event and IMU packets.
+
+        Args:
+            stream: name of the stream; None for all streams.
+
+        Raises:
+            BrokenRecording: as in `packets`.
+        """
+        streams = _streams(self.file) if stream is None else [stream]
+        topics = [topic for name in streams for topic in (f"{name}/events", f"{name}/imu") if topic in self.file.topics]
+        for record in self.file.records(topics, tally=self.faults.begin("packets")):
+            name, _, kind = record.channel.topic.rpartition("/")
+            yield RecordedMessage(name, kind, record.data, record.log_ns)
+
     @property
     def all_streams(self) -> tuple[str, ...]:
         """Names of all event streams in the file."""
@@ -158,7 +187,7 @@ class McapRecording(EventsOnly):
         return (payload and CameraInfo(**(CameraInfo.decode(payload).model_dump() | {"stream": stream}))) or None
 
     def imu(self) -> Iterator[Imu]:
-        """Yield the IMU samples of the converted recording."""
+        """Yield the IMU samples, in the frame in which they were published or converted."""
         tally = self.faults.begin("imu")
         return ordered(self._tables("imu", tally), tally)
 

@@ -15,8 +15,9 @@ from neurove_core.io.formats.packet_log import layout
 from neurove_core.io.packets import slices
 from neurove_core.io.recording import Recording
 from neurove_protocol.camera import CameraInfo
-from neurove_protocol.errors import InvalidField
+from neurove_protocol.errors import InvalidField, NeuroVEError
 from neurove_protocol.events import EventPacket, encode_packet
+from neurove_protocol.imu import MAX_SAMPLES, Imu, ImuPacket, encode_imu
 from neurove_protocol.keys import check_name
 
 CHUNK_BYTES: Final = 1 << 20
@@ -180,20 +181,49 @@ def write_mcap(recording: Recording, path: Path, stream: str = "cam0", progress:
         camera = recording.camera(stream)
         if camera is not None:
             writer.camera(camera.encode())
+        inertial = _Inertial(recording, stream, writer)
         for seq, piece in enumerate(slices(recording.chunks())):
+            inertial.write_until(piece.end_us)
             packet = EventPacket(stream, seq, recording.sensor, piece.t0_us, piece.events)
             writer.write(stream, encode_packet(packet), piece.end_us * 1000)
             events += piece.events.n
             if progress:
                 progress(events, piece.end_us)
+        inertial.write_until(1 << 62)
         _write_other_data(recording, stream, writer)
         writer.about(source=recording.name, stream=stream, events=events)
     return events
 
 
+class _Inertial:
+    """Writes the inertial samples of a recording in step with its events, so that a replay sends them in time."""
+
+    def __init__(self, recording: Recording, stream: str, writer: PacketWriter) -> None:
+        self._batches, self._stream, self._writer = recording.imu(), stream, writer
+        self._rest, self._seq = Imu.empty(), 0
+
+    def write_until(self, t_us: int) -> None:
+        """Write all samples before this time [us]."""
+        while True:
+            before = int(self._rest.t.searchsorted(t_us))
+            for first in range(0, before, MAX_SAMPLES):
+                self._write(self._rest.span(first, min(first + MAX_SAMPLES, before)))
+            self._rest = self._rest.span(before, self._rest.n)
+            batch = None if self._rest.n else next(self._batches, None)
+            if batch is None:
+                return
+            self._rest = batch
+
+    def _write(self, samples: Imu) -> None:
+        try:
+            payload = encode_imu(ImuPacket(self._stream, self._seq, samples))
+            self._seq += 1
+        except NeuroVEError:  # a number beyond the bounds of the protocol: keep it, as a table that no replay sends
+            payload = layout.pack_columns("imu", samples)
+        self._writer.add(self._stream, "imu", payload, int(samples.t[0]) * 1000)
+
+
 def _write_other_data(recording: Recording, stream: str, writer: PacketWriter) -> None:
-    for imu in recording.imu():
-        _write_rows(writer, stream, "imu", imu)
     for triggers in recording.triggers():
         _write_rows(writer, stream, "triggers", triggers)
     poses, twists = truth(recording)

@@ -12,6 +12,7 @@ import numpy as np
 
 from neurove_core.geometry import motion
 from neurove_core.geometry.motion import Poses, Twists
+from neurove_core.io.axes import OPTICAL
 from neurove_core.io.checked import cleaned, ordered, unread
 from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSource
 from neurove_core.io.faults import Faults, Reason, Tally
@@ -32,16 +33,18 @@ from neurove_core.io.formats.ros import messages
 from neurove_core.io.formats.ros.events import PROPHESEE, UNIX_TIME, Anchor, Decoder
 from neurove_core.io.formats.ros.messages import BadMessage, EventMessage
 from neurove_core.io.order import Where
-from neurove_core.io.recording import EventsOnly, Imu, Triggers, later
+from neurove_core.io.recording import EventsOnly, Triggers, later
 from neurove_core.io.spool import plain_file
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
+from neurove_protocol.imu import Imu
 
 DVS_TYPES: Final = ("dvs_msgs/EventArray", "prophesee_event_msgs/EventArray")
 """Types with one layout: github.com/uzh-rpg/rpg_dvs_ros and github.com/prophesee-ai/prophesee_ros_wrapper."""
 
 EVENT_TYPES: Final = ("event_camera_msgs/EventPacket", "event_array_msgs/EventArray", *DVS_TYPES)
+LIBCAER: Final = ("libcaer", "libcaer_cmp")
 IMU_TYPE: Final = "sensor_msgs/Imu"
 CAMERA_TYPE: Final = "sensor_msgs/CameraInfo"
 POSE_TYPES: Final = ("geometry_msgs/PoseStamped", "nav_msgs/Odometry")
@@ -210,12 +213,15 @@ class RosbagRecording(EventsOnly):
     def imu(self) -> Iterator[Imu]:
         """The samples of the sensor_msgs/Imu topic nearest by name.
 
-        They are in the frame of the IMU, because bags rarely give its mounting.
+        The driver rpg_dvs_ros (dvs_msgs) gives the optical frame. Samples of libcaer_driver are rotated into it, see
+        `axes.OPTICAL`. Samples of any other driver are in the frame of the IMU, because bags rarely give its mounting.
         """
         topic = self._nearest_topic(IMU_TYPE)
         if topic is not None:
             tally = self.faults.begin("imu")
-            yield from ordered(_imu_batches(self._samples(topic, messages.imu, tally), self.ros_offset_us), tally)
+            signs = OPTICAL if self.first.encoding in LIBCAER else np.ones(3)
+            for batch in ordered(_imu_batches(self._samples(topic, messages.imu, tally), self.ros_offset_us), tally):
+                yield Imu(batch.t, batch.accel_m_s2 * signs, batch.gyro_rad_s * signs)
 
     def _samples(self, topic: str, read: Callable[..., T], tally: Tally) -> Iterator[tuple[str, T]]:
         """The place and the value of each message of a topic that can be decoded."""
