@@ -43,7 +43,7 @@ MAY_IMPORT = {
         "engine models estimator self_test io io.formats sim sources"
     ),
     "neurove_core.adaptation": (
-        "config files geometry models estimator io io.formats sources evaluation training"
+        "config files geometry models estimator self_test io io.formats sources evaluation training"
     ),
     "neurove_core.bench": (
         "config compiled figures geometry spiking ingest networks engine models estimator sim sources"

@@ -26,7 +26,7 @@ class Pieces(NamedTuple):
 
 
 def divide(name: str, start_us: int, end_us: int, share: float, least_us: int, validation_us: int) -> Pieces:
-    """Divide a recording: validation first, held-out pieces in the middle and at the end, the rest to learn from.
+    """Divide a recording into one or two equal blocks: a piece to learn from, one to validate, one that is held out.
 
     Args:
         name: of the recording.
@@ -34,28 +34,31 @@ def divide(name: str, start_us: int, end_us: int, share: float, least_us: int, v
         end_us: last time with both.
         share: of the recording that is held out.
         least_us: shortest piece that can be learned from.
-        validation_us: shortest piece that can validate.
+        validation_us: shortest piece that can validate, or be held out.
 
     Raises:
         InvalidField: the recording is too short.
     """
     length = end_us - start_us
     count = 2 if length >= _TWO_FROM_S * 1e6 else 1
-    held = [
-        (round(end_us - length * ((count - 1 - i) / count) - length * share / count), round(end_us - length * (count - 1 - i) / count))
-        for i in range(count)
-    ]
-    validation = (start_us, start_us + max(validation_us, round(length * _VALIDATION)))
-    training, at = [], validation[1] + GAP_US
-    for first, last in held:
-        if first - GAP_US - at >= least_us:
-            training.append((at, first - GAP_US))
-        at = last + GAP_US
-    if not training or min(last - first for first, last in held) < validation_us:
-        needed = (least_us + 2 * GAP_US + validation_us) / max(1e-6, 1 - share - _VALIDATION) / 1e6
-        bound = f"at least {max(needed, validation_us / share / 1e6):.0f} s with events and truth are needed, with {share:.0%} held out"
+    block = length // count
+    held_us, checked_us = round(block * share), max(validation_us, round(block * _VALIDATION))
+    parts: list[tuple[Span, Span, Span]] = []
+    for first in (start_us + i * block for i in range(count)):
+        held = (first + block - held_us, first + block)
+        checked = (held[0] - GAP_US - checked_us, held[0] - GAP_US)
+        learned = (first + (GAP_US if first > start_us else 0), checked[0] - GAP_US)
+        parts.append((learned, checked, held))
+    if held_us < validation_us or any(last - first < least_us for (first, last), _, _ in parts):
+        least_s = max(
+            (least_us + 2 * GAP_US) / max(0.05, 1 - share - _VALIDATION),
+            (least_us + 2 * GAP_US + validation_us) / (1 - share),
+            validation_us / share,
+        )
+        bound = f"at least {least_s / 1e6:.0f} s with events and truth are needed, with {share:.0%} held out"
         raise InvalidField("adapt", name, f"{length / 1e6:.1f} s", bound)
-    return Pieces(tuple(training), (validation,), tuple(held))
+    training, validation, held_out = zip(*parts, strict=True)
+    return Pieces(tuple(training), tuple(validation), tuple(held_out))
 
 
 def within(truth: Twists, spans: tuple[Span, ...]) -> Twists:
@@ -64,9 +67,7 @@ def within(truth: Twists, spans: tuple[Span, ...]) -> Twists:
     return Twists(truth.t, np.where(inside[:, None], truth.twist, np.nan))
 
 
-def inside_any(
-    start_us: NDArray[np.int64], end_us: NDArray[np.int64], spans: tuple[Span, ...]
-) -> NDArray[np.bool_]:
+def inside_any(start_us: NDArray[np.int64], end_us: NDArray[np.int64], spans: tuple[Span, ...]) -> NDArray[np.bool_]:
     """Which intervals (N,) lie completely within one of the spans."""
     found = np.zeros(len(start_us), np.bool_)
     for first, last in spans:

@@ -8,7 +8,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.adaptation import clock, truth as truths
+from neurove_core.adaptation import clock
+from neurove_core.adaptation import truth as truths
 from neurove_core.adaptation.pieces import Pieces, divide, told
 from neurove_core.adaptation.truth import Asked, Truth
 from neurove_core.estimator import Estimator
@@ -66,10 +67,14 @@ def opened(source: str, given: Input) -> tuple[Recording, Recording]:
     seen = with_lens(plain, given.calibration, given.height_m)
     camera = seen.camera(_STREAM)
     if camera is None:
-        why = "it does not say the lens of its camera, without which no velocity can be learned: give --calibration FILE"
+        why = (
+            "it does not say the lens of its camera, without which no velocity can be learned: give --calibration FILE"
+        )
         raise InvalidField("adapt", "--calibration", source, why)
     if camera.height_m is None:
-        why = "it does not say the height of its camera above the ground, and linear velocity is learned per metre of it"
+        why = (
+            "it does not say the height of its camera above the ground, and linear velocity is learned per metre of it"
+        )
         raise InvalidField("adapt", "--height", source, why)
     return plain, seen
 
@@ -108,7 +113,7 @@ def prepare(
     duration_us = estimator.config.window.duration_us
     start_us, end_us = int(before.start_us[0]), int(before.start_us[-1]) + duration_us
     truths.check_overlap(seen.name, truth.twists, start_us, end_us, asked.unit)
-    truth, about_clock = _aligned(truth, before, given.offset_s)
+    truth, about_clock = _aligned(truth, seen, before, given.offset_s)
     _check_frame(seen.name, before, truth.twists)
     first, last = max(start_us, int(truth.twists.t[0])), min(end_us, int(truth.twists.t[-1]))
     pieces = divide(seen.name, first, last, given.held_out, windows[0] * duration_us, windows[1] * duration_us)
@@ -144,17 +149,26 @@ def _moved(truth: Truth, offset_us: int) -> Truth:
     return replace(truth, twists=Twists(truth.twists.t + offset_us, truth.twists.twist))
 
 
-def _aligned(truth: Truth, before: Estimates, given_s: float | None) -> tuple[Truth, str]:
+def _aligned(truth: Truth, seen: Recording, before: Estimates, given_s: float | None) -> tuple[Truth, str]:
     """The truth on the clock of the events, and what was done."""
     if given_s is not None:
         return truth, f"clock: --offset moves the truth by {given_s:+.3f} s"
-    found = clock.find_offset(*stamps_and_twists(before), truth.twists)
-    if found is None:
-        return truth, "clock: events and truth do not show the same motion clearly enough to compare their clocks"
-    change = f"correlation {found.before:.2f} without, {found.agreement:.2f} with it"
-    if abs(found.us) < clock.LEAST_US or found.agreement - found.before < clock.LEAST_GAIN:
-        return truth, f"clock: truth and events agree to within {clock.LEAST_US / 1e3:.0f} ms (correlation {found.agreement:.2f})"
-    return _moved(truth, found.us), f"clock: the truth is {found.us / 1e6:+.3f} s behind the events ({change}); corrected"
+    by_gyro = clock.seen_by_gyro(seen.imu())
+    by_model = clock.seen_by_model(*stamps_and_twists(before))
+    for shown in (by_gyro, by_model):
+        found = None if shown is None else clock.find_offset(shown, truth.twists)
+        if shown is None or found is None:
+            continue
+        if abs(found.us) < shown.least_us:
+            least_s = shown.least_us / 1e6
+            about = (
+                f"clock: {shown.source} and the truth agree to within {least_s:g} s (correlation {found.agreement:.2f})"
+            )
+            return truth, about + ("" if shown is by_gyro else "; a smaller offset needs a gyro or --offset")
+        change = f"correlation {found.before:.2f} without it, {found.agreement:.2f} with it"
+        said = f"clock: by {shown.source} the truth is {found.us / 1e6:+.2f} s behind the events ({change}); corrected"
+        return _moved(truth, found.us), said
+    return truth, "clock: events and truth do not show the same motion clearly enough to compare their clocks"
 
 
 def _check_frame(name: str, before: Estimates, truth: Twists) -> None:

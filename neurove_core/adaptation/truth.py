@@ -50,8 +50,7 @@ class Truth:
     @property
     def axes(self) -> NDArray[np.bool_]:
         """The axes (6) that are known anywhere."""
-        known: NDArray[np.bool_] = np.isfinite(self.twists.twist).any(0)
-        return known
+        return np.asarray(np.isfinite(self.twists.twist).any(0), np.bool_)
 
 
 def read(recording: Recording, asked: Asked) -> Truth:
@@ -73,14 +72,18 @@ def read(recording: Recording, asked: Asked) -> Truth:
     mounting = asked.mounting or Mounting.from_angles()
     frame = asked.frame or usual
     rate = (len(base.t) - 1) / max(1e-6, (int(base.t[-1]) - int(base.t[0])) / 1e6)
-    about = f"{source}, {len(base.t)} samples at {rate:.0f} Hz, motion of the {'robot base' if frame == 'base' else frame}"
+    about = (
+        f"{source}, {len(base.t)} samples at {rate:.0f} Hz, motion of the {'robot base' if frame == 'base' else frame}"
+    )
     if np.isnan(base.twist[:, 1:]).all():  # column 0 is the forward speed of the base
         found = mounting.of_forward_speed(base.t, base.twist[:, 0])
         about += "; only vz is known and learned"
     else:
         found = base if frame == "camera" else mounting.of_base(base)
     if frame == "base" and asked.mounting is None:
-        about += "; assumed: the camera looks forward, level, at the base (else give --extrinsics, or --mount and --position)"
+        about += (
+            "; assumed: the camera looks forward, level, at the base (else --extrinsics, or --mount and --position)"
+        )
     _check_motion(source, found)
     return Truth(found, about, tally.faults)
 
@@ -123,7 +126,9 @@ def read_wheel_speed(path: Path, unit: str | None = None) -> Twists:
         raise InvalidField(str(path), "rows", int((~np.isfinite(t + v)).argmax()) + 1, "must be finite numbers")
     if (np.diff(t) <= 0).any():
         first = int((np.diff(t) <= 0).argmax()) + 1
-        raise InvalidField(str(path), "t", float(t[first]), f"must be later than {float(t[first - 1])!r} of the row before")
+        raise InvalidField(
+            str(path), "t", float(t[first]), f"must be later than {float(t[first - 1])!r} of the row before"
+        )
     twist = np.full((len(t), 6), np.nan)
     twist[:, 0] = v
     return Twists(np.rint(t * scale).astype(np.int64), twist)
@@ -155,7 +160,9 @@ def check_overlap(name: str, truth: Twists, start_us: int, end_us: int, unit: st
         for one in _UNITS
         if one != was and 0.3 < ratio * US_PER_UNIT[one] / US_PER_UNIT[was] < 3 and not 0.3 < ratio < 3
     ]
-    hint = f"; their lengths would agree with --truth-unit {right[0]}" if right else "; --offset SECONDS moves the truth"
+    hint = (
+        f"; their lengths would agree with --truth-unit {right[0]}" if right else "; --offset SECONDS moves the truth"
+    )
     raise InvalidField(name, "truth", spans, f"the times of the truth must overlap with those of the events{hint}")
 
 
@@ -184,7 +191,9 @@ def _topic(bag: BagFile, asked: Asked, offset_us: int, tally: Tally) -> tuple[Tw
     if topic is None:
         if len(known) != 1:
             found = ", ".join(f"{name} ({kind})" for name, kind in known.items()) or "none"
-            raise InvalidField("adapt", "--topic", None, f"choose the topic of the robot's motion; {bag.path.name} has {found}")
+            raise InvalidField(
+                "adapt", "--topic", None, f"choose the topic of the robot's motion; {bag.path.name} has {found}"
+            )
         topic = next(iter(known))
     found_twists = read_motion(bag, topic, offset_us, tally)
     return found_twists, f"{topic} ({bag.topics[topic]})", "base"

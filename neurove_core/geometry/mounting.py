@@ -45,7 +45,10 @@ class Mounting(NamedTuple):
         array([ 0.,  0., -1.])
         """
         roll, pitch, yaw = np.radians([roll_deg, pitch_deg, yaw_deg])
-        turns = [rotations.matrix_of(rotations.exp(np.array([angle]))) for angle in ([roll, 0, 0], [0, pitch, 0], [0, 0, yaw])]
+        turns = [
+            rotations.matrix_of(rotations.exp(np.array([angle])))
+            for angle in ([roll, 0, 0], [0, pitch, 0], [0, 0, yaw])
+        ]
         x, y, z = (turn[0] for turn in turns)
         return cls(z @ y @ x @ _LEVEL, np.array(position_m, np.float64))
 
@@ -84,7 +87,9 @@ class Mounting(NamedTuple):
         v_c = R^T (v_b + w_b x p), w_c = R^T w_b, with R from camera to base and p the position of the camera.
         """
         v, w = base.twist[:, :3], base.twist[:, 3:]
-        return Twists(base.t, np.concatenate([(v + np.cross(w, self.position_m)) @ self.rotation, w @ self.rotation], 1))
+        return Twists(
+            base.t, np.concatenate([(v + np.cross(w, self.position_m)) @ self.rotation, w @ self.rotation], 1)
+        )
 
     def of_forward_speed(self, t: NDArray[np.int64], speed_m_s: Array) -> Twists:
         """The twists of a camera of which only the forward speed of the robot is known: vz, and nan elsewhere.

@@ -203,7 +203,7 @@ def with_wider_sigma(bundle: Bundle, factor: Array, provenance: str) -> Bundle:
         raise BadModel(bundle.name, "it has no uncertainty: neurove calibrate adds it")
     leak = 1 - float(torch.sigmoid(network.kappa_logit.detach()))
     with torch.no_grad():  # the leaky neuron integrates log(factor) * leak to log(factor)
-        network.spread.bias += torch.from_numpy(np.log(factor) * leak).float()
+        network.spread.bias.add_(torch.from_numpy(np.log(factor) * leak).float())
     about = f"{bundle.uncertainty.provenance}; {provenance}"[:_PROVENANCE_CHARS]
     changed = replace(bundle.uncertainty, provenance=about)
     return replace(bundle, network=network.eval(), uncertainty=changed).with_digest()

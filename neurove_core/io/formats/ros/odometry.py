@@ -92,6 +92,8 @@ def _ordered(topic: str, samples: list[messages.TwistSample], offset_us: int, ta
     for reason, wrong in ((Reason.INVALID, ~finite), (Reason.LATE, finite & ~later)):
         if wrong.any():
             first = int(wrong.argmax())
-            tally.add(reason, f"{topic}: sample {first}", f"twist {twist[first].tolist()} at {t[first]} us", int(wrong.sum()))
+            tally.add(
+                reason, f"{topic}: sample {first}", f"twist {twist[first].tolist()} at {t[first]} us", int(wrong.sum())
+            )
     kept = finite & later
     return Twists(t[kept], twist[kept])
