@@ -3,17 +3,40 @@
 They are stored in the header of the model's bundle. A wrong value raises an error that names it.
 """
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    SerializationInfo,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
 
 MAX_CANONICAL_CELLS = 1 << 20
+MAX_HISTORY = 16
+"""Most earlier windows that `network.history` reaches back."""
 
 
 class Config(BaseModel):
-    """Base of all configurations: immutable, unknown keys are errors, finite numbers only."""
+    """Base of all configurations: immutable, unknown keys are errors, finite numbers only.
+
+    A field in LATER is newer than the stored bundles. It is left out of a dump while it has its default, so that a
+    bundle, its digest and a folder of sequences that do not use it stay as they were.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    LATER: ClassVar[tuple[str, ...]] = ()
+
+    @model_serializer(mode="wrap")
+    def _without_later(self, dump: SerializerFunctionWrapHandler, _: SerializationInfo) -> dict[str, Any]:
+        found: dict[str, Any] = dump(self)
+        for name in self.LATER:
+            if name in found and getattr(self, name) == type(self).model_fields[name].default:
+                del found[name]
+        return found
 
 
 class WindowConfig(Config):
@@ -43,12 +66,30 @@ class CanonicalConfig(Config):
     width: int = Field(86, ge=8, description="Grid columns.")
     height: int = Field(65, ge=8, description="Grid rows.")
     hfov_deg: float = Field(75.0, gt=1, lt=170, description="Horizontal field of view [deg]; cells are square.")
+    subcells: Literal[1, 2] = Field(
+        1,
+        description="Parts of a cell in each direction: 2 counts the four quarters of a cell in channels of their own.",
+    )
+
+    LATER = ("subcells",)
 
     @model_validator(mode="after")
     def _bounded(self) -> Self:
-        if self.width * self.height > MAX_CANONICAL_CELLS:
-            raise ValueError(f"width * height = {self.width * self.height}: at most {MAX_CANONICAL_CELLS} cells")
+        cells = self.width * self.height * self.parts
+        if cells > MAX_CANONICAL_CELLS:
+            raise ValueError(f"width * height * subcells**2 = {cells}: at most {MAX_CANONICAL_CELLS} cells")
         return self
+
+    @property
+    def fine(self) -> "CanonicalConfig":
+        """The grid whose cells are the parts of this one."""
+        size = {"width": self.width * self.subcells, "height": self.height * self.subcells}
+        return CanonicalConfig.model_validate(self.model_dump() | size | {"subcells": 1})
+
+    @property
+    def parts(self) -> int:
+        """Parts of a cell that are counted apart: the square of `subcells`."""
+        return self.subcells**2
 
 
 class NetworkConfig(Config):
@@ -63,6 +104,9 @@ class NetworkConfig(Config):
     features: int = Field(128, ge=1, le=4096, description="Width of the layer between extractor and estimator.")
     hidden: int = Field(128, ge=1, le=4096, description="Units of each ASLSTM cell.")
     cells: int = Field(2, ge=1, le=8, description="ASLSTM layers; the paper has two.")
+    history: Annotated[tuple[int, ...], Field(max_length=4)] = Field(
+        (), description="Longer time: number of earlier windows in each further bin, the newest first, such as 1, 2, 4."
+    )
     decay: float = Field(0.5, ge=0, lt=1, description="LIF leak per time step: 1 - dt/tau.")
     v_th: float = Field(1.0, gt=0, description="Firing threshold of all neurons.")
     alpha: float = Field(0.9, ge=0, le=1, description="ASLSTM: share of h in the membrane potential.")
@@ -70,10 +114,18 @@ class NetworkConfig(Config):
     surrogate: Literal["rectangular", "arctan", "triangle"] = "rectangular"
     surrogate_width: float = Field(1.0, gt=0, description="Width of the surrogate gradient, in thresholds.")
 
+    LATER = ("history",)
+
     @model_validator(mode="after")
     def _channels_positive(self) -> Self:
         if not all(1 <= count <= 1024 for count in self.channels):
             raise ValueError(f"channels={self.channels}: each must be 1 to 1024")
+        return self
+
+    @model_validator(mode="after")
+    def _history_bounded(self) -> Self:
+        if not all(1 <= count <= MAX_HISTORY for count in self.history) or sum(self.history) > MAX_HISTORY:
+            raise ValueError(f"history={self.history}: each must be at least 1, and all at most {MAX_HISTORY} windows")
         return self
 
 
@@ -95,6 +147,37 @@ class ModelConfig(Config):
         le=100,
         description="The same for events per pixel that the model sees; a stationary sensor has 0.02 to 0.12.",
     )
+
+    scales: Annotated[tuple[int, ...], Field(max_length=4)] = Field(
+        (), description="Longer windows that the network runs on too, in windows, such as 2, 4, 8; see timescales."
+    )
+    scale_bounds: tuple[float, float] = Field(
+        (4.0, 0.5),
+        description="Greatest linear (model's unit) and angular [rad/s] speed, times the scale, of a longer window.",
+    )
+
+    LATER = ("scales", "scale_bounds")
+
+    @model_validator(mode="after")
+    def _scales_rise(self) -> Self:
+        if list(self.scales) != sorted(set(self.scales)) or not all(2 <= one <= MAX_HISTORY for one in self.scales):
+            raise ValueError(f"scales={self.scales}: must rise, from at least 2 to at most {MAX_HISTORY}")
+        if not min(self.scale_bounds) > 0:
+            raise ValueError(f"scale_bounds={self.scale_bounds}: both must be above 0")
+        if self.scales and self.network.history:
+            raise ValueError(f"scales={self.scales}: a model with network.history={self.network.history} has none")
+        return self
+
+    @property
+    def window_shape(self) -> tuple[int, int, int]:
+        """Shape (C, H, W) of a window's counts; C = 2n * parts, see `ingest.windows.Window`."""
+        return 2 * self.window.bins * self.canonical.parts, self.canonical.height, self.canonical.width
+
+    @property
+    def input_shape(self) -> tuple[int, int, int]:
+        """Shape (C, H, W) of the network's input: a window's channels, then those of the history."""
+        channels, rows, columns = self.window_shape
+        return channels + 2 * self.canonical.parts * len(self.network.history), rows, columns
 
     @model_validator(mode="after")
     def _int8_is_neuroves(self) -> Self:

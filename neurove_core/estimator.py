@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from neurove_core.engine.runner import runner_of
 from neurove_core.geometry.tables import TABLES
 from neurove_core.ingest import windows
+from neurove_core.ingest.channels import Recent, remembered, with_history
 from neurove_core.ingest.windows import Pushed, Window, WindowsState
 from neurove_core.ingest.wire import read_packet
 from neurove_core.io.packets import slices
@@ -23,6 +24,7 @@ from neurove_core.models.bundle import PER_HEIGHT, Bundle, LinearUnit
 from neurove_core.networks.kinds import State
 from neurove_core.networks.neurove import NetworkState, NeuroVE
 from neurove_core.networks.runner import Runner
+from neurove_core.timescales import Answer, Longer, chosen, followed, jobs, slowed
 from neurove_protocol import CameraInfo, Events, Sensor
 from neurove_protocol.errors import BadModel
 from neurove_protocol.events import EventPacket, PacketLimits, WireEvents, encode_packet
@@ -42,6 +44,8 @@ class StreamState(NamedTuple):
     age: int  # windows since the network state began
     end_us: int | None = None  # end of the newest window that the network has processed
     low_activity_below: float = 0.0  # a window with fewer visible events is flagged low_activity
+    recent: Recent = ()  # counts of earlier windows, for models with a history
+    longer: Longer = Longer()  # for models with longer windows
 
 
 class WindowEstimate(NamedTuple):
@@ -58,6 +62,7 @@ class WindowEstimate(NamedTuple):
     covariance: NDArray[np.float64] | None = None  # (6, 6) of each of these twists, from the bundle's calibration
     uncertain: bool = False  # the linear or the angular sigma exceeds both its bounds, see Uncertainty.is_uncertain
     source: Source = "network"  # of the angular part
+    gyro_disagrees: bool = False  # the events and the gyroscope of the camera disagree
 
 
 class PushResult(NamedTuple):
@@ -122,7 +127,7 @@ class Estimator:
         return StreamState(sensor, camera, lut, WindowsState(), network, 0, low_activity_below=least)
 
     def estimates(self, recording: Recording, camera: CameraInfo | None = None) -> Iterator[WindowEstimate]:
-        """Estimates of all complete windows of a recording, in order, as the service answers its packets.
+        """Estimates of all complete windows of a recording by its events alone, as the service answers its packets.
 
         Args:
             recording: source of events, see `open_source`.
@@ -176,6 +181,11 @@ class Estimator:
         self._answer([stream])
         return stream.estimates, stream.state
 
+    def is_uncertain(self, twists: NDArray[np.float64], covariance: NDArray[np.float64]) -> bool:
+        """Whether sigma exceeds the bounds, see `Uncertainty.is_uncertain`; False for a model without uncertainty."""
+        unsure = self.bundle.uncertainty
+        return unsure is not None and unsure.is_uncertain(twists, covariance, self._bounds)
+
     def has_same_windows(self, other: "Estimator") -> bool:
         """Whether both models use the same windows and canonical camera, so that one can use the other's windows."""
         return (self.config.window, self.config.canonical) == (other.config.window, other.config.canonical)
@@ -192,21 +202,38 @@ class Estimator:
             due = [stream for stream in streams if turn < len(stream.windows)]
             for stream in due:
                 self._reset_after_gap(stream, stream.windows[turn])
-            counts = [stream.windows[turn].counts for stream in due]
+            counts = [with_history(stream.windows[turn].counts, stream.state.recent, self.config) for stream in due]
             steps = self._runner.run(counts, [stream.state.network for stream in due])
             for stream, (twists, network) in zip(due, steps, strict=True):
                 self._take(stream, stream.windows[turn], twists * self._scale + self._offset, network)
 
+    def _chosen(self, stream: _Progress, window: Window, answer: Answer) -> Answer:
+        """The answer of the time scale that fits the motion; longer windows run on the way."""
+        if not self.config.scales:
+            return answer
+        wanted, longer = jobs(window.counts, stream.state.longer, self.network, self.config)
+        runs = self._runner.run([job.counts for job in wanted], [job.state for job in wanted]) if wanted else []
+        longer = followed(longer, [(job, state) for job, (_, state) in zip(wanted, runs, strict=True)], self.config)
+        stream.state = stream.state._replace(longer=longer)
+        answers = [answer]
+        for job, (twists, state) in zip(wanted, runs, strict=True):
+            answers.append(Answer(slowed(twists * self._scale + self._offset, job.scale), state, job.scale))
+        return chosen(answers, longer.windows, self.config.scale_bounds)
+
     def _reset_after_gap(self, stream: _Progress, window: Window) -> None:
         """Reset the network state where a window does not follow the one before it."""
         if stream.state.end_us not in (None, window.start_us) and not window.bridged:
-            stream.state = stream.state._replace(network=self.network.initial_state(), age=0)
+            stream.state = stream.state._replace(
+                network=self.network.initial_state(), age=0, recent=(), longer=Longer()
+            )
 
     def _take(self, stream: _Progress, window: Window, twists: NDArray[np.float64], network: State) -> None:
+        answer = self._chosen(stream, window, Answer(twists, network))
         state = stream.state
-        stream.estimates.append(self._estimate(window, twists, network, state))
+        stream.estimates.append(self._estimate(window, answer, state))
         end_us = window.start_us + self.config.window.duration_us
-        stream.state = state._replace(network=network, age=state.age + 1, end_us=end_us)
+        recent = remembered(window.counts, state.recent, self.config)
+        stream.state = state._replace(network=network, age=state.age + 1, end_us=end_us, recent=recent)
 
     def warm_up(self) -> None:
         """Compile all code and run all parts, so that the first packet does not wait for it.
@@ -232,20 +259,19 @@ class Estimator:
             if not (finite and state.network.finite()):  # a membrane of nan never fires, so the answer does not show it
                 raise BadModel(self.bundle.name, "it computes numbers that are not finite")
 
-    def _covariance(self, state: State, metres: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Covariance (6, 6) of the twists of the window that led to this state, in the units of the estimate."""
+    def _covariance(self, answer: Answer, metres: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Covariance (6, 6) of the twists of an answer, in the units of the estimate."""
+        state = answer.network
         if not isinstance(self.network, NeuroVE) or not isinstance(state, NetworkState):
             return None
         log_sigma = self.network.log_sigma(state)
         if self.bundle.uncertainty is None or log_sigma is None:
             return None
-        return self.bundle.uncertainty.covariance(log_sigma[0].double().numpy(), self._scale * metres)
+        return self.bundle.uncertainty.covariance(log_sigma[0].double().numpy(), self._scale * metres / answer.scale)
 
-    def _estimate(
-        self, window: Window, twists: NDArray[np.float64], network: State, before: StreamState
-    ) -> WindowEstimate:
+    def _estimate(self, window: Window, answer: Answer, before: StreamState) -> WindowEstimate:
         metres, age = _to_metres(before.camera, self.bundle.linear_unit), before.age
-        twists, covariance = twists * metres, self._covariance(network, metres)
+        twists, covariance = answer.twists * metres, self._covariance(answer, metres)
         unsure = self.bundle.uncertainty
         return WindowEstimate(
             start_us=window.start_us,

@@ -133,6 +133,24 @@ class Latency(Part):
     p99: float
 
 
+class ImuStatus(Part):
+    """The inertial unit of a stream, as far as its packets reach the node."""
+
+    rate_hz: float  # of its newest samples; 0 if no packet arrives
+    samples: Count  # received
+    lost_packets: Count  # missing by sequence number
+    refused_packets: Count  # they break a rule of the contract
+    dropped_packets: Count  # by this node, oldest first, because the queue was full
+    late_samples: Count  # earlier than others before
+    used: bool  # the newest estimate takes its angular part from the gyroscope
+    resting: bool  # the camera does not move
+    bias_rad_s: Annotated[tuple[float, float, float], Field(strict=False)] | None  # None before the first rest
+    bias_sigma_rad_s: float  # standard deviation of each axis of the bias
+    offset_ms: float | None  # by which its times are late; None while no turn shows it
+    disagrees: bool  # gyroscope and events have turned differently for a while
+    problem: str  # what is wrong, in one sentence; empty if nothing is
+
+
 class StreamStatus(Message):
     """The verdict and the counters of one stream on one node, since the stream began."""
 
@@ -158,6 +176,7 @@ class StreamStatus(Message):
     uncounted_packets: Count = 0  # all had the sequence number 0, so losses before this node cannot be counted
     refused_cameras: Count = 0  # CameraInfo messages that were refused or do not belong to the sensor
     refusal: str = ""  # why the newest packet or CameraInfo was refused
+    imu: ImuStatus | None = None  # None for a stream without an inertial unit
 
 
 class ModelInfo(Part):

@@ -36,6 +36,7 @@ class Flag(StrEnum):
     LOW_ACTIVITY = "low_activity"  # fewer events than the model needs to see motion
     SATURATED = "saturated"  # the event count of a cell reached its maximum
     FROZEN = "frozen"  # the camera repeats the same events
+    GYRO_DISAGREES = "gyro_disagrees"  # gyroscope and events turn differently; the gyroscope is not used
     UNCERTAIN = "uncertain"  # sigma of the linear or the angular part is above its relative and its absolute bound
 
 

@@ -31,13 +31,17 @@ MAY_IMPORT = {
     "neurove_core.networks": "config compiled spiking",
     "neurove_core.engine": "compiled spiking networks",
     "neurove_core.models": "config files networks",
-    "neurove_core.estimator": "geometry ingest networks engine models io",
+    "neurove_core.timescales": "config ingest networks",
+    "neurove_core.refine": "compiled geometry ingest",
+    "neurove_core.inertial": "",
+    "neurove_core.estimator": "geometry ingest networks engine models io refine timescales",
     "neurove_core.self_test": "config models estimator",
+    "neurove_core.aided": "estimator inertial",
     "neurove_core.io": "files extras figures geometry",
     "neurove_core.io.formats": "compiled files extras geometry io",
     "neurove_core.sim": "compiled config figures geometry io io.formats",
     "neurove_core.sources": "io io.formats sim",
-    "neurove_core.evaluation": "compiled figures geometry networks models estimator io",
+    "neurove_core.evaluation": "compiled figures geometry networks models estimator inertial aided io",
     "neurove_core.training": (
         "config files extras figures geometry ingest networks "
         "engine models estimator self_test io io.formats sim sources"
@@ -58,6 +62,7 @@ MAY_IMPORT = {
     "neurove_service.logs": "output log_writer",
     "neurove_service.lifecycle": "",
     "neurove_service.latency": "",
+    "neurove_service.clock_offset": "",
     "neurove_service.limits": "",
     "neurove_service.endpoints": "",
     "neurove_service.config": "core:files endpoints",
@@ -65,13 +70,14 @@ MAY_IMPORT = {
     "neurove_service.desk": "",
     "neurove_service.transport": "logs guard desk",
     "neurove_service.streams": (
-        "core:config core:geometry core:ingest core:networks core:models core:estimator logs guard"
+        "core:config core:geometry core:ingest core:networks core:models core:estimator "
+        "core:inertial core:aided logs guard clock_offset"
     ),
     "neurove_service.models": (
         "core:config core:files core:ingest core:networks core:models core:estimator core:self_test logs guard streams"
     ),
     "neurove_service.clients": (
-        "core:config core:geometry core:ingest core:io core:io.formats core:bench logs config transport"
+        "core:config core:geometry core:ingest core:io core:io.formats core:bench logs config transport clock_offset"
     ),
     "neurove_service.node": (
         "core:files core:geometry core:models logs guard lifecycle latency config transport streams models"

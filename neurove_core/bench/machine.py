@@ -47,7 +47,7 @@ def flops(config: ModelConfig) -> int:
     """Multiplications and additions of one window with dense products, without elementwise operations."""
     net = config.network
     sizes = NeuroVE(config).map_sizes()
-    inputs, total = 2 * config.window.bins, 0
+    inputs, total = config.input_shape[0], 0
     for outputs, (rows, columns) in zip(net.channels, sizes, strict=True):
         total += 9 * inputs * outputs * rows * columns
         inputs = outputs

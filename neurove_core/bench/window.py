@@ -145,7 +145,7 @@ def streams(rounds: int, *, quick: bool) -> list[Row]:
 
 def random_input(config: ModelConfig, steps: int, batch: int = 1, seed: int = 1) -> Tensor:
     """Random network input (T, B, 2n, H, W), encoded from counts, in the channels-last layout of the encoding."""
-    shape = (steps, batch, 2 * config.window.bins, config.canonical.height, config.canonical.width)
+    shape = (steps, batch, *config.input_shape)
     counts = torch.poisson(torch.full(shape, 0.3), generator=torch.Generator().manual_seed(seed))
     return counts.log1p().movedim(2, -1).contiguous().movedim(-1, 2)
 

@@ -9,10 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.estimator import Estimator, WindowEstimate
+from neurove_core.aided import aided
+from neurove_core.estimator import Estimator, PushResult, WindowEstimate
 from neurove_core.evaluation.judgement import judgement
 from neurove_core.evaluation.metrics import ANGULAR_FLOOR_RAD_S, LINEAR_FLOOR_M_S, SKIP_S, figures
 from neurove_core.geometry.motion import Twists
+from neurove_core.inertial.state import InertialState, push
+from neurove_core.io.imu_feed import ImuFeed
 from neurove_core.io.packets import slices
 from neurove_core.io.recording import Recording
 from neurove_core.models.uncertainty import LEVEL, LEVELS, coverage
@@ -70,6 +73,8 @@ def estimate_recording(
     recording: Recording,
     camera: CameraInfo | None = None,
     on_events: Callable[[int], None] = lambda _: None,
+    *,
+    inertial: bool = False,
 ) -> Estimates:
     """Run a model on a recording, packet by packet as a driver sends it.
 
@@ -78,6 +83,7 @@ def estimate_recording(
         recording: its input.
         camera: lens of the recording; by default the one that the recording gives.
         on_events: called after each packet with the number of events so far.
+        inertial: use the recording's inertial samples too, as the service does.
 
     Raises:
         InvalidField: the lens belongs to another sensor.
@@ -88,9 +94,14 @@ def estimate_recording(
     latencies_ms: list[float] = []
     firing_rate = _FiringRate()
     events = 0
+    feed, unit = ImuFeed(recording) if inertial and "imu" in recording.streams else None, InertialState()
     for piece in slices(recording.chunks()):
+        if feed is not None:
+            unit, _ = push(unit, feed.until(piece.end_us))
         began = time.perf_counter()
         pushed = estimator.push(piece.events, state, piece.t0_us)
+        if feed is not None:
+            pushed, unit = _aided(estimator, pushed, unit, camera)
         took_ms = (time.perf_counter() - began) * 1e3
         state = pushed.state
         found += pushed.estimates
@@ -114,6 +125,16 @@ def estimate_recording(
         uncertain=None if _sigmas(found) is None else np.array([one.uncertain for one in found], np.bool_),
         sources=tuple(one.source for one in found),
     )
+
+
+def _aided(
+    estimator: Estimator, pushed: PushResult, unit: InertialState, camera: CameraInfo | None
+) -> tuple[PushResult, InertialState]:
+    found = []
+    for estimate in pushed.estimates:
+        one, unit = aided(estimator, estimate, unit, camera)
+        found.append(one)
+    return pushed._replace(estimates=found), unit
 
 
 def _sigmas(found: list[WindowEstimate]) -> NDArray[np.float64] | None:

@@ -1,6 +1,7 @@
 """Camera: lens models, and the look-up table from the pixels of any sensor to the canonical camera."""
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,15 +41,16 @@ def lookup_table(canonical: CanonicalConfig, sensor: Sensor, camera: CameraInfo 
         camera: the lens of the sensor, if known.
 
     Returns:
-        (sensor.height, sensor.width) of row * width + column, or OUTSIDE.
+        (sensor.height, sensor.width) of (part * height + row) * width + column, or OUTSIDE. Without subcells the part
+        is 0; else it is that of ingest.channels.
 
     Raises:
         InvalidField: the camera info describes a sensor of another size.
     """
     if camera is None:
-        columns = (np.arange(sensor.width) * canonical.width // sensor.width).astype(np.int32)
-        rows = (np.arange(sensor.height) * canonical.height // sensor.height).astype(np.int32)
-        return rows[:, None] * np.int32(canonical.width) + columns
+        columns = (np.arange(sensor.width) * canonical.fine.width // sensor.width).astype(np.int32)
+        rows = (np.arange(sensor.height) * canonical.fine.height // sensor.height).astype(np.int32)
+        return _cell(rows[:, None], columns, canonical).astype(np.int32)
     if camera.sensor != sensor:
         raise InvalidField("camera info", "width x height", str(camera.sensor), f"the events' sensor is {sensor}")
     table = np.empty((sensor.height, sensor.width), np.int32)
@@ -69,13 +71,22 @@ def _fill(
     v = np.arange(table.shape[0], dtype=np.float64)[piece, None]
     xd, yd = np.broadcast_arrays((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
     x, y, steps = _undistort(xd, yd, camera, steps)
-    focal = focal_px(canonical)
+    fine = canonical.fine
+    focal = focal_px(fine)
     with np.errstate(invalid="ignore", over="ignore"):  # a pixel without a ray is nan, and nan is outside
-        column = np.floor(x * focal + canonical.width / 2)
-        row = np.floor(y * focal + canonical.height / 2)
-        inside = (column >= 0) & (column < canonical.width) & (row >= 0) & (row < canonical.height)
-        table[piece] = np.where(inside, row * canonical.width + column, OUTSIDE)
+        column = np.floor(x * focal + fine.width / 2)
+        row = np.floor(y * focal + fine.height / 2)
+        inside = (column >= 0) & (column < fine.width) & (row >= 0) & (row < fine.height)
+        table[piece] = np.where(inside, _cell(row, column, canonical), OUTSIDE)
     return steps
+
+
+def _cell(row: NDArray[Any], column: NDArray[Any], canonical: CanonicalConfig) -> NDArray[Any]:
+    """The entry of a table for a row and column of the fine grid."""
+    n = canonical.subcells
+    part = row % n * n + column % n
+    entry: NDArray[Any] = (part * canonical.height + row // n) * canonical.width + column // n
+    return entry
 
 
 def field_of_view_deg(camera: CameraInfo) -> tuple[float, float]:

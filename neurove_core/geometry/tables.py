@@ -91,7 +91,7 @@ TABLES = Tables()
 
 
 def _key(canonical: CanonicalConfig, sensor: Sensor, camera: CameraInfo | None) -> _Key:
-    grid = (canonical.width, canonical.height, canonical.hfov_deg)
+    grid = (canonical.width, canonical.height, canonical.hfov_deg, canonical.subcells)
     if camera is None:
         return (*grid, sensor)
     lens = (camera.lens, camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion)

@@ -21,7 +21,8 @@ class Window(NamedTuple):
     """One complete window, counted on the canonical grid."""
 
     start_us: int
-    counts: NDArray[np.uint8]  # (2n, H, W), saturating at 255: channel 2i is OFF, 2i + 1 is ON of bin i
+    counts: NDArray[np.uint8]  # (2n * parts, H, W), saturating at 255: channel 2i is OFF, 2i + 1 is ON of bin i for
+    # cells of one part; ingest.channels has the order for cells of four parts
     events: int  # of the whole sensor
     outside: int  # those whose pixel has no cell of the grid
     bridged: bool = False  # windows before it were left out on purpose: the network state goes on over them
@@ -32,7 +33,7 @@ class WindowsState(NamedTuple):
 
     start_us: int | None = None  # None before the first packet
     horizon_us: int = 0  # sensor time up to which all events are known; unused before the first packet
-    counts: NDArray[np.uint8] | None = None  # None while the open window is empty
+    counts: NDArray[np.uint8] | None = None  # (2n, parts * H, W); None while the open window is empty
     events: int = 0
     outside: int = 0
     bridged: bool = False  # as in Window
@@ -122,7 +123,8 @@ class _Open:
     def __init__(self, start_us: int, state: WindowsState, config: WindowConfig, canonical: CanonicalConfig) -> None:
         self.start_us, self.counts, self.events, self.outside = start_us, state.counts, state.events, state.outside
         self._bridged, self._bin_us = state.bridged, config.bin_us
-        self._shape = (2 * config.bins, canonical.height, canonical.width)
+        self._shape = (2 * config.bins, canonical.parts * canonical.height, canonical.width)
+        self._window = (-1, canonical.height, canonical.width)
 
     def add(self, events: Events | WireEvents, lut: NDArray[np.int32]) -> None:
         if not events.n:
@@ -137,7 +139,7 @@ class _Open:
         return self.counts
 
     def close(self) -> Window:
-        return Window(self.start_us, self._grid(), self.events, self.outside, self._bridged)
+        return Window(self.start_us, self._grid().reshape(self._window), self.events, self.outside, self._bridged)
 
     def state(self, horizon_us: int) -> WindowsState:
         return WindowsState(self.start_us, horizon_us, self.counts, self.events, self.outside, self._bridged)

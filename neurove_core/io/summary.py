@@ -38,6 +38,8 @@ class ImuSummary:
     gyro_std_rad_s: tuple[float, ...]
     accel_mean_m_s2: tuple[float, ...]
     accel_std_m_s2: tuple[float, ...]
+    gyro_peak_rad_s: float  # greatest length
+    accel_peak_m_s2: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,6 +269,7 @@ class _ImuTally:
     def __init__(self) -> None:
         self._n, self._first_us, self._last_us = 0, 0, 0
         self._mean, self._squares = np.zeros(6), np.zeros(6)
+        self._peak = np.zeros(2)  # largest length of the angular velocity and of the specific force
 
     def add(self, imu: Imu) -> None:
         """Add samples."""
@@ -275,6 +278,8 @@ class _ImuTally:
         self._first_us = self._first_us if self._n else int(imu.t[0])
         self._last_us = int(imu.t[-1])
         difference, total = mean - self._mean, self._n + n
+        lengths = [float(np.linalg.norm(part, axis=1).max()) for part in (imu.gyro_rad_s, imu.accel_m_s2)]
+        self._peak = np.maximum(self._peak, lengths)
         self._squares += ((values - mean) ** 2).sum(axis=0) + difference**2 * (self._n * n / total)
         self._mean, self._n = self._mean + difference * (n / total), total
 
@@ -291,6 +296,8 @@ class _ImuTally:
             gyro_std_rad_s=tuple(std[:3]),
             accel_mean_m_s2=tuple(mean[3:]),
             accel_std_m_s2=tuple(std[3:]),
+            gyro_peak_rad_s=float(self._peak[0]),
+            accel_peak_m_s2=float(self._peak[1]),
         )
 
 

@@ -264,7 +264,7 @@ def untrained(seed: int = 0, config: ModelConfig | None = None, name: str = "unt
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         network = kinds.make(config)
-        shape = (8, 4, 2 * config.window.bins, config.canonical.height, config.canonical.width)
+        shape = (8, 4, *config.input_shape)
         _take_statistics(network, torch.poisson(torch.full(shape, 0.3)).log1p())
     return Bundle(
         name=name,

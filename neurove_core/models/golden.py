@@ -29,7 +29,7 @@ _SEEN, _COUNTS, _TWISTS = "golden.seen", "golden.counts", "golden.twists"
 class Golden(NamedTuple):
     """Windows and their expected twists, from the zero state."""
 
-    counts: NDArray[np.uint8]  # (T, 2n, H, W)
+    counts: NDArray[np.uint8]  # (T, C, H, W), C of `ModelConfig.window_shape`: 2n without subcells
     twists: NDArray[np.float32]  # (T, n, 6) expected, in the bundle's linear unit and rad/s
     tolerance: float = TOLERANCE  # largest error of an axis, as a fraction of the bundle's scale of that axis
 
@@ -73,7 +73,7 @@ def from_tensors(tensors: dict[str, Tensor], config: ModelConfig, tolerance: flo
             raise BadModel(name, f"tensor {key!r} is missing: a golden test has three tensors and a tolerance")
     if tolerance is None:
         raise BadModel(name, "header field golden_tolerance=missing: the bundle has the tensors of a golden test")
-    twists, grid = found[_TWISTS], (2 * config.window.bins, config.canonical.height, config.canonical.width)
+    twists, grid = found[_TWISTS], config.window_shape
     windows = len(twists) if twists.dim() else 0
     cells = windows * int(np.prod(grid))
     if not 0 < cells <= MAX_CELLS:

@@ -36,7 +36,7 @@ class Ann(nn.Module):
         self.bins = config.window.bins
         rows, columns = config.canonical.height, config.canonical.width
         self.convs, self.norms = nn.ModuleList(), nn.ModuleList()
-        for a, b in itertools.pairwise((2 * self.bins, *net.channels)):
+        for a, b in itertools.pairwise((config.input_shape[0], *net.channels)):
             self.convs.append(nn.Conv2d(a, b, 3, stride=2, padding=1, bias=False))
             self.norms.append(nn.BatchNorm2d(b))
             rows, columns = (rows + 1) // 2, (columns + 1) // 2

@@ -3,7 +3,7 @@
 All have the same interface, so that training, evaluation and the estimator work with any of them:
 
     network.initial_state(batch) -> state            tensors in named tuples, see state.py
-    network(spikes, state) -> (twists, state)        (T, B, 2n, H, W) -> (T, B, n, 6), in scaled units
+    network(spikes, state) -> (twists, state)        (T, B, C, H, W) -> (T, B, n, 6), in scaled units
 
 The paper's variant w/o diffusion is a NeuroVE with `network.diffusion = false`.
 """

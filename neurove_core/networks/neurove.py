@@ -57,7 +57,7 @@ class SpikingBlock(nn.Module):
 
 
 class NeuroVE(nn.Module):
-    """The network of paper Fig. 2: one time step per window, 2n channels in, n twists out, all state streamed.
+    """The network of paper Fig. 2: one time step per window, n bins in, n twists out, all state streamed.
 
     Its outputs are in the bundle's scaled units; Estimator converts them to m/s and rad/s. In int8 the weights of its
     convolutions and of its projection are rounded to 8 bits, also in training (decision 38).
@@ -69,7 +69,7 @@ class NeuroVE(nn.Module):
         self.config = config
         self.bins = config.window.bins
         lif = LIFParams(net.decay, net.v_th, net.surrogate, net.surrogate_width * net.v_th)
-        widths = (2 * self.bins, *net.channels)
+        widths = (config.input_shape[0], *net.channels)
         self._int8 = net.precision == "int8"
         self.blocks = nn.ModuleList(SpikingBlock(a, b, lif, int8=self._int8) for a, b in itertools.pairwise(widths))
         rows, columns = self.map_sizes()[-1]
@@ -148,7 +148,7 @@ class NeuroVE(nn.Module):
         Source: NeuroVE, section III-A to III-D, computed layer by layer, each over all time steps.
 
         Args:
-            spikes: (T, B, 2n, H, W) from encoding.to_spikes.
+            spikes: (T, B, C, H, W) from encoding.to_spikes; C is 2n, and more with subcells or a history.
             state: state of these B streams, from initial_state or the previous call.
 
         Returns:

@@ -21,7 +21,7 @@ class Runner(Protocol):
         """One window of each of B streams.
 
         Args:
-            counts: B windows, each (2n, H, W) event counts.
+            counts: B windows, each (C, H, W) event counts; see ModelConfig.input_shape.
             states: the state of each stream, for a batch of one.
 
         Returns:

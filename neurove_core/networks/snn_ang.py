@@ -60,7 +60,7 @@ class SnnAng(nn.Module):
         self._lif: list[LIFParams] = []
         self._sizes: list[tuple[int, ...]] = []
         rows, columns = config.canonical.height, config.canonical.width
-        for layer, (a, b) in enumerate(itertools.pairwise((2 * self.bins, *net.channels))):
+        for layer, (a, b) in enumerate(itertools.pairwise((config.input_shape[0], *net.channels))):
             stride, nth = 2 if layer < _STRIDED else 1, min(layer, len(THRESHOLDS) - 1)
             self.convs.append(nn.Conv2d(a, b, 3, stride=stride, padding=1, bias=False))
             norm = nn.BatchNorm2d(b)

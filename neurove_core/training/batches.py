@@ -8,6 +8,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from neurove_core.config import ModelConfig
+from neurove_core.ingest.channels import network_input
 from neurove_core.training.config import RecipeConfig
 from neurove_core.training.data import Sequences
 
@@ -20,13 +22,22 @@ _SEEN_FIRST: Final = 4  # least number of complete windows before a disturbance;
 class Segment(NamedTuple):
     """S consecutive windows of B streams; each stream starts from the zero state."""
 
-    counts: Tensor  # (S, B, 2n, H, W) uint8
+    counts: Tensor  # (S, B, C, H, W) uint8, the network's input before its encoding
     twists: Tensor  # (S, B, n, 6): vx vy vz per metre of camera height [1/s], wx wy wz [rad/s]
     height_m: Tensor  # (B)
 
 
-def draw(rng: np.random.Generator, sequences: Sequences, recipe: RecipeConfig) -> Segment:
-    """Draw a segment for each stream of a batch, from a random sequence and a random position in it."""
+def draw(
+    rng: np.random.Generator, sequences: Sequences, recipe: RecipeConfig, model: ModelConfig | None = None
+) -> Segment:
+    """Draw a segment for each stream of a batch, from a random sequence and a random position in it.
+
+    Args:
+        rng: of the run.
+        sequences: to draw from.
+        recipe: of the run.
+        model: its subcells and its history; by default the stored counts are the input.
+    """
     counts, twists, heights = [], [], []
     for _ in range(recipe.batch):
         index = int(rng.integers(len(sequences)))
@@ -37,7 +48,7 @@ def draw(rng: np.random.Generator, sequences: Sequences, recipe: RecipeConfig) -
         if twice:
             seen, truth = doubled(seen, truth)
         seen, truth = augment(rng, seen, truth, recipe)
-        counts.append(seen)
+        counts.append(seen if model is None else network_input(seen, model))
         twists.append(truth)
         heights.append(sequences.height_m[index])
     return Segment(

@@ -25,6 +25,7 @@ from torch import nn
 from neurove_core import self_test
 from neurove_core.engine.engine import Engine
 from neurove_core.estimator import Estimator
+from neurove_core.ingest.channels import network_input
 from neurove_core.models.bounds import UNSET, Bounds
 from neurove_core.models.bundle import PER_HEIGHT, Bundle
 from neurove_core.models.uncertainty import LEVEL, LEVELS, Uncertainty, half_width
@@ -224,9 +225,8 @@ def collect_errors(bundle: Bundle, parts: list[tuple[Sequences, bool]]) -> Itera
             rng = np.random.default_rng((203, number))
             counts, twists = found.counts(index, 0, len(found.twists[index])), found.twists[index]
             variants = variants_of(rng, counts, twists)
-            spikes = to_spikes(
-                torch.from_numpy(np.stack([seen for seen, _ in variants], 1)), bundle.config.network.encoding
-            )
+            seen = np.stack([network_input(seen, bundle.config) for seen, _ in variants], 1)
+            spikes = to_spikes(torch.from_numpy(seen), bundle.config.network.encoding)
             state, inputs, outputs = probe.initial_state(len(variants)), [], []
             for step in range(len(counts)):
                 output, state = engine(spikes[step : step + 1], state)

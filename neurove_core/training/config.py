@@ -42,6 +42,10 @@ def _from_source(value: object) -> object:
     return {"source": value} if isinstance(value, str) else value
 
 
+SINCE: Final = ("spun_axis", "robots", "robot_m_s", "robot_rad_s", "rocked", "rocked_rad_s", "subcells", "off_ratio")
+"""Fields of DataConfig that are newer than the stored sequences; sequences stay valid where they have their default."""
+
+
 class DataConfig(Config):
     """Simulated sequences and recordings of a training run.
 
@@ -84,9 +88,19 @@ class DataConfig(Config):
     spun_axis: tuple[Size, Size, Size] = Field(
         (0.4, 1.0, 0.4), description="Standard deviation of x, y, z of its axis before normalisation."
     )
-    threshold: LogSpan = Field(
-        (0.15, 0.4), description="Threshold of ON events, log-uniform; OFF is within 15 % of it."
+    robots: float = Field(0.0, ge=0, le=1, description="Share of the drives that are of a small robot, not of a car.")
+    robot_m_s: LogSpan = Field((0.1, 3.0), description="Forward speed of a robot while it moves, log-uniform [m/s].")
+    robot_rad_s: LogSpan = Field((0.05, 1.2), description="Rate of a robot that turns, log-uniform [rad/s].")
+    rocked: float = Field(0.0, ge=0, le=1, description="Share of the drives with a rocking camera.")
+    rocked_rad_s: LogSpan = Field(
+        (0.01, 0.1), description="Root mean square of the pitch rate that rocking adds, log-uniform [rad/s]."
     )
+    subcells: Literal[1, 2] = Field(
+        1,
+        description="Cells of the stored counts per canonical cell and axis; 2 serves models of any subcells.",
+    )
+    threshold: LogSpan = Field((0.15, 0.4), description="Threshold of ON events, log-uniform.")
+    off_ratio: Span = Field((0.85, 1.15), description="Threshold of OFF events over that of ON events, uniform.")
     threshold_sigma: Span = Field(
         (0.02, 0.05), description="Standard deviation of the thresholds between pixels, uniform."
     )
@@ -208,6 +222,13 @@ class TrainingConfig(Config):
             have = f"data.seconds={self.data.seconds:g} has {windows} windows of {self.model.window.duration_us} us"
             wants = f"recipe.segment_windows={self.recipe.segment_windows} needs {needed}{twice}"
             raise ValueError(f"a sequence of {have}, a segment of {wants}")
+        return self
+
+    @model_validator(mode="after")
+    def _subcells_are_stored(self) -> Self:
+        if self.data.subcells < self.model.canonical.subcells:
+            wanted = f"model.canonical.subcells={self.model.canonical.subcells} needs as many"
+            raise ValueError(f"data.subcells={self.data.subcells}: {wanted}")
         return self
 
     @property

@@ -19,19 +19,20 @@ import safetensors
 import safetensors.numpy
 from numpy.typing import ArrayLike, NDArray
 
-from neurove_core.config import ModelConfig
+from neurove_core.config import CanonicalConfig, ModelConfig
 from neurove_core.files import write_atomically
 from neurove_core.geometry.camera import lookup_table
 from neurove_core.ingest import windows
 from neurove_core.ingest.windows import WindowsState
 from neurove_core.io.errors import BrokenRecording
+from neurove_core.sim.motion.generated import robot, rocked
 from neurove_core.sim.motion.trajectory import Mounted, Trajectory, driving, hand_held, rotation
 from neurove_core.sim.render.camera import Camera, named_camera
 from neurove_core.sim.render.pixels import PixelConfig
 from neurove_core.sim.simulate import Simulation
 from neurove_core.sim.world.path import CameraPath
 from neurove_core.sim.world.scene import named_scene
-from neurove_core.training.config import DataConfig, TrainingConfig
+from neurove_core.training.config import SINCE, DataConfig, TrainingConfig
 from neurove_core.training.config import Span as Range
 from neurove_protocol.errors import InvalidField
 
@@ -46,6 +47,8 @@ HAND_HELD_SCENES: Final = ("room", "plain-room")
 
 _HANDS: Final = {"waved": (1.0, 1.0), "turned": (0.0, 1.0), "slid": (1.0, 0.0), "spun": (0.0, 1.0)}
 """Each motion of a hand-held camera: how much of the translation and of the rotation it has; `spun` is steady."""
+
+_DEFAULT: Final = DataConfig()
 
 _SAMPLES: Final = 4  # samples of the exact twist per bin; the bin has their mean
 
@@ -119,7 +122,7 @@ def draw_simulation(config: DataConfig, index: int) -> Simulation:
     on = log_uniform(rng, config.threshold)
     pixels = PixelConfig(
         threshold_on=on,
-        threshold_off=on * float(rng.uniform(0.85, 1.15)),
+        threshold_off=on * float(rng.uniform(*config.off_ratio)),
         threshold_sigma=float(rng.uniform(*config.threshold_sigma)),
         refractory_us=int(rng.uniform(*config.refractory_us)),
         leak_hz=float(rng.uniform(*config.leak_hz)),
@@ -129,23 +132,31 @@ def draw_simulation(config: DataConfig, index: int) -> Simulation:
     )
     hand_held_scene = scene in HAND_HELD_SCENES
     slowed = log_uniform(rng, config.slowed_hand if hand_held_scene else config.slowed_drive)
-    trajectory: Trajectory
-    if hand_held_scene:
-        trajectory = _hand_held(rng, config, seed, slowed)
-    else:
-        trajectory = turning_part(rng, driving(seed, DRIVE_S + config.seconds), slowed, config.seconds)
+    trajectory = _hand_held(rng, config, seed, slowed) if hand_held_scene else _drive(rng, config, seed, slowed)
     mounted = Mounted(trajectory, camera.height_m, camera.pitch_deg)
     simulation = Simulation(scene, named_scene(scene), mounted, camera, pixels, seed, config.seconds)
     return replace(simulation, motion_px=config.motion_px)
 
 
-def sequence_of(simulation: Simulation, config: ModelConfig) -> Sequence:
-    """Split a simulation into windows as the service does, with the mean exact twist of each bin."""
+def stored_grid(config: TrainingConfig) -> CanonicalConfig:
+    """The grid of stored counts: the canonical grid, or with `data.subcells` = 2 one that is twice as fine."""
+    return config.model.canonical.model_copy(update={"subcells": config.data.subcells}).fine
+
+
+def sequence_of(simulation: Simulation, config: ModelConfig, grid: CanonicalConfig | None = None) -> Sequence:
+    """Split a simulation into windows as the service does, with the mean exact twist of each bin.
+
+    Args:
+        simulation: of the sequence.
+        config: of the model; its windows.
+        grid: of the counts, see `stored_grid`; by default that of the model's subcells.
+    """
+    grid = grid or config.canonical.fine
     height_m = simulation.lens.height_m
-    lut = lookup_table(config.canonical, simulation.sensor, simulation.lens.info)
+    lut = lookup_table(grid, simulation.sensor, simulation.lens.info)
     state, counts = WindowsState(), []
     for step in simulation.steps():
-        pushed = windows.push(step.events, step.stop_us, state, lut, config.window, config.canonical)
+        pushed = windows.push(step.events, step.stop_us, state, lut, config.window, grid)
         state = pushed.state
         counts += [window.counts for window in pushed.windows]
     twists = true_twists(simulation.trajectory, len(counts), config)
@@ -172,11 +183,12 @@ class Cache:
 
     def __init__(self, folder: Path, config: TrainingConfig) -> None:
         self._config = config
-        data = config.data.model_dump(exclude={"sequences", "recordings"})
-        if config.data.spun_axis == DataConfig().spun_axis:
-            del data["spun_axis"]  # sequences that were simulated before this setting existed stay valid
+        data = config.data.model_dump(exclude={"sequences", "recordings", "subcells"})
+        for name in SINCE:  # sequences that were simulated before a setting existed stay valid
+            if name in data and getattr(config.data, name) == getattr(_DEFAULT, name):
+                del data[name]
         kind: list[Any] = [FORMAT, data]
-        kind += [config.model.window.model_dump(), config.model.canonical.model_dump()]
+        kind += [config.model.window.model_dump(), stored_grid(config).model_dump()]
         self.folder = folder / hashlib.sha256(json.dumps(kind, sort_keys=True).encode()).hexdigest()[:16]
 
     def path(self, index: int) -> Path:
@@ -221,15 +233,28 @@ class Cache:
 
 def _make(job: tuple[TrainingConfig, int, Path]) -> str:
     config, index, path = job
-    sequence = sequence_of(draw_simulation(config.data, index), config.model)
-    save(sequence, path)
+    sequence = sequence_of(draw_simulation(config.data, index), config.model, stored_grid(config))
+    save(sequence, path, sparse=config.data.subcells > 1)
     return sequence.name
 
 
-def save(sequence: Sequence, path: Path) -> None:
-    """Write a sequence to a file, atomically."""
+def save(sequence: Sequence, path: Path, *, sparse: bool = False) -> None:
+    """Write a sequence to a file, atomically.
+
+    Args:
+        sequence: to write.
+        path: of the file.
+        sparse: store only counts above 0: `cells`, their flat index in a window, `values`, and `starts` (T + 1), the
+            first of each window. A fine grid, where few cells have events, takes about a tenth of the space.
+    """
     arrays: dict[str, NDArray[Any]] = {"counts": sequence.counts, "twists": sequence.twists}
     metadata = {"height_m": repr(sequence.height_m), "name": sequence.name}
+    if sparse:
+        flat = arrays.pop("counts").reshape(len(sequence.counts), -1)
+        window, cells = np.nonzero(flat)
+        starts = np.searchsorted(window, np.arange(len(flat) + 1)).astype(np.int64)
+        arrays |= {"cells": cells.astype(np.uint32), "values": flat[window, cells], "starts": starts}
+        metadata["shape"] = json.dumps(sequence.counts.shape)
     write_atomically(path, safetensors.numpy.save(arrays, metadata))
 
 
@@ -253,7 +278,7 @@ class Sequences:
 
     def __init__(self, paths: Iterable[Path | Span]) -> None:
         self.paths = list(paths)
-        self._files: list[Any] = []
+        self._files: list[_Stored] = []
         self._first: list[int] = []
         self.twists: list[NDArray[np.float32]] = []  # each (T, n, 6)
         self.height_m: list[float] = []
@@ -263,13 +288,14 @@ class Sequences:
                 file: Any = safetensors.safe_open(path, "numpy")
                 metadata = file.metadata()
                 twists, height_m = file.get_tensor("twists"), float(metadata["height_m"])
-                shape = file.get_slice("counts").get_shape()
+                starts = file.get_tensor("starts") if "shape" in metadata else None
+                shape = file.get_slice("counts").get_shape() if starts is None else json.loads(metadata["shape"])
             except (OSError, KeyError, TypeError, ValueError, safetensors.SafetensorError) as error:
                 raise BrokenRecording(path, "its header", f"not a training sequence: {error}") from None
             if len(shape) != 4 or shape[0] != len(twists) or shape[1] != 2 * twists.shape[1] or not height_m > 0:
                 why = f"counts {tuple(shape)} do not match twists {twists.shape}"
                 raise BrokenRecording(path, "its header", why)
-            self._files.append(file)
+            self._files.append(_Stored(file, tuple(shape), starts))
             self._first.append(start)
             self.twists.append(twists[start:stop])
             self.height_m.append(height_m)
@@ -280,8 +306,28 @@ class Sequences:
     def counts(self, index: int, start: int, stop: int) -> NDArray[np.uint8]:
         """Counts (stop - start, 2n, H, W) of windows start to stop of a sequence."""
         first = self._first[index]
-        found: NDArray[np.uint8] = self._files[index].get_slice("counts")[first + start : first + stop]
-        return found
+        return self._files[index].counts(first + start, first + stop)
+
+
+class _Stored(NamedTuple):
+    """The counts in a file of `save`."""
+
+    file: Any
+    shape: tuple[int, ...]  # (T, 2n, H, W)
+    starts: NDArray[np.int64] | None  # of each window, in a sparse file
+
+    def counts(self, start: int, stop: int) -> NDArray[np.uint8]:
+        """Counts (stop - start, 2n, H, W) of these windows."""
+        if self.starts is None:
+            dense: NDArray[np.uint8] = self.file.get_slice("counts")[start:stop]
+            return dense
+        stop = min(stop, self.shape[0])
+        first, last = self.starts[start], self.starts[stop]
+        cells = self.file.get_slice("cells")[first:last].astype(np.int64)
+        window = np.repeat(np.arange(stop - start), np.diff(self.starts[start : stop + 1]))
+        found = np.zeros((stop - start, int(np.prod(self.shape[1:]))), np.uint8)
+        found[window, cells] = self.file.get_slice("values")[first:last]
+        return found.reshape(stop - start, *self.shape[1:])
 
 
 def _hand_held(rng: np.random.Generator, config: DataConfig, seed: int, slowed: float) -> Trajectory:
@@ -294,6 +340,18 @@ def _hand_held(rng: np.random.Generator, config: DataConfig, seed: int, slowed: 
         return rotation(wx, wy, wz, config.seconds)
     moved, turned = _HANDS[motion]
     return Part(hand_held(seed, config.seconds, moved, turned), 0.0, slowed, config.seconds)
+
+
+def _drive(rng: np.random.Generator, config: DataConfig, seed: int, slowed: float) -> Trajectory:
+    """Draw a drive: of a car or, where the configuration asks for it, of a robot, and with or without rocking."""
+    drive: Trajectory
+    if config.robots and rng.uniform() < config.robots:
+        drive = robot(seed, config.seconds, config.robot_m_s, config.robot_rad_s)
+    else:
+        drive = turning_part(rng, driving(seed, DRIVE_S + config.seconds), slowed, config.seconds)
+    if config.rocked and rng.uniform() < config.rocked:
+        drive = rocked(drive, seed, log_uniform(rng, config.rocked_rad_s), config.seconds)
+    return drive
 
 
 def turning_part(rng: np.random.Generator, drive: Trajectory, slowed: float, seconds: float) -> Part:

@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neurove_core import self_test
+from neurove_core.config import CanonicalConfig
 from neurove_core.estimator import Estimator
 from neurove_core.files import write_atomically
+from neurove_core.ingest.channels import window_counts
 from neurove_core.models import bundle, golden
 from neurove_core.models.bundle import Bundle
 from neurove_core.models.metadata import MadeBy, Metadata
@@ -130,7 +132,7 @@ def train(
     draw_curve(run.curve, out, f"{config.name}: {run.step} updates", run.validation)
     path = out / f"{config.name}{bundle.SUFFIX}"
     made = run.bundle(provenance(run, len(more)), metadata_of(run), best=kept_step(run) < run.step)
-    test = self_test.record(Estimator(made), golden_windows(sequences))
+    test = self_test.record(Estimator(made), golden_windows(sequences, config.model.canonical))
     bundle.save(replace(made, golden=test), path)
     return path
 
@@ -173,7 +175,7 @@ def train_to_end(
         on_point(_validated(run, held))
     over = _is_over(run)
     while run.step < recipe.updates and not over:
-        recent += train_segment(run, draw(run.rng, sequences, share))
+        recent += train_segment(run, draw(run.rng, sequences, share, run.config.model))
         mean = _mean(recent)
         validated = run.validation[-1] if run.validation else None
         on_progress(Progress(run.step, recipe.updates, 2 * mean.linear, 2 * mean.angular, validated))
@@ -297,15 +299,20 @@ def _program(run: TrainingRun) -> str:
     return f"neurove train {run.config.name}{begun}"
 
 
-def golden_windows(sequences: Sequences) -> NDArray[np.uint8]:
-    """Select windows (T, 2n, H, W) for the golden test: the busiest end of the first sequences.
+def golden_windows(sequences: Sequences, canonical: CanonicalConfig | None = None) -> NDArray[np.uint8]:
+    """Select windows (T, C, H, W) for the golden test: the busiest end of the first sequences.
 
     A large grid gives fewer windows than `golden.WINDOWS`, so that they fit into the bundle.
+
+    Args:
+        sequences: of the run.
+        canonical: grid and subcells of the model; by default the windows are as stored.
     """
     ends = []
     for index in range(min(len(sequences), _GOLDEN_SEQUENCES)):
         stop = len(sequences.twists[index])
         end = sequences.counts(index, max(0, stop - golden.WINDOWS), stop)
+        end = end if canonical is None else window_counts(end, canonical)
         while len(end) > 1 and golden.stored_bytes(end) > _GOLDEN_BYTES:
             end = end[len(end) // 2 :]
         ends.append(end)

@@ -86,7 +86,7 @@ def train(
     if validating:
         _simulate("simulated to validate", validating, data, workers, on_progress)
     simulated = Cache(data, validating).paths() if validating else []
-    held = Held.read(recordings.split()[1], simulated, config.recipe)
+    held = Held.read(recordings.split()[1], simulated, config.recipe, config.model)
 
     def trained(progress: loop.Progress) -> None:
         errors = f"{progress.linear_m_s:.3f} m/s {progress.angular_rad_s:.4f} rad/s{_validated(progress.validated)}"

@@ -24,7 +24,7 @@ from neurove_core.io import Recording, UnknownSource
 from neurove_core.io.formats.pose_files import read_truth
 from neurove_core.sources import open_source
 from neurove_core.training.config import RecordedConfig, TrainingConfig
-from neurove_core.training.data import FORMAT, Sequence, Sequences, Span, save
+from neurove_core.training.data import FORMAT, Sequence, Sequences, Span, save, stored_grid
 from neurove_protocol.errors import InvalidField
 
 log = logging.getLogger(__name__)
@@ -71,7 +71,8 @@ class RecordedSequences:
                 folder.mkdir(parents=True, exist_ok=True)
                 lengths: list[int] = []
                 for sequence in split_recording(found.recording, found.truth, found.height_m, self._config):
-                    save(sequence, folder / f"{len(lengths):06d}.safetensors")
+                    path = folder / f"{len(lengths):06d}.safetensors"
+                    save(sequence, path, sparse=self._config.data.subcells > 1)
                     lengths.append(len(sequence.twists))
                 for fault in found.recording.faults.found:
                     log.warning("recording has a fault: recording=%s %s", found.source, fault)
@@ -133,7 +134,12 @@ class RecordedSequences:
 
     def _folder_of(self, found: "_OpenRecording") -> Path:
         model = self._config.model
-        kind = [FORMAT, model.window.model_dump(), model.canonical.model_dump(), self._config.sequence_windows]
+        kind = [
+            FORMAT,
+            model.window.model_dump(),
+            stored_grid(self._config).model_dump(),
+            self._config.sequence_windows,
+        ]
         kind += [found.height_m, found.digest]
         name = hashlib.sha256(json.dumps(kind, sort_keys=True).encode()).hexdigest()[:16]
         return self._folder / f"recorded-{name}"
@@ -168,9 +174,10 @@ def split_recording(recording: Recording, truth: Twists, height_m: float, config
 
 def _windows(recording: Recording, config: TrainingConfig) -> Iterator[Window]:
     model, state = config.model, WindowsState()
-    lut = lookup_table(model.canonical, recording.sensor, recording.camera(_STREAM))
+    grid = stored_grid(config)
+    lut = lookup_table(grid, recording.sensor, recording.camera(_STREAM))
     for chunk in recording.chunks():
-        pushed = windows.push(chunk, int(chunk.t[0]), state, lut, model.window, model.canonical)
+        pushed = windows.push(chunk, int(chunk.t[0]), state, lut, model.window, grid)
         state = pushed.state
         yield from pushed.windows
 

@@ -23,8 +23,10 @@ from neurove_core.models.bundle import PER_HEIGHT, Bundle
 from neurove_core.models.metadata import Metadata
 from neurove_core.networks import kinds
 from neurove_core.networks.kinds import Network
+from neurove_core.networks.neurove import NeuroVE
 from neurove_core.training.config import RecipeConfig, TrainingConfig
 from neurove_core.training.data import Sequences
+from neurove_core.training.growing import grown, narrowed
 from neurove_core.training.loss import Balance
 from neurove_core.training.ranks import ALONE, Ranks, share_norms
 from neurove_protocol.errors import BadModel, InvalidField
@@ -216,13 +218,14 @@ def check_start(start: Bundle, config: TrainingConfig) -> None:
     """Refuse a start model whose weights do not fit the network of the configuration.
 
     The surrogate gradient and the precision of the weights may differ, because they do not change the weights' meaning.
+    A NeuroVE may begin from a smaller one; see `growing.narrowed`.
 
     Raises:
         BadModel: a field differs; the error has both values.
     """
     if start.linear_unit != PER_HEIGHT:
         raise BadModel(start.name, f"linear_unit={start.linear_unit!r}: training can start only from {PER_HEIGHT!r}")
-    check_same_network(start, config.model)
+    check_same_network(start, narrowed(config.model, start.config))
 
 
 def check_same_network(model: Bundle, config: ModelConfig) -> None:
@@ -240,6 +243,8 @@ def check_same_network(model: Bundle, config: ModelConfig) -> None:
 def _copy_weights(network: Network, start: Bundle) -> None:
     """Copy the weights and norms of a model into a network, without its uncertainty, which is fitted again later."""
     weights = {name: one for name, one in start.network.state_dict().items() if not name.startswith("spread.")}
+    if isinstance(network, NeuroVE):
+        weights = grown(weights, start.config, network)
     network.load_state_dict(weights)
 
 

@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from neurove_core.config import ModelConfig
+from neurove_core.ingest.channels import network_input
 from neurove_core.networks import kinds
 from neurove_core.networks.encoding import to_spikes
 from neurove_core.networks.kinds import Network
@@ -57,18 +59,21 @@ class Held(NamedTuple):
     simulated: Segment | None
 
     @classmethod
-    def read(cls, recorded: list[Span], simulated: list[Path], recipe: RecipeConfig) -> "Held":
+    def read(
+        cls, recorded: list[Span], simulated: list[Path], recipe: RecipeConfig, model: ModelConfig | None = None
+    ) -> "Held":
         """Read the windows of both sets.
 
         Args:
             recorded: windows of recordings that the run does not train on.
             simulated: files of simulated sequences.
             recipe: of the run; a stream has `segment_windows`.
+            model: its subcells and its history; by default the stored counts are the input.
         """
-        return cls(_segment(recorded, recipe), _segment([Span(path) for path in simulated], recipe))
+        return cls(_segment(recorded, recipe, model), _segment([Span(path) for path in simulated], recipe, model))
 
 
-def _segment(spans: list[Span], recipe: RecipeConfig) -> Segment | None:
+def _segment(spans: list[Span], recipe: RecipeConfig, model: ModelConfig | None) -> Segment | None:
     found, windows = Sequences(spans), recipe.segment_windows
     starts = [
         (index, first)
@@ -78,7 +83,8 @@ def _segment(spans: list[Span], recipe: RecipeConfig) -> Segment | None:
     if not starts:
         return None
     chosen = [starts[int(i)] for i in np.linspace(0, len(starts) - 1, min(_STREAMS, len(starts)))]
-    counts = np.stack([found.counts(index, first, first + windows) for index, first in chosen], 1)
+    stored = [found.counts(index, first, first + windows) for index, first in chosen]
+    counts = np.stack([one if model is None else network_input(one, model) for one in stored], 1)
     twists = np.stack([found.twists[index][first : first + windows] for index, first in chosen], 1)
     heights = torch.tensor([found.height_m[index] for index, _ in chosen], dtype=torch.float32)
     return Segment(torch.from_numpy(counts), torch.from_numpy(twists), heights)

@@ -61,6 +61,12 @@ def add_lens_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--height", type=metres, metavar="M", help="height of the camera above the ground [m]")
 
 
+def add_axes_flag(parser: argparse.ArgumentParser) -> None:
+    """Add the mounting of the inertial unit, if the recording lacks it."""
+    about = "axes of the inertial unit along x (right), y (down), z (forward) of the camera, such as -x,y,-z; write "
+    parser.add_argument("--imu-axes", metavar="A", help=about + "--imu-axes=A, because of the first dash")
+
+
 def add_playback_flags(parser: argparse.ArgumentParser, seconds_help: str) -> None:
     """Add how fast and how long a source is played."""
     parser.add_argument(

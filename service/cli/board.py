@@ -19,6 +19,7 @@ from rich.text import Text
 from neurove_protocol import Flag, Twist, TwistEstimate
 from neurove_protocol.control import StreamStatus
 from neurove_protocol.velocity import AXES
+from neurove_service.cli.inertial_text import imu_text
 from neurove_service.latency import latency
 
 VERDICT_STYLE = {
@@ -113,7 +114,7 @@ class Received:
 
     @property
     def late_s(self) -> float | None:
-        """Age of the newest estimate when it was published [s], if it was older than two windows."""
+        """Age of the newest estimate when it arrived [s], if it was older than two windows."""
         if self.last is None or self.last.host is None:
             return None
         age_s = self.last.host.age_ns / 1e9
@@ -255,6 +256,8 @@ def status_notes(status: StreamStatus) -> Iterator[str]:
         yield f"{status.stream}: {status.verdict}: {status.why}"
     if status.refusal and status.refusal not in status.why:
         yield f"{status.stream}: refused: {status.refusal}"
+    if status.imu is not None:
+        yield f"{status.stream}: {imu_text(status.imu)}"
     if status.uncounted_packets:
         count = f"{status.uncounted_packets:,} packets have the sequence number 0"
         yield f"{status.stream}: {count}, so losses on the way to the node are not counted"
@@ -383,7 +386,7 @@ def _footer(received: Received, status: StreamStatus | None, now: float) -> Text
     elif numbers is not None:
         text.append(f"{received.rate_hz:.1f} estimates/s, latency p50 {numbers.p50:.1f} ms p99 {numbers.p99:.1f} ms")
     if received.late_s is not None:
-        text.append(f", {received.late_s:.1f} s old when published", style="yellow")
+        text.append(f", {received.late_s:.1f} s old on arrival", style="yellow")
     if status is not None:
         text.append(f", {status.packets_received:,} packets, {status.events_received:,} events")
         lost = status.lost.nonzero()

@@ -49,7 +49,8 @@ def lines(about: dict[str, Any]) -> Iterator[str]:
         "answers": f"{about['linear_unit']} and rad/s",
         "windows": f"{window['duration_us'] / 1e3:g} ms in {window['bins']} bins, settled after "
         f"{about['config']['settle_windows']}, primed with {about['prime_windows']}",
-        "camera": f"{grid['width']}x{grid['height']}, {grid['hfov_deg']:g} degrees wide",
+        "camera": f"{grid['width']}x{grid['height']}, {grid['hfov_deg']:g} degrees wide"
+        + (f", each cell in {grid['subcells'] ** 2} parts" if "subcells" in grid else ""),
         "network": _pairs(net),
         "limits": _pairs(about["limits"]),
         "golden": _pairs(about["golden"]),

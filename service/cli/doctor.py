@@ -9,6 +9,7 @@ from neurove_protocol import Flag, TwistEstimate
 from neurove_protocol.control import HealthReply, StreamStatus
 from neurove_protocol.errors import EXIT_FAILURE, NeuroVEError
 from neurove_service.cli.arguments import add_client_flags, client_config, command
+from neurove_service.cli.inertial_text import imu_text
 from neurove_service.cli.installation import Check, check_engine, check_extras, check_kernels, check_processor
 from neurove_service.config import ClientConfig, ConfigError
 
@@ -115,6 +116,7 @@ def check_stream(status: StreamStatus, estimate: TwistEstimate | None) -> list[C
             "let the driver publish its CameraInfo; `neurove drive --calibration FILE` does",
         ),
         _check_height(f"{name}: height", estimate),
+        *_check_imu(f"{name}: inertial unit", status),
     ]
 
 
@@ -133,6 +135,18 @@ def _check_clock(what: str, status: StreamStatus) -> Check:
         state = f"newest packet {status.last_packet_age_s:.1f} s old"
         return Check(what, state, "bad", "check that the driver runs and reaches the service")
     return Check(what, f"plausible: newest packet {status.last_packet_age_s:.1f} s old", "ok")
+
+
+def _check_imu(what: str, status: StreamStatus) -> list[Check]:
+    if status.imu is None:
+        return []
+    state = imu_text(status.imu)
+    if status.imu.disagrees:
+        advice = "check axes, signs and times of the driver's samples; README.md of protocol/ says which are expected"
+        return [Check(what, state, "bad", advice)]
+    if status.imu.problem:
+        return [Check(what, state, "bad", "check that the driver sends samples in time, on the clock of its events")]
+    return [Check(what, state, "ok")]
 
 
 def _check_height(what: str, estimate: TwistEstimate | None) -> Check:

@@ -1,6 +1,7 @@
 """The command estimate: the estimates of a recording as a file, as the service gives them. It needs no service."""
 
 import argparse
+import contextlib
 import json
 import math
 import sys
@@ -10,10 +11,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurove_protocol import CameraInfo, EventPacket, TwistEstimate
+from neurove_protocol import CameraInfo, EventPacket, Imu, ImuPacket, TwistEstimate
 from neurove_protocol.errors import EXIT_FAILURE, InvalidField, NeuroVEError
+from neurove_protocol.imu import decode_imu, encode_imu
 from neurove_service import logs
 from neurove_service.cli.arguments import (
+    add_axes_flag,
     add_force,
     add_lens_flags,
     add_recording_flags,
@@ -80,13 +83,17 @@ class Offline:
         found = self.stream.accept(packet, Arrival(self._now_ns, self._now_ns))
         return [one.model_copy(update={"host": None}) for one in found]
 
+    def accept_samples(self, packet: ImuPacket) -> None:
+        """Add the samples of the inertial unit."""
+        self.stream.inertial.accept(encode_imu(packet), self._now_ns)
+
     def refuse(self, why: str) -> None:
         """Count a packet that cannot be decoded."""
         self.stream.refused(self._now_ns, why)
 
 
 def estimates_of(
-    recording: "Recording", offline: Offline, *, as_published: bool = True
+    recording: "Recording", offline: Offline, *, as_published: bool = True, inertial: bool = True
 ) -> Iterator[tuple[int, list[TwistEstimate]]]:
     """The estimates of a recording, packet by packet as `neurove drive` sends it.
 
@@ -94,32 +101,48 @@ def estimates_of(
         recording: the source of events.
         offline: the stream; it counts what it refuses.
         as_published: send the packets of a packet log as they were published, else encode its events again.
+        inertial: send the inertial samples too.
 
     Yields:
         for each packet the sensor time since the first one [us], and the estimates that it completes.
     """
     first_us: int | None = None
-    for packet in _packets(recording, offline.stream.name, as_published=as_published):
+    for packet in _packets(recording, offline.stream.name, as_published=as_published, inertial=inertial):
         if isinstance(packet, NeuroVEError):
             offline.refuse(packet.message)
+            continue
+        if isinstance(packet, ImuPacket):
+            offline.accept_samples(packet)
             continue
         first_us = packet.t0_us if first_us is None else first_us
         yield packet.t0_us - first_us, offline.accept(packet)
 
 
-def _packets(recording: "Recording", stream: str, *, as_published: bool) -> Iterator[EventPacket | NeuroVEError]:
+def _packets(
+    recording: "Recording", stream: str, *, as_published: bool, inertial: bool
+) -> Iterator[EventPacket | ImuPacket | NeuroVEError]:
     from neurove_core.io.formats.packet_log.reader import LIMITS, McapRecording
+    from neurove_core.io.imu_feed import ImuFeed
     from neurove_core.io.packets import slices
     from neurove_protocol.events import decode_packet
 
     if isinstance(recording, McapRecording) and as_published:
-        for recorded in recording.packets(recording.stream):
+        for recorded in recording.driven(recording.stream):
+            if recorded.kind == "imu":
+                if inertial:
+                    with contextlib.suppress(NeuroVEError):
+                        yield replace(decode_imu(recorded.payload), stream=stream)
+                continue
             try:
                 yield replace(decode_packet(recorded.payload, LIMITS), stream=stream)
             except NeuroVEError as error:
                 yield error
         return
+    feed = ImuFeed(recording)
     for seq, piece in enumerate(slices(recording.chunks())):
+        samples = feed.until(piece.end_us) if inertial else Imu.empty()
+        if samples.n:
+            yield ImuPacket(stream, seq, samples)
         yield EventPacket(stream, seq, recording.sensor, piece.t0_us, piece.events)
 
 
@@ -129,6 +152,7 @@ def estimate(args: argparse.Namespace) -> int:
 
     from neurove_core import models
     from neurove_core.estimator import Estimator
+    from neurove_core.io.axes import with_axes
     from neurove_core.io.calibration import lens_of
     from neurove_core.io.formats.estimate_files import WRITERS, estimate_file
     from neurove_core.sources import open_source
@@ -137,7 +161,7 @@ def estimate(args: argparse.Namespace) -> int:
     path: Path = args.out
     if path.suffix not in WRITERS:
         raise InvalidField("estimate", "--out", str(path), f"its name must end in {', '.join(WRITERS)}")
-    recording = open_source(args.source, args.sensor, args.topic, args.time_unit)
+    recording = with_axes(open_source(args.source, args.sensor, args.topic, args.time_unit), args.imu_axes)
     if recording.endless and args.seconds in (None, math.inf):
         raise InvalidField("estimate", "RECORDING", args.source, "it never ends: give --seconds S")
     refuse_existing("estimate", "--out", path, args.source, force=args.force)
@@ -147,7 +171,7 @@ def estimate(args: argparse.Namespace) -> int:
     offline = Offline(estimator, camera, getattr(recording, "stream", _STREAM))
     told = _Told(estimator, recording)
     with event_count(recording.name) as show, estimate_file(path) as add:
-        found = estimates_of(recording, offline, as_published=args.sensor is None)
+        found = estimates_of(recording, offline, as_published=args.sensor is None, inertial=not args.no_imu)
         broken = _write(found, told, add, args.seconds, lambda: show(offline.stream.counters.events_received))
     broken = broken or next(map(str, recording.faults.unread), None)
     summary = told.summary(path, offline) | {"broken": broken}
@@ -243,5 +267,7 @@ def add_estimate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--model", default="default", metavar="BUNDLE", help=about)
     add_lens_flags(parser)
     add_recording_flags(parser)
+    add_axes_flag(parser)
+    parser.add_argument("--no-imu", action="store_true", help="use the events alone, not the inertial samples")
     parser.add_argument("--seconds", type=duration, metavar="S", help="seconds of the recording to read; default: all")
     add_force(parser, "FILE")

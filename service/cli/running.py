@@ -13,6 +13,7 @@ from typing import Any
 from neurove_protocol.errors import EXIT_FAILURE, InvalidField
 from neurove_service import logs
 from neurove_service.cli.arguments import (
+    add_axes_flag,
     add_client_flags,
     add_force,
     add_lens_flags,
@@ -69,6 +70,7 @@ def serve(args: argparse.Namespace) -> int:
 
 def drive(args: argparse.Namespace) -> int:
     """Publish a recording or a synthetic source as one stream; publish a packet log as it was recorded."""
+    from neurove_core.io.axes import with_axes
     from neurove_core.io.calibration import lens_of
     from neurove_core.sources import open_source
     from neurove_service.clients import ask
@@ -76,7 +78,7 @@ def drive(args: argparse.Namespace) -> int:
 
     stop = stop_on_signals(with_parent=args.with_parent)
     config = client_config(args)
-    recording = open_source(args.source, args.sensor, args.topic, args.time_unit)
+    recording = with_axes(open_source(args.source, args.sensor, args.topic, args.time_unit), args.imu_axes)
     lens = lens_of(recording, args.calibration, args.height)
     wait = Wait(config, args.wait, stop)
     with wait.connect(config) as transport:
@@ -257,6 +259,7 @@ def add_drive(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `neurove drive`."""
     add_source(command(parser, drive))
     add_lens_flags(parser)
+    add_axes_flag(parser)
     add_client_flags(parser)
     about = f"name of the stream, one key chunk; default {_STREAM}, and for a packet log the names in it"
     parser.add_argument("--stream", metavar="NAME", help=about)

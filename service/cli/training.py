@@ -120,7 +120,7 @@ def evaluate(args: argparse.Namespace) -> int:
     evaluated = []
     for (_, recording), truth in zip(sources, truths, strict=True):
         with event_count(recording.name) as show:
-            estimates = evaluation.estimate_recording(estimator, recording, on_events=show)
+            estimates = evaluation.estimate_recording(estimator, recording, on_events=show, inertial=not args.no_imu)
         evaluated.append(evaluation.evaluate(estimates, truth))
         tell_faults(recording)
     report = {"model": estimator.bundle.info.model_dump(), **evaluation.report(evaluated)}
@@ -243,6 +243,7 @@ def add_evaluate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--truth", type=Path, metavar="FILE", help=about)
     add_recording_flags(parser)
     add_lens_flags(parser)
+    parser.add_argument("--no-imu", action="store_true", help="use the events alone, not the inertial samples")
     parser.add_argument("--plot", type=Path, metavar="DIR", help="draw truth and estimate over time into this folder")
 
 

@@ -96,6 +96,8 @@ def survey_table(summary: "Summary") -> RenderableType:
         rate = "" if summary.imu.rate_hz is None else f" at {summary.imu.rate_hz:,.1f} Hz"
         table.add_row("imu", f"{summary.imu.samples:,} samples{rate}")
         table.add_row("  gyro", _spread(summary.imu.gyro_mean_rad_s, summary.imu.gyro_std_rad_s, "rad/s"))
+        peaks = f"{summary.imu.gyro_peak_rad_s:.3f} rad/s, {summary.imu.accel_peak_m_s2:.1f} m/s²"
+        table.add_row("  greatest", peaks)
         table.add_row("  accelerometer", _spread(summary.imu.accel_mean_m_s2, summary.imu.accel_std_m_s2, "m/s²"))
     if summary.truth is None:
         table.add_row("truth", "none")

@@ -24,6 +24,7 @@ from neurove_protocol.control import (
 )
 from neurove_protocol.errors import EXIT_FAILURE, NeuroVEError
 from neurove_service import logs
+from neurove_service.clients.transit import Transit
 from neurove_service.config import ClientConfig
 from neurove_service.transport import Transport, Unreachable, open_transport
 
@@ -251,21 +252,26 @@ def listen(
 ) -> None:
     """Receive every estimate and status; a message that cannot be decoded is logged and ignored.
 
+    An estimate that waited on its way is flagged `late`, and its `host.age_ns` counts until its arrival: see `Transit`.
+
     Args:
         transport: an open session; the subscriptions last as long as it.
         config: the deployment's prefix.
         on_estimate: called on Zenoh's thread.
         on_status: called on Zenoh's thread.
     """
+    transit = Transit()
 
-    def decoded(kind: type[ReplyT], use: Callable[[ReplyT], None]) -> Callable[[str, bytes, int], None]:
-        def on_sample(key: str, payload: bytes, _: int) -> None:
+    def decoded(kind: type[ReplyT], use: Callable[[ReplyT, int], None]) -> Callable[[str, bytes, int], None]:
+        def on_sample(key: str, payload: bytes, received_ns: int) -> None:
             try:
-                use(kind.decode(payload))
+                use(kind.decode(payload), received_ns)
             except NeuroVEError as error:
                 log.warning("message refused", key=key, why=error.message)
 
         return on_sample
 
-    transport.subscribe(config.keys.velocity(), decoded(TwistEstimate, on_estimate))
-    transport.subscribe(config.keys.status(), decoded(StreamStatus, on_status))
+    transport.subscribe(
+        config.keys.velocity(), decoded(TwistEstimate, lambda one, at_ns: on_estimate(transit.arrived(one, at_ns)))
+    )
+    transport.subscribe(config.keys.status(), decoded(StreamStatus, lambda one, _: on_status(one)))

@@ -67,8 +67,8 @@ class Cost(NamedTuple):
 
 def cost(model: Bundle) -> Cost:
     """What a busy window costs at least, whatever the weights: events reach the first layer, neurons are updated."""
-    rows, columns = model.config.canonical.height, model.config.canonical.width
-    first, neurons = 0.0, 2 * model.config.window.bins * rows * columns
+    channels, rows, columns = model.config.input_shape
+    first, neurons = 0.0, channels * rows * columns
     for layer in model.network.modules():
         if isinstance(layer, nn.Conv2d):
             rows, columns = -(-rows // layer.stride[0]), -(-columns // layer.stride[1])
@@ -137,8 +137,7 @@ def window_times_ms(
         bound_ms: a window that takes longer is slow [ms].
         max_slow: maximum number of slow windows; the measurement ends when it is exceeded.
     """
-    window, grid = estimator.config.window, estimator.config.canonical
-    shape = (2 * window.bins, grid.height, grid.width)
+    window, grid, shape = estimator.config.window, estimator.config.canonical, estimator.config.window_shape
     rng, times = np.random.default_rng(0), []
     state = estimator.initial_state(Sensor(grid.width, grid.height))
     busy = [rng.poisson(0.3, shape).astype(np.uint8) for _ in range(8)]

@@ -7,6 +7,7 @@ shape need none of this.
 `python -m neurove_service.models.precompile CONFIG` takes the configuration of the model as JSON.
 """
 
+import math
 import os
 import subprocess
 import sys
@@ -86,10 +87,10 @@ def in_child(config: ModelConfig, stop: threading.Event, timeout_s: float = TIME
 
 def _shape(config: ModelConfig) -> tuple[object, ...]:
     """What the types and constants of compiled code depend on."""
-    cells = config.canonical.width * config.canonical.height * 2 * config.window.bins
+    cells = math.prod(config.window_shape)
     net = config.network
     widths = net.encoding, net.precision, net.channels, net.features, net.hidden, net.cells
-    return config.kind, widths, config.window.bins, cells > _WIDE_CELLS
+    return config.kind, widths, config.window.bins, cells > _WIDE_CELLS, bool(net.history)
 
 
 def main() -> None:

@@ -165,6 +165,7 @@ class Service:
             lambda: not self._stop.is_set() and registry.alive(),
         )
         transport.subscribe_timed(keys.camera(), route(keys, registry, registry.put_camera))
+        transport.subscribe_timed(keys.imu(), route(keys, registry, registry.put_imu))
         transport.subscribe_timed(keys.events(), route(keys, registry, registry.put_packet))
         transport.answer(
             keys.health(node),

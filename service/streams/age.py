@@ -4,9 +4,7 @@ import statistics
 from collections import deque
 
 from neurove_protocol.events import Packet
-
-DRIFT = 200e-6
-"""The clock of a sensor may be slower than that of this node by this share: 100 ppm for each of two crystals."""
+from neurove_service.clock_offset import ClockOffset
 
 _DELAYS = 64
 
@@ -14,9 +12,7 @@ _DELAYS = 64
 class Ages:
     """Learns the offset between the clock of a stream and the monotonic clock of this node.
 
-    The offset is that of the quickest packet, because a packet cannot arrive before its events happened. It grows by no
-    more than the drift of two crystals, so a delay that grows is seen as age. A delay that all packets share is not
-    seen.
+    The offset is that of the quickest packet, see `ClockOffset`.
     The clock of a stream is that of the sensor, or the driver's time of sending where it is given.
 
     A source that pauses together with its clock, as a player does, or a sensor whose clock is too slow, looks like a
@@ -24,8 +20,7 @@ class Ages:
     """
 
     def __init__(self) -> None:
-        self._offset_ns: int | None = None
-        self._learned_ns = 0
+        self._offset = ClockOffset()
         self._delays_ns: deque[int] = deque(maxlen=_DELAYS)
 
     @property
@@ -35,7 +30,7 @@ class Ages:
 
     def forget(self) -> None:
         """Begin anew: the clock of the stream has changed."""
-        self._offset_ns = None
+        self._offset.forget()
         self._delays_ns.clear()
 
     def learn(self, clock_us: int, received_ns: int) -> int:
@@ -45,12 +40,7 @@ class Ages:
             clock_us: clock of the stream at the newest event of the packet, or when it was sent [us].
             received_ns: when it arrived [ns].
         """
-        offset_ns = received_ns - clock_us * 1000
-        drifted_ns = offset_ns
-        if self._offset_ns is not None:
-            drifted_ns = self._offset_ns + int(DRIFT * max(0, received_ns - self._learned_ns))
-        self._offset_ns, self._learned_ns = min(offset_ns, drifted_ns), received_ns
-        delay_ns = offset_ns - self._offset_ns
+        delay_ns = self._offset.learn(clock_us * 1000, received_ns)
         self._delays_ns.append(delay_ns)
         return delay_ns
 

@@ -82,6 +82,7 @@ class Flags:
             Flag.SETTLING: not window.settled,
             Flag.LOW_ACTIVITY: window.low_activity,
             Flag.SATURATED: window.saturated,
+            Flag.GYRO_DISAGREES: window.gyro_disagrees,
             Flag.UNCERTAIN: window.uncertain,
             Flag.LATE: late,
             Flag.FROZEN: frozen,

@@ -130,7 +130,8 @@ def _rate(state: StreamState) -> float:
 def windows_to_prime(estimator: Estimator) -> int:
     """Number of windows that a model should see before it answers a stream: the bundle's value if it has one."""
     wanted = estimator.bundle.metadata.prime_windows
-    return max(estimator.config.settle_windows, PRIME_WINDOWS) if wanted is None else wanted
+    wanted = max(estimator.config.settle_windows, PRIME_WINDOWS) if wanted is None else wanted
+    return max(wanted, sum(estimator.config.network.history))
 
 
 def replay(lane: Lane, entries: list[PackedWindow], pace: Pace | None = None) -> Lane:

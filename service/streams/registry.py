@@ -78,6 +78,13 @@ class StreamRegistry:
             if worker is not None:
                 worker.put_camera(payload, received_ns)
 
+    def put_imu(self, stream: str, payload: bytes, received_ns: int, _sent_us: int | None = None) -> None:
+        """Queue an IMU packet of a stream that is served; without events there is nothing to aid."""
+        with self._lock:
+            worker = self._workers.get(stream)
+            if worker is not None:
+                worker.put_imu(payload, received_ns)
+
     def refuse(self, name: str) -> None:
         """Count a stream whose name is not valid."""
         with self._lock:

@@ -12,6 +12,7 @@ from neurove_service.streams.age import newest_us
 from neurove_service.streams.answers import Answers
 from neurove_service.streams.flags import Flags
 from neurove_service.streams.history import RingSize
+from neurove_service.streams.inertial import Inertial
 from neurove_service.streams.intake import Arrival, Intake
 from neurove_service.streams.lanes import Lanes, Pushing, ServingModelFailed
 from neurove_service.streams.model_source import ModelSource
@@ -56,6 +57,7 @@ class Stream:
         self.verdicts = Verdicts(self.activity)
         self.lanes = Lanes(name, ring)
         self.models = models
+        self.inertial = Inertial(name, now_ns)
         self._flags = Flags()
         self._intake = Intake(name, self.activity, self._flags, max_age_s)
         self._answers = Answers(name, node, self.activity, self._flags, self._intake, now_ns, max_age_s)
@@ -125,7 +127,8 @@ class Stream:
         if pushing.skipped_windows:
             activity.lost("skipped_windows", pushing.skipped_windows)
         about = pushing.serving, self.calibration, packet, arrival
-        estimates = [self._answers.of(one, *about) for one in pushing.estimates]
+        aided = self.inertial.aid(pushing.estimates, pushing.serving.estimator, self.calibration)
+        estimates = [self._answers.of(one, *about) for one in aided]
         self._intake.compare(first)  # later: the windows ended before this packet
         return estimates
 
@@ -189,6 +192,7 @@ class Stream:
         if window is not None and window.events:
             self.activity.lost("restart_windows", 1)
         self.lanes.restart()
+        self.inertial.restart()
         self._flags.forget_gaps()
         self.activity.was_reset()
 

@@ -32,6 +32,8 @@ _MAX_PAUSE_S = 0.02
 _SOON_NS, _GATHER_S = 300_000, 0.001  # packets that follow this soon are gathered: a wake-up costs more than a packet
 _SAMPLE_BYTES = 256
 _MAX_CAMERAS = 16  # CameraInfo messages that wait for the worker
+_MAX_IMU = 1024  # IMU packets that wait for the worker: seconds of a usual driver
+_MAX_IMU_TOTAL_BYTES = 4 << 20
 
 
 class Sample(NamedTuple):
@@ -65,6 +67,8 @@ class Inbox:
         self._samples: deque[Sample] = deque()
         self.max_age_s, self._max_age_ns, self._max_bytes = max_age_s, max_age_s * 1e9, max_bytes
         self._cameras: deque[tuple[int, Sample]] = deque()  # each with the number of packets that precede it
+        self._imu: deque[Sample] = deque()
+        self._imu_bytes = self._imu_dropped = 0
         self._bytes = self._dropped = 0
         self._changed = threading.Condition()
 
@@ -91,6 +95,23 @@ class Inbox:
                     break
             if waited:
                 self._changed.notify()
+
+    def put_imu(self, sample: Sample) -> None:
+        """Append an IMU packet; it wakes nobody, because it completes no window."""
+        with self._changed:
+            self._imu.append(sample)
+            self._imu_bytes += sample.size
+            while len(self._imu) > _MAX_IMU or self._imu_bytes > _MAX_IMU_TOTAL_BYTES:
+                self._imu_bytes -= self._imu.popleft().size
+                self._imu_dropped += 1
+
+    def take_imu(self) -> tuple[deque[Sample], int]:
+        """All IMU packets, oldest first, and how many were dropped since the last call."""
+        with self._changed:
+            dropped, self._imu_dropped = self._imu_dropped, 0
+            samples, self._imu = self._imu, deque()
+            self._imu_bytes = 0
+            return samples, dropped
 
     def wake(self) -> None:
         """Let a waiting `take` return."""
@@ -165,6 +186,10 @@ class StreamWorker:
         if len(payload) > MAX_CAMERA_BYTES or not self._inbox.put_camera(Sample(payload, received_ns, is_camera=True)):
             self._cameras.lose()
 
+    def put_imu(self, payload: bytes, received_ns: int) -> None:
+        """Queue an IMU packet."""
+        self._inbox.put_imu(Sample(payload, received_ns, is_camera=False))
+
     def stop(self) -> None:
         """Ask the thread to end; queued samples are not processed."""
         self._stopping.set()
@@ -222,12 +247,25 @@ class StreamWorker:
         self._pending.extend(samples)
         if dropped:
             self.stream.overloaded(dropped)
+        inertial, missing = self._inbox.take_imu()  # after the packets: samples up to their time have arrived
+        self.stream.inertial.drop(missing)
+        for one in inertial:
+            with self._guard.at("imu packet", stream=self.stream.name):
+                self.stream.inertial.accept(one.payload, one.received_ns)
 
     def _work_next(self, outlet: Outlet) -> None:
         now_ns = time.monotonic_ns()
         if self._overload.must_shed(now_ns - self._pending[0].received_ns, now_ns):
             self._take(0)
             self._shed()
+            answered = self.stream.counters.estimates
+            while self._pending and self.stream.counters.estimates == answered:
+                self._work_some(now_ns, outlet)  # a whole window: until the next turn the rest of it would be too old
+        else:
+            self._work_some(now_ns, outlet)
+
+    def _work_some(self, now_ns: int, outlet: Outlet) -> None:
+        """Process the oldest samples: a run of small packets, or one."""
         if len(self._pending) == 1 or not self._work_run(now_ns, outlet):
             self._work(self._pending.popleft(), now_ns, outlet)
 

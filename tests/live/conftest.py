@@ -11,7 +11,8 @@ import time
 
 import pytest
 
-from neurove_service.clients import ask
+from neurove_protocol import TwistEstimate
+from neurove_protocol.control import StreamStatus
 from neurove_service.config import ClientConfig
 from neurove_service.transport import open_transport
 
@@ -106,13 +107,19 @@ def _connects(endpoint):
     return False
 
 
+def listen(transport, config, on_estimate, on_status):
+    """Receive estimates as they were published; `ask.listen` also marks those that waited on a busy machine."""
+    transport.subscribe(config.keys.velocity(), lambda _key, data, _ns: on_estimate(TwistEstimate.decode(data)))
+    transport.subscribe(config.keys.status(), lambda _key, data, _ns: on_status(StreamStatus.decode(data)))
+
+
 class Heard:
     """Estimates and statuses that a consumer received, by stream."""
 
     def __init__(self, transport, config):
         self.estimates = []
         self.statuses = {}
-        ask.listen(transport, config, self.estimates.append, self._on_status)
+        listen(transport, config, self.estimates.append, self._on_status)
 
     def _on_status(self, status):
         self.statuses[status.stream] = status

@@ -33,6 +33,10 @@ def test_a_service_and_its_streams_are_checked(run):
             }
             assert {name: checks[name]["level"] for name in expected} == expected
             assert code == (1 if "bad" in expected.values() else 0)
+        with running("drive", "sim://wall?seed=1", "--stream", "cam1", "--connect", endpoint, "--wait", "20"):
+            wait_until(lambda: heard.of("cam1"))
+            known = checks_of(run("doctor", "--connect", endpoint, "--json").out)["stream cam1: height"]
+            assert (known["state"], known["level"]) == ("known", "ok")
 
 
 def test_a_router_without_a_service_is_named(run):

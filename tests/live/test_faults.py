@@ -15,9 +15,8 @@ import pytest
 from neurove_protocol import EventPacket, Flag, Sensor, TwistEstimate
 from neurove_protocol.control import StreamStatus
 from neurove_protocol.events import encode_packet
-from neurove_service.clients import ask
 from tests.builders import make_packets
-from tests.live.conftest import AT_FULL_SPEED, Source, client, free_endpoint, service, wait_until
+from tests.live.conftest import AT_FULL_SPEED, Source, client, free_endpoint, listen, service, wait_until
 
 pytestmark = pytest.mark.live
 
@@ -213,7 +212,7 @@ def run(names: list[str], *settings: str) -> dict[str, Ran]:
         client(endpoint) as listener,
         client(endpoint) as driver,
     ):
-        ask.listen(
+        listen(
             listener,
             config,
             lambda one: estimates[one.stream].append(one),

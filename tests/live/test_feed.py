@@ -16,7 +16,18 @@ from neurove_service.clients import ask
 from neurove_service.config import ClientConfig
 from neurove_service.transport import Transport
 from tests.builders import SENSOR, make_packets
-from tests.live.conftest import START_S, Heard, Source, client, free_endpoint, is_alive, running, service, wait_until
+from tests.live.conftest import (
+    START_S,
+    Heard,
+    Source,
+    client,
+    free_endpoint,
+    is_alive,
+    neurove,
+    running,
+    service,
+    wait_until,
+)
 
 pytestmark = pytest.mark.live
 
@@ -239,3 +250,20 @@ def test_an_idle_stream_is_evicted_and_a_full_node_refuses_further_streams():
         wait_until(lambda: len(heard.of("second")) >= 2)
         assert heard.of("first")[0].twists
         assert str(SENSOR) == "64x48"
+
+
+def test_the_gyroscope_of_a_driven_recording_gives_the_angular_part_over_the_wire(node, heard):
+    _, transport, config = node
+    source = (
+        "sim://wall?trajectory=rotation%3Fwy=0.4&seed=20006&camera=pinhole:24x18:75&seconds=1.2&imu=500&gyro_noise=0"
+    )
+    driven = neurove("drive", source, "--connect", config.connect[0], "--stream", "turning", "--speed", "0.5")
+    assert driven.returncode == 0, driven.stderr
+    assert "600 IMU samples" in driven.stdout
+    wait_until(lambda: len(heard.of("turning")) >= 20)
+    aided = [one for one in heard.of("turning") if one.source == "gyro"]
+    assert len(aided) >= 15
+    assert all(abs(one.twist.wy - 0.4) < 0.05 for one in aided)
+    (reply, *_) = ask.health(transport, config)
+    (unit,) = [status.imu for status in reply.streams if status.stream == "turning"]
+    assert (unit.samples, unit.lost_packets, unit.refused_packets) == (600, 0, 0)

@@ -25,6 +25,12 @@ WRONG = [
     (CanonicalConfig, "hfov_deg", 1.0, "greater than 1"),
     (CanonicalConfig, "hfov_deg", 170.0, "less than 170"),
     (CanonicalConfig, "hfov_deg", float("nan"), "finite number"),
+    (CanonicalConfig, "subcells", 3, "1 or 2"),
+    (NetworkConfig, "history", (0,), "each must be at least 1"),
+    (NetworkConfig, "history", (9, 8), "at most 16 windows"),
+    (ModelConfig, "scales", (1,), "from at least 2 to at most 16"),
+    (ModelConfig, "scales", (4, 2), "must rise"),
+    (ModelConfig, "scale_bounds", (0.0, 1.0), "both must be above 0"),
     (NetworkConfig, "encoding", "rate", "'binary' or 'log1p'"),
     (NetworkConfig, "precision", "int4", "'float32' or 'int8'"),
     (NetworkConfig, "channels", (), "at least 1 item"),
@@ -104,7 +110,11 @@ def test_a_canonical_camera_has_at_most_the_maximum_number_of_cells():
 small: dict[str, st.SearchStrategy[Any]] = {
     "window": st.builds(lambda n, b: WindowConfig(duration_us=n * b, bins=b), st.integers(1, 4_000), st.integers(1, 6)),
     "canonical": st.builds(
-        CanonicalConfig, width=st.integers(8, 20), height=st.integers(8, 20), hfov_deg=st.floats(2, 169)
+        CanonicalConfig,
+        width=st.integers(8, 20),
+        height=st.integers(8, 20),
+        hfov_deg=st.floats(2, 169),
+        subcells=st.sampled_from([1, 2]),
     ),
     "network": st.builds(
         NetworkConfig,
@@ -116,6 +126,7 @@ small: dict[str, st.SearchStrategy[Any]] = {
         decay=st.floats(0, 0.99),
         v_th=st.floats(1e-3, 10),
         alpha=st.floats(0, 1),
+        history=st.sampled_from([(), (1,), (1, 2, 4)]),
         diffusion=st.booleans(),
         surrogate=st.sampled_from(["rectangular", "arctan", "triangle"]),
     ),

@@ -93,6 +93,21 @@ STATUS: Fields = {
     "uncounted_packets": 0,
     "refused_cameras": 1,
     "refusal": "t0_us=-1: must be 0 or more",
+    "imu": {
+        "rate_hz": 1000.5,
+        "samples": 4_000,
+        "lost_packets": 1,
+        "refused_packets": 2,
+        "dropped_packets": 3,
+        "late_samples": 5,
+        "used": False,
+        "resting": False,
+        "bias_rad_s": [0.0625, 0.0, -0.125],
+        "bias_sigma_rad_s": 0.0005,
+        "offset_ms": 3.5,
+        "disagrees": True,
+        "problem": "the gyroscope turns the other way about y",
+    },
 }
 EXAMPLES: dict[str, Fields] = {
     "EventPacket": {
@@ -315,6 +330,16 @@ models = st.fixed_dictionaries(
         "signature": st.sampled_from(["unsigned", "unchecked", "trusted", "untrusted"]),
     }
 )
+inertial_units = st.fixed_dictionaries(
+    {
+        **dict.fromkeys(("rate_hz", "bias_sigma_rad_s"), floats),
+        **{name: counts for name, value in STATUS["imu"].items() if type(value) is int},
+        **dict.fromkeys(("used", "resting", "disagrees"), st.booleans()),
+        "bias_rad_s": st.none() | st.lists(floats, min_size=3, max_size=3),
+        "offset_ms": st.none() | floats,
+        "problem": sentences,
+    }
+)
 statuses = st.fixed_dictionaries(
     {
         "node": names,
@@ -326,6 +351,7 @@ statuses = st.fixed_dictionaries(
         "lost": st.fixed_dictionaries(dict.fromkeys(STATUS["lost"], counts)),
         "latency_ms": st.none() | st.fixed_dictionaries(dict.fromkeys(("p50", "p95", "p99"), floats)),
         "last_packet_age_s": floats,
+        "imu": st.none() | inertial_units,
         **{name: counts for name, value in STATUS.items() if type(value) is int and name != "v"},
     }
 )

@@ -43,8 +43,11 @@ NULLABLE = {
     ("TwistEstimate", "node"),
     ("TwistEstimate", "host"),
     ("CameraInfo", "height_m"),
-    ("StreamStatus", "latency_ms"),
-    ("HealthReply", "latency_ms"),
+    *(
+        (kind, name)
+        for kind in ("StreamStatus", "HealthReply")
+        for name in ("latency_ms", "imu", "bias_rad_s", "offset_ms")
+    ),
     ("ModelsReply", "previous"),
     ("PushRequest", "signature"),
     ("ActivateRequest", "expect"),
@@ -53,7 +56,7 @@ NULLABLE = {
 }
 FREE_MAPS = ("details", "unreadable", "figures", "partial", "internal_errors")
 DEFAULTED = {"release", "figures", "signature"}  # of a ModelInfo
-DEFAULTED |= {"recovered_packets", "uncounted_packets", "refused_cameras", "refusal"}  # of a StreamStatus
+DEFAULTED |= {"recovered_packets", "uncounted_packets", "refused_cameras", "refusal", "imu"}  # of a StreamStatus
 OUT_OF_BOUND: dict[str, dict[str, tuple[Any, ...]]] = {
     "EventPacket": {
         "stream": ("", "a/b", "@node", "*", "**", ".", "..", "-a", "a" * 65, "caf\u00e9", "a b", "a\n", "$*", "#", "?"),
@@ -109,6 +112,8 @@ OUT_OF_BOUND: dict[str, dict[str, tuple[Any, ...]]] = {
             if type(value) is int and name != "v"
         },
         **{f"lost.{name}": (-1, 1 << 63) for name in Losses.model_fields},
+        "imu.samples": (-1, 1 << 63),
+        "imu.bias_rad_s": ([], [0.0] * 2, [0.0] * 4),
     },
     "HealthReply": {
         "node": ("*",),

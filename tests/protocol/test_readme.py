@@ -38,7 +38,7 @@ from neurove_protocol import (
     velocity,
 )
 from neurove_protocol.codec import PROTOCOL_VERSION
-from neurove_protocol.control import Latency, Losses, ModelInfo, Verdict
+from neurove_protocol.control import ImuStatus, Latency, Losses, ModelInfo, Verdict
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import DEFAULT_LIMITS, FORMATS, PacketLimits, decode_packet, encode_packet
 from neurove_protocol.imu import decode_imu, encode_imu
@@ -155,8 +155,15 @@ def test_the_table_of_a_message_has_its_fields_and_says_which_have_a_default(mod
 
 @pytest.mark.parametrize(
     ("heading", "part"),
-    [("`trace`", Trace), ("`host`", HostTime), ("`lost`", Losses), ("`latency_ms`", Latency), ("ModelInfo", ModelInfo)],
-    ids=["trace", "host", "lost", "latency", "model"],
+    [
+        ("`trace`", Trace),
+        ("`host`", HostTime),
+        ("`lost`", Losses),
+        ("`latency_ms`", Latency),
+        ("`imu`", ImuStatus),
+        ("ModelInfo", ModelInfo),
+    ],
+    ids=["trace", "host", "lost", "latency", "imu", "model"],
 )
 def test_the_table_of_a_part_has_its_fields_and_says_which_have_a_default(heading: str, part: type[BaseModel]) -> None:
     assert_fields(table(f"field of {heading}"), part)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from neurove_core.engine.engine import Engine
 from neurove_core.evaluation.metrics import SKIP_S, figures
 from neurove_core.experiments.velocity.held_out import Scenario
+from neurove_core.ingest.channels import network_input
 from neurove_core.models.bundle import PER_HEIGHT, Bundle
 from neurove_core.networks.encoding import to_spikes
 from neurove_core.networks.kinds import fired
@@ -67,9 +68,9 @@ def follow(model: Bundle, path: Path, scenario: Scenario) -> tuple[Track, tuple[
     network = model.network.eval()
     step: Callable[..., Any] = Engine(network) if isinstance(network, NeuroVE) else network
     state, answers, counted = network.initial_state(1), [], np.zeros(2, np.int64)
-    for first in range(0, len(twists), _CHUNK):
-        counts = torch.from_numpy(found.counts(0, first, min(first + _CHUNK, len(twists))).copy())[:, None]
-        answer, state = step(to_spikes(counts, model.config.network.encoding), state)
+    seen = torch.from_numpy(network_input(found.counts(0, 0, len(twists)).copy(), model.config))[:, None]
+    for counts in torch.split(seen, _CHUNK):
+        answer, state = step(to_spikes(counts.contiguous(), model.config.network.encoding), state)
         answers.append(answer[:, 0])
         for layer in fired(state).values():
             counted += [int(layer.sum()), layer.numel()]

@@ -7,12 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.geometry import rotations
-from neurove_core.sim.motion.curves import SplineTrajectory
+from neurove_core.sim.motion.curves import SplineTrajectory, Trajectory
 
 Array = NDArray[np.float64]
 
 _DRIVE_STEP_S: Final = 0.1
 _HAND_STEP_S: Final = 0.02
+_ROBOT_STEP_S: Final = 0.05
 _TAIL_S: Final = 10.0  # generated and dropped, so that a longer drive of the same seed begins like the shorter one
 
 TOP_M_S: Final = 12.0
@@ -93,6 +94,68 @@ def _eased(values: Array) -> Array:
 
 def _rate(values: Array) -> Array:
     return np.asarray(np.gradient(values, _DRIVE_STEP_S))
+
+
+def robot(
+    seed: int,
+    seconds: float = 60.0,
+    speed_m_s: tuple[float, float] = (0.1, 3.0),
+    rate_rad_s: tuple[float, float] = (0.05, 1.2),
+) -> SplineTrajectory:
+    """Generate the trajectory of a small robot on level ground that stops, turns in place, and drives straight or arcs.
+
+    Each manoeuvre lasts 0.6 to 4 s at a constant speed and a constant rate. One in ten runs backwards. The heading
+    stays within MAX_HEADING of z. The camera is up to 0.3 m ahead of the axle.
+
+    Args:
+        seed: of the trajectory.
+        seconds: duration.
+        speed_m_s: range of the forward speeds, log-uniform.
+        rate_rad_s: range of the turning rates, log-uniform.
+    """
+    rng = np.random.default_rng((seed, 4))
+    n, ease = math.ceil(seconds / _ROBOT_STEP_S) + 1, np.hanning(11)[1:-1]
+    lever_m = float(rng.uniform(0, 0.3))
+    speed, rate = np.zeros(n + ease.size - 1), np.zeros(n + ease.size - 1)
+    i, heading = 0, 0.0
+    while i < speed.size:
+        kind = rng.choice(["rest", "turn", "straight", "arc"], p=[0.1, 0.25, 0.3, 0.35])
+        v, w = (math.exp(rng.uniform(*np.log(span))) for span in (speed_m_s, rate_rad_s))
+        v, w = v * float(rng.choice([1.0, -1.0], p=[0.9, 0.1])), w * float(rng.choice([1.0, -1.0]))
+        steps = round(float(rng.uniform(0.6, 4.0)) / _ROBOT_STEP_S)
+        if abs(heading + w * steps * _ROBOT_STEP_S) > MAX_HEADING:
+            w = -math.copysign(w, heading)
+            steps = min(steps, int(MAX_HEADING / abs(w) / _ROBOT_STEP_S))
+        stop = min(i + steps, speed.size)
+        speed[i:stop] = v if kind in ("straight", "arc") else 0.0
+        rate[i:stop] = w if kind in ("turn", "arc") else 0.0
+        heading += float(rate[i:stop].sum()) * _ROBOT_STEP_S
+        i = stop
+    speed, rate = (np.convolve(values, ease / ease.sum(), mode="valid") for values in (speed, rate))
+    yaw = np.cumsum(rate) * _ROBOT_STEP_S
+    step = np.stack([np.sin(yaw) * speed, 0 * yaw, np.cos(yaw) * speed], axis=1) * _ROBOT_STEP_S
+    position = np.concatenate([np.zeros((1, 3)), np.cumsum((step[1:] + step[:-1]) / 2, axis=0)])
+    heading_q = rotations.exp(np.stack([0 * yaw, yaw, 0 * yaw], axis=1))
+    position += lever_m * rotations.turn(heading_q, np.array([0.0, 0.0, 1.0]))
+    return SplineTrajectory.through(f"robot {seed}", _ROBOT_STEP_S, position - position[:1], heading_q, seconds)
+
+
+def rocked(trajectory: Trajectory, seed: int, rate_rad_s: float, seconds: float) -> SplineTrajectory:
+    """Add a rocking rotation about all axes to a trajectory, as of a robot on legs or on rough ground.
+
+    Args:
+        trajectory: it must last `seconds`.
+        seed: of the rocking.
+        rate_rad_s: root mean square of the added pitch rate, and on average of the roll rate; yaw has a third of it.
+        seconds: duration of the result.
+    """
+    n = math.ceil(seconds / _HAND_STEP_S) + 1
+    step_s = seconds / (n - 1)
+    position, q = trajectory.position_orientation(np.linspace(0, seconds, n))
+    tilt = noise(np.random.default_rng((seed, 5)), n, 3, 0.4, 2.0, step_s)
+    tilt *= rate_rad_s / max(1e-9, float(np.sqrt(np.mean(np.gradient(tilt[:, 0], step_s) ** 2))))
+    turned = rotations.product(q, rotations.exp(tilt * np.array([1.0, 0.33, 1.0])))
+    return SplineTrajectory.through(f"{trajectory.name}, rocked", step_s, position, turned, seconds)
 
 
 def hand_held(seed: int, seconds: float = 60.0, moved: float = 1.0, turned: float = 1.0) -> SplineTrajectory:

@@ -9,7 +9,6 @@ import pytest
 from neurove_core import models
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.estimator import Estimator
-from neurove_core.evaluation.contrast import angular
 from neurove_core.evaluation.evaluate import estimate_recording
 from neurove_core.experiments import real
 from neurove_core.models import bundle
@@ -62,24 +61,41 @@ def test_reproduce_velocity_refuses_a_wrong_folder_of_recordings_before_it_train
     assert not (tmp_path / "out").exists()
 
 
-def test_a_rotating_camera_is_compared_with_contrast_maximisation_over_complete_windows(estimator, tmp_path):
+def write_gyro(folder: Path, bias: tuple[float, float, float], rate: tuple[float, float, float]) -> None:
+    """Samples of a gyro with a bias that is at rest until 0.6 s, then turns."""
+    folder.mkdir(parents=True, exist_ok=True)
+    t_s = np.arange(0, 1.6, 0.005)[:, None]
+    gyro = bias + np.where(t_s < 0.6, 0.0, 1.0) * np.array(rate)
+    np.savetxt(folder / "imu.txt", np.hstack([t_s, np.tile([0, -9.8, 0], (len(t_s), 1)), gyro]))
+
+
+def test_a_rotating_camera_is_compared_with_its_gyro_over_complete_windows_without_its_bias(estimator, tmp_path):
     folder = tmp_path / "ecd" / "shapes_rotation"
-    folder.mkdir(parents=True)
+    write_gyro(folder, (0.3, -0.2, 0.1), (0.5, 1.0, 0.0))
     events = rotating_camera(0.13)
-    events = events._replace(t=events.t + 20_000)  # so that the first and the last window are incomplete
+    events = events._replace(t=events.t + 720_000)  # so that the first and the last window are incomplete
     (folder / "events.txt").write_bytes(ecd_text(events))
     (folder / "calib.txt").write_text(CALIB)
-    row = by_name(real.run(estimator, tmp_path))["ecd", "rate of turning"]
-    recording = open_source(str(folder))
-    camera = recording.camera("real")
-    first, stop = events.t.searchsorted([50_000, 100_000])
-    true = angular(events.span(int(first), int(stop)), camera).w_rad_s
-    answers = estimate_recording(estimator, recording)
-    found = answers.twists[answers.start_us.tolist().index(50_000), :, 3:].mean(0)
-    assert row["made_of"]["contrast maximisation [rad/s]"] == pytest.approx(true.tolist(), rel=1e-3)
+    row = by_name(real.run(estimator, tmp_path))["ecd", "rate of turning at 43.5 s"]
+    answers = estimate_recording(estimator, open_source(str(folder)))
+    found = answers.twists[answers.start_us.tolist().index(750_000), :, 3:].mean(0)
+    true = np.array([0.5, 1.0, 0.0])
+    assert row["truth"] == "the gyro, less its bias"
+    assert row["made_of"]["gyro [rad/s]"] == pytest.approx(true.tolist())
     assert row["made_of"]["estimate [rad/s]"] == pytest.approx(found.tolist())
-    assert row["value"] == pytest.approx(np.linalg.norm(found - true) / np.linalg.norm(true), rel=1e-3)
-    assert row["met"] is (row["value"] <= 0.25)
+    assert row["value"] == pytest.approx(np.linalg.norm(found - true) / np.linalg.norm(true))
+    assert row["met"] is (row["value"] <= 0.15)
+
+
+def test_without_samples_at_rest_or_in_a_window_the_gyro_is_no_truth(estimator, tmp_path):
+    folder = tmp_path / "ecd" / "shapes_rotation"
+    folder.mkdir(parents=True)
+    (folder / "events.txt").write_bytes(ecd_text(rotating_camera(0.11)))
+    assert "bias is not known" in by_name(real.run(estimator, tmp_path))["ecd", "rate of turning at 43.5 s"]["skipped"]
+    late = rotating_camera(0.11)
+    (folder / "events.txt").write_bytes(ecd_text(late._replace(t=late.t + 5_000_000)))
+    write_gyro(folder, (0, 0, 0), (0, 1, 0))
+    assert "does not cover" in by_name(real.run(estimator, tmp_path))["ecd", "rate of turning at 43.5 s"]["skipped"]
 
 
 def test_a_recording_without_truth_or_a_complete_window_is_skipped_with_the_reason(estimator, tmp_path):
@@ -92,19 +108,23 @@ def test_a_recording_without_truth_or_a_complete_window_is_skipped_with_the_reas
         file.write_bytes(ecd_text(events if events is not None else rotating_camera(0.04)))
     rows = by_name(real.run(estimator, tmp_path))
     assert "groundtruth.txt" in rows["slider_depth", "direction of motion"]["skipped"]
-    assert "no complete window of 50 ms" in rows["ecd", "rate of turning"]["skipped"]
+    assert "no complete window of 50 ms" in rows["ecd", "rate of turning at 43.5 s"]["skipped"]
 
 
 def test_profiles_and_stationary_cameras_are_evaluated_over_their_windows(estimator, tmp_path):
-    (tmp_path / "ecd").mkdir()
-    (tmp_path / "ecd" / "shapes_rotation_1.43s.txt").write_bytes(ecd_text(rotating_camera(0.75, rad_s=0.2)))
+    turning = rotating_camera(0.75, rad_s=0.2)
+    write_gyro(tmp_path / "ecd" / "shapes_rotation", (0, 0, 0), (0, 0.2, 0))
+    (tmp_path / "ecd" / "shapes_rotation" / "events.txt").write_bytes(ecd_text(turning.span(0, 1000)))
+    (tmp_path / "ecd" / "shapes_rotation_1.43s.txt").write_bytes(ecd_text(turning))
     (tmp_path / "aedat4").mkdir()
     noise = make_events(3000, duration_us=600_000, sensor=Sensor(346, 260))
     (tmp_path / "aedat4" / "davis346.aedat4").write_bytes(aedat4([noise], Sensor(346, 260)).data)
     found = list(real.run(estimator, tmp_path))
     rows = by_name(found)
-    assert rows["ecd", "yaw"]["made_of"]["windows"] == 3  # complete windows, 0.5 s after the first
-    assert -1 <= rows["ecd", "yaw"]["value"] <= 1
+    correlation, error = (row for row in found if row["what"].startswith("yaw"))
+    assert correlation["made_of"]["windows"] == 3  # complete windows, 0.5 s after the first
+    assert -1 <= correlation["value"] <= 1
+    assert error["made_of"]["RMS of the gyro"] == pytest.approx(0.2 * np.sqrt(2 / 3), rel=1e-3)
     assert (
         rows["ecd", "turning at rest [rad/s]"]["value"] >= rows["ecd", "turning at rest [rad/s]"]["made_of"]["median"]
     )
@@ -120,6 +140,9 @@ def test_no_check_is_skipped_if_all_recordings_exist(tmp_path):
         shared(check.recording)
     rows = by_name(real.run(Estimator(models.find("default")), SHARED))
     assert not any(row["skipped"] for row in rows.values())
+    assert all(row["truth"] for row in rows.values())
+    turning = rows["ecd", "rate of turning at 43.5 s"]["made_of"]["gyro [rad/s]"]
+    assert turning == pytest.approx([1.48, -0.52, 1.89], abs=0.01)
     evbench = rows["evbench", "rotation about x over its truth"]["made_of"]
     assert evbench["truth [rad/s]"] == pytest.approx(-0.142, abs=0.001)
     stationary = rows["ecd", "turning at rest [rad/s]"]

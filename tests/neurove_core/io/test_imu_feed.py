@@ -8,11 +8,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neurove_core.io import Imu
+from neurove_core.io.axes import with_axes
 from neurove_core.io.formats.packet_log.writer import write_mcap
 from neurove_core.io.imu_feed import ImuFeed, Turn
 from neurove_core.io.recording import EventsOnly
 from neurove_core.sources import open_source
 from neurove_protocol import Sensor
+from neurove_protocol.errors import InvalidField
 from neurove_protocol.imu import MAX_SAMPLES, decode_imu
 from tests.builders import make_events
 from tests.datasets import make_imu
@@ -93,3 +95,15 @@ def test_a_converted_recording_holds_published_packets_in_step_with_the_events(t
     assert [packet.seq for packet in packets] == list(range(len(packets)))
     assert kinds[0] == "imu"  # before the events of its time
     assert kinds.index("events") < len(packets)
+
+
+def test_axes_of_another_mounting_are_rotated_and_what_is_no_rotation_is_refused():
+    imu = make_imu(20)
+    (turned,) = with_axes(Recorded(imu, 20), "-y,x,z").imu()
+    np.testing.assert_array_equal(turned.gyro_rad_s, imu.gyro_rad_s[:, (1, 0, 2)] * (-1, 1, 1))
+    np.testing.assert_array_equal(turned.accel_m_s2, imu.accel_m_s2[:, (1, 0, 2)] * (-1, 1, 1))
+    for wrong in ("x,y", "x,y,y", "-x,y,z", "x,z,y", "x,y,w", ""):
+        with pytest.raises(InvalidField, match="axes"):
+            with_axes(Recorded(imu), wrong)
+    with pytest.raises(InvalidField, match="no inertial samples"):
+        with_axes(open_source("pattern://"), "-x,y,-z")

@@ -112,6 +112,7 @@ def test_imu_and_ground_truth_are_in_si():
     np.testing.assert_allclose(summary.imu.gyro_std_rad_s, GYRO.std(axis=0))
     np.testing.assert_allclose(summary.imu.accel_mean_m_s2, ACCEL.mean(axis=0))
     np.testing.assert_allclose(summary.imu.accel_std_m_s2, ACCEL.std(axis=0))
+    assert summary.imu.accel_peak_m_s2 == pytest.approx(np.linalg.norm(ACCEL, axis=1).max())
     truth = summary.as_json()["truth"]
     assert (truth["from"], truth["samples"], truth["first_us"], truth["last_us"]) == ("poses", 200, 0, 1_990_000)
     assert truth["mean_linear_m_s"] == pytest.approx(5)

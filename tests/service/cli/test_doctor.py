@@ -4,10 +4,10 @@ import json
 
 import pytest
 
-from neurove_protocol import Flag
+from neurove_protocol import Flag, TwistEstimate
 from neurove_protocol.control import StreamStatus
 from neurove_service.cli import doctor, extras, installation
-from tests.protocol.messages import STATUS
+from tests.protocol.messages import EXAMPLES, STATUS
 
 NOWHERE = "tcp/127.0.0.1:9"
 
@@ -77,8 +77,26 @@ def test_an_extra_that_is_not_installed_is_named_with_its_modules(monkeypatch):
     assert (found.level, found.state) == ("info", "not installed: no_such_module")
 
 
+@pytest.mark.parametrize(
+    ("flags", "state", "level"),
+    [
+        (("unscaled",), "unknown to the service, which assumes 1 m", "bad"),
+        (("uncalibrated", "unscaled"), "unknown to the service, which assumes 1 m", "bad"),
+        (("gap",), "known", "ok"),
+        (None, "unknown: no estimate within 2 s", "info"),
+    ],
+)
+def test_the_height_of_a_stream_is_known_by_the_flags_of_its_newest_estimate(flags, state, level):
+    estimate = None if flags is None else TwistEstimate.model_validate(EXAMPLES["TwistEstimate"] | {"flags": flags})
+    found = {check.what: check for check in doctor.check_stream(status(), estimate)}["stream cam0: height"]
+    assert (found.state, found.level) == (state, level)
+    assert ("--height M" in found.advice) == (level == "bad")
+
+
 def status(**changes):
-    return StreamStatus.model_validate(STATUS).model_copy(update={"stream": "cam0", "verdict": "ok"} | changes)
+    return StreamStatus.model_validate(STATUS).model_copy(
+        update={"stream": "cam0", "verdict": "ok", "imu": None} | changes
+    )
 
 
 class Estimate:
@@ -100,3 +118,23 @@ def test_each_stream_is_checked_for_feed_clock_calibration_and_height(changes, e
     found = doctor.check_stream(status(**changes), estimate)
     assert [check.level for check in found] == levels
     assert all(check.advice for check in found if check.level == "bad")
+
+
+@pytest.mark.parametrize(
+    ("changes", "level", "state"),
+    [
+        (
+            {"disagrees": False, "problem": ""},
+            "ok",
+            "inertial unit 1,000 Hz, gyroscope bias +0.0625 +0.0000",
+        ),
+        ({"disagrees": False, "problem": "no packet for 3.0 s"}, "bad", "inertial unit: no packet for 3.0 s"),
+        ({"disagrees": True, "problem": "it turns the other way"}, "bad", "gyroscope disagrees with the events"),
+    ],
+)
+def test_the_inertial_unit_of_a_stream_is_checked_if_it_has_one(changes, level, state):
+    unit = StreamStatus.model_validate(STATUS).imu.model_copy(update=changes)
+    check = doctor.check_stream(status(imu=unit, calibrated=True, last_packet_age_s=0.1), Estimate())[-1]
+    assert (check.what, check.level) == ("stream cam0: inertial unit", level)
+    assert check.state.startswith(state)
+    assert bool(check.advice) == (level == "bad")
