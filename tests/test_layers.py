@@ -46,6 +46,9 @@ MAY_IMPORT = {
         "config files extras figures geometry ingest networks "
         "engine models estimator self_test io io.formats sim sources timescales"
     ),
+    "neurove_core.adaptation": (
+        "config files geometry models estimator self_test io io.formats sources evaluation training"
+    ),
     "neurove_core.bench": (
         "config compiled figures geometry spiking ingest networks engine models estimator sim sources"
     ),

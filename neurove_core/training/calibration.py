@@ -51,6 +51,7 @@ _SEED_SHIFT: Final = 450_000_000  # distance from the seeds of training
 _SEEDS: Final = 900_000_000
 _KIND_SEEDS: Final = 1_000_000  # distance between the sets of sequences
 _FOLDS: Final = 4
+_PROVENANCE_CHARS: Final = 1000
 _PENALTY: Final = 0.003  # on the weights of the spread; its inputs have variance 1 on average
 _NEWTON_STEPS: Final = 50
 _CLIPPED: Final = 3.0  # limit of an error in the correlation, in sigma, so that one bad sequence does not dominate
@@ -186,6 +187,28 @@ def with_uncertainty(
     if made.golden:  # a wider last layer may round differently
         made = replace(made, golden=self_test.record(Estimator(made), made.golden.counts, made.golden.tolerance))
     return Calibration(made.with_digest(), _report(held, factor, provenance))
+
+
+def with_wider_sigma(bundle: Bundle, factor: Array, provenance: str) -> Bundle:
+    """Multiply the sigma of each axis of a calibrated bundle; its twists stay the same.
+
+    Args:
+        bundle: with an uncertainty.
+        factor: (6), above 0.
+        provenance: one line on where the factors come from; it is added to that of the uncertainty.
+
+    Raises:
+        BadModel: the bundle has no uncertainty.
+    """
+    network = _copy(bundle)
+    if bundle.uncertainty is None or network.spread is None:
+        raise BadModel(bundle.name, "it has no uncertainty: neurove calibrate adds it")
+    leak = 1 - float(torch.sigmoid(network.kappa_logit.detach()))
+    with torch.no_grad():  # the leaky neuron integrates log(factor) * leak to log(factor)
+        network.spread.bias.add_(torch.from_numpy(np.log(factor) * leak).float())
+    about = f"{bundle.uncertainty.provenance}; {provenance}"[:_PROVENANCE_CHARS]
+    changed = replace(bundle.uncertainty, provenance=about)
+    return replace(bundle, network=network.eval(), uncertainty=changed).with_digest()
 
 
 def collect_errors(bundle: Bundle, parts: list[tuple[Sequences, bool]]) -> Iterator[SequenceErrors]:
