@@ -24,6 +24,7 @@ from neurove_core.models.bundle import PER_HEIGHT, Bundle, LinearUnit
 from neurove_core.networks.kinds import State
 from neurove_core.networks.neurove import NetworkState, NeuroVE
 from neurove_core.networks.runner import Runner
+from neurove_core.timescales import Answer, Longer, chosen, followed, jobs, slowed
 from neurove_protocol import CameraInfo, Events, Sensor
 from neurove_protocol.errors import BadModel
 from neurove_protocol.events import EventPacket, PacketLimits, WireEvents, encode_packet
@@ -44,6 +45,7 @@ class StreamState(NamedTuple):
     end_us: int | None = None  # end of the newest window that the network has processed
     low_activity_below: float = 0.0  # a window with fewer visible events is flagged low_activity
     recent: Recent = ()  # counts of earlier windows, for models with a history
+    longer: Longer = Longer()  # for models with longer windows
 
 
 class WindowEstimate(NamedTuple):
@@ -205,14 +207,30 @@ class Estimator:
             for stream, (twists, network) in zip(due, steps, strict=True):
                 self._take(stream, stream.windows[turn], twists * self._scale + self._offset, network)
 
+    def _chosen(self, stream: _Progress, window: Window, answer: Answer) -> Answer:
+        """The answer of the time scale that fits the motion; longer windows run on the way."""
+        if not self.config.scales:
+            return answer
+        wanted, longer = jobs(window.counts, stream.state.longer, self.network, self.config)
+        runs = self._runner.run([job.counts for job in wanted], [job.state for job in wanted]) if wanted else []
+        longer = followed(longer, [(job, state) for job, (_, state) in zip(wanted, runs, strict=True)], self.config)
+        stream.state = stream.state._replace(longer=longer)
+        answers = [answer]
+        for job, (twists, state) in zip(wanted, runs, strict=True):
+            answers.append(Answer(slowed(twists * self._scale + self._offset, job.scale), state, job.scale))
+        return chosen(answers, longer.windows, self.config.scale_bounds)
+
     def _reset_after_gap(self, stream: _Progress, window: Window) -> None:
         """Reset the network state where a window does not follow the one before it."""
         if stream.state.end_us not in (None, window.start_us) and not window.bridged:
-            stream.state = stream.state._replace(network=self.network.initial_state(), age=0, recent=())
+            stream.state = stream.state._replace(
+                network=self.network.initial_state(), age=0, recent=(), longer=Longer()
+            )
 
     def _take(self, stream: _Progress, window: Window, twists: NDArray[np.float64], network: State) -> None:
+        answer = self._chosen(stream, window, Answer(twists, network))
         state = stream.state
-        stream.estimates.append(self._estimate(window, twists, network, state))
+        stream.estimates.append(self._estimate(window, answer, state))
         end_us = window.start_us + self.config.window.duration_us
         recent = remembered(window.counts, state.recent, self.config)
         stream.state = state._replace(network=network, age=state.age + 1, end_us=end_us, recent=recent)
@@ -241,20 +259,19 @@ class Estimator:
             if not (finite and state.network.finite()):  # a membrane of nan never fires, so the answer does not show it
                 raise BadModel(self.bundle.name, "it computes numbers that are not finite")
 
-    def _covariance(self, state: State, metres: NDArray[np.float64]) -> NDArray[np.float64] | None:
-        """Covariance (6, 6) of the twists of the window that led to this state, in the units of the estimate."""
+    def _covariance(self, answer: Answer, metres: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Covariance (6, 6) of the twists of an answer, in the units of the estimate."""
+        state = answer.network
         if not isinstance(self.network, NeuroVE) or not isinstance(state, NetworkState):
             return None
         log_sigma = self.network.log_sigma(state)
         if self.bundle.uncertainty is None or log_sigma is None:
             return None
-        return self.bundle.uncertainty.covariance(log_sigma[0].double().numpy(), self._scale * metres)
+        return self.bundle.uncertainty.covariance(log_sigma[0].double().numpy(), self._scale * metres / answer.scale)
 
-    def _estimate(
-        self, window: Window, twists: NDArray[np.float64], network: State, before: StreamState
-    ) -> WindowEstimate:
+    def _estimate(self, window: Window, answer: Answer, before: StreamState) -> WindowEstimate:
         metres, age = _to_metres(before.camera, self.bundle.linear_unit), before.age
-        twists, covariance = twists * metres, self._covariance(network, metres)
+        twists, covariance = answer.twists * metres, self._covariance(answer, metres)
         unsure = self.bundle.uncertainty
         return WindowEstimate(
             start_us=window.start_us,

@@ -31,8 +31,10 @@ MAY_IMPORT = {
     "neurove_core.networks": "config compiled spiking",
     "neurove_core.engine": "compiled spiking networks",
     "neurove_core.models": "config files networks",
+    "neurove_core.timescales": "config ingest networks",
+    "neurove_core.refine": "compiled geometry ingest",
     "neurove_core.inertial": "",
-    "neurove_core.estimator": "geometry ingest networks engine models io",
+    "neurove_core.estimator": "geometry ingest networks engine models io refine timescales",
     "neurove_core.self_test": "config models estimator",
     "neurove_core.aided": "estimator inertial",
     "neurove_core.io": "files extras figures geometry",
@@ -42,7 +44,10 @@ MAY_IMPORT = {
     "neurove_core.evaluation": "compiled figures geometry networks models estimator inertial aided io",
     "neurove_core.training": (
         "config files extras figures geometry ingest networks "
-        "engine models estimator self_test io io.formats sim sources"
+        "engine models estimator self_test io io.formats sim sources timescales"
+    ),
+    "neurove_core.adaptation": (
+        "config files geometry models estimator self_test io io.formats sources evaluation training"
     ),
     "neurove_core.bench": (
         "config compiled figures geometry spiking ingest networks engine models estimator sim sources"

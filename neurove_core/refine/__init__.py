@@ -1,0 +1,1 @@
+"""Refinement of estimates by the events of each window, after the network."""

@@ -1,0 +1,197 @@
+"""Linear velocity by the ground: laws on points of a plane, and agreement of the compiled loops with numpy."""
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from neurove_core.geometry import rotations
+from neurove_core.refine import ground_kernels as kernels
+from neurove_core.refine.ground import (
+    LEAST_EVENTS,
+    MAX_SIGMAS,
+    PITCH,
+    SPAN_US,
+    Answer,
+    GroundEvents,
+    GroundState,
+    image_of,
+    on_ground,
+    rays_of,
+    refine,
+)
+from neurove_core.refine.ground_search import Prior, objective
+from neurove_protocol import CameraInfo
+
+Array = NDArray[np.float64]
+
+WINDOW_US = 50_000
+LENS = {"width": 172, "height": 130, "lens": "pinhole", "fx": 112.0, "fy": 112.0, "cx": 85.5, "cy": 64.5}
+SIGMA_RAD_S = np.full(3, 0.05)
+
+
+def camera(height_m: float | None = 1.0) -> CameraInfo:
+    return CameraInfo.model_validate({"stream": "cam0", "height_m": height_m, **LENS})
+
+
+def ahead(speed_m_s: float, pitch: float = PITCH, yaw_rad_s: float = 0.0) -> Array:
+    """The twist of a camera that drives ahead on level ground and turns about its vertical."""
+    c, s = math.cos(pitch), math.sin(pitch)
+    return np.array([0.0, -s * speed_m_s, c * speed_m_s, 0.0, c * yaw_rad_s, s * yaw_rad_s])
+
+
+def seen(
+    twist: Array, start_us: int, *, height_m: float = 1.0, pitch: float = PITCH, points: int = 400, wall: int = 0
+) -> GroundEvents:
+    """A window of events of random points on the ground, and of a wall 3 m to the right, rounded to pixels."""
+    rng = np.random.default_rng(0)
+    c, s = math.cos(pitch), math.sin(pitch)
+    right = np.append(rng.uniform(-3, 3, points), np.full(wall, 3.0))
+    down = np.append(np.full(points, height_m), rng.uniform(-2, height_m, wall))
+    far = np.append(rng.uniform(0.5, 12, points), rng.uniform(2, 9, wall))
+    # in the axes of the camera at time 0; every point is seen 12 times in each window
+    world = np.repeat(np.stack([right, c * down - s * far, s * down + c * far], axis=1), 12, axis=0)
+    t_us = start_us + np.random.default_rng(start_us).integers(0, WINDOW_US, world.shape[0])
+    world, t_us = world[np.argsort(t_us, kind="stable")], np.sort(t_us)
+    orientation, position = rotations.pose_of(t_us[:, None] / 1e6 * twist)
+    x, y, z = rotations.turn(rotations.inverse(orientation), world - position).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = np.rint(x / z * 112 + 85.5), np.rint(y / z * 112 + 64.5)
+    inside = (z > 0.1) & (u >= 0) & (u < 172) & (v >= 0) & (v < 130)
+    columns = (((side - centre) / 112)[inside].astype(np.float32) for side, centre in ((u, 85.5), (v, 64.5)))
+    return GroundEvents(*columns, t_us[inside])
+
+
+def answer(twist: Array, known: Array, *, windows: int = 6, height_m: float | None = 1.0, **scene: float) -> Answer:
+    """The last answer after some windows of a constant twist, with a constant estimate known before."""
+    state = GroundState()
+    for number in range(windows):
+        start_us = number * WINDOW_US
+        events = seen(twist, start_us, height_m=height_m or 1.0, **scene)  # type: ignore[arg-type]
+        found = refine(events, start_us, start_us + WINDOW_US, camera(height_m), known, SIGMA_RAD_S, state)
+        state = found.state
+    return found
+
+
+@pytest.mark.parametrize(("speed", "known"), [(0.3, 1.1), (0.5, 1.1), (1.0, 1.3), (2.0, 1.8), (4.0, 3.4)])
+def test_a_wrong_speed_is_mended_from_a_crawl_to_a_drive(speed: float, known: float) -> None:
+    found = answer(ahead(speed), ahead(known))
+    assert found.outcome == "accepted"
+    assert found.motion is not None
+    assert np.linalg.norm(found.motion.twist[:3] - ahead(speed)[:3]) < max(0.05 * speed, 0.1)
+
+
+@pytest.mark.parametrize("phantom", [0.5, 1.4])
+def test_a_camera_that_turns_in_place_does_not_move(phantom: float) -> None:
+    truth = ahead(0.0, yaw_rad_s=0.5)
+    found = answer(truth, truth + ahead(phantom))
+    assert found.motion is not None
+    assert np.linalg.norm(found.motion.twist[:3]) < 0.1
+
+
+def test_a_wall_at_the_side_is_not_taken_for_ground() -> None:
+    found = answer(ahead(1.0), ahead(1.4), wall=200)
+    assert found.motion is not None
+    assert np.linalg.norm(found.motion.twist[:3] - ahead(1.0)[:3]) < 0.1
+
+
+def test_the_speed_is_proportional_to_the_height() -> None:
+    high, unknown = (answer(ahead(2.0), ahead(1.6), height_m=2.0), answer(ahead(1.0), ahead(0.8), height_m=None))
+    assert high.motion is not None
+    assert unknown.motion is not None
+    assert high.motion.twist[2] == pytest.approx(2.0, abs=0.1)
+    assert unknown.motion.twist[2] == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("pitch_deg", [1.0, 9.0])
+def test_an_unknown_pitch_is_approached(pitch_deg: float) -> None:
+    pitch = math.radians(pitch_deg)
+    short, long = (answer(ahead(4.0, pitch), ahead(4.0), windows=n, pitch=pitch).state for n in (6, 16))
+    wrong = [abs(found - pitch) for found in (PITCH, short.pitch, long.pitch)]
+    assert wrong[2] < wrong[1] < wrong[0]
+    assert long.pitch_sigma < short.pitch_sigma
+
+
+def test_without_events_on_the_ground_there_is_no_answer() -> None:
+    events = seen(ahead(1.0), 0)
+    few = GroundEvents(*(column[: LEAST_EVENTS // 2] for column in events))
+    sky = events._replace(y=-np.abs(events.y) - np.float32(0.2))
+    for given in (few, sky):
+        found = refine(given, 0, WINDOW_US, camera(), ahead(1.0), SIGMA_RAD_S, GroundState())
+        assert (found.outcome, found.motion) == ("few events", None)
+
+
+def test_a_camera_that_pitches_is_not_refined_until_it_has_been_calm() -> None:
+    truth = ahead(1.0)
+    pitching = truth + np.array([0.0, 0, 0, 0.4, 0, 0])
+    state, outcomes = GroundState(), []
+    for number, known in enumerate([truth, pitching, *[truth] * 5]):
+        start_us = number * WINDOW_US
+        found = refine(seen(truth, start_us), start_us, start_us + WINDOW_US, camera(), known, SIGMA_RAD_S, state)
+        state = found.state
+        outcomes.append(found.outcome)
+    assert outcomes == ["accepted", *["tilting"] * 4, "accepted", "accepted"]
+
+
+def test_an_answer_is_accepted_exactly_where_it_is_not_too_far_from_what_is_known() -> None:
+    for known, accepted in ((ahead(2.0), True), (ahead(2.0) + np.array([2.0, 0, 0, 0, 0, 0]), False)):
+        found = answer(ahead(2.0), known)
+        assert found.motion is not None
+        assert (found.outcome == "accepted", found.motion.distance < MAX_SIGMAS) == (accepted, accepted)
+
+
+def test_a_gap_discards_older_events_and_the_same_windows_give_the_same_answer() -> None:
+    truth = ahead(1.0)
+    first = refine(seen(truth, 0), 0, WINDOW_US, camera(), truth, SIGMA_RAD_S, GroundState())
+    later = 10 * WINDOW_US
+    after = refine(seen(truth, 0), later, later + WINDOW_US, camera(), truth, SIGMA_RAD_S, first.state)
+    assert len(after.state.recent) == 1
+    again, same = answer(truth, ahead(1.3)), answer(truth, ahead(1.3))
+    assert again.motion is not None
+    assert same.motion is not None
+    np.testing.assert_array_equal(again.motion.twist, same.motion.twist)
+    np.testing.assert_array_equal(again.motion.covariance, same.motion.covariance)
+
+
+def test_more_events_make_the_answer_more_certain() -> None:
+    sigmas = []
+    for points in (50, 400):
+        motion = answer(ahead(1.0), ahead(1.2), points=points).motion
+        assert motion is not None
+        assert np.linalg.eigvalsh(motion.covariance).min() > 0
+        sigmas.append(float(np.sqrt(np.trace(motion.covariance[:3, :3]))))
+    assert sigmas[1] < sigmas[0]
+
+
+@pytest.fixture
+def rays() -> tuple[kernels.Rays, kernels.Image]:
+    image = image_of(camera(), PITCH)
+    events = on_ground([seen(ahead(1.0), k * WINDOW_US) for k in range(4)], PITCH)
+    return rays_of(events, SPAN_US // 2, PITCH, image), image
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_compiled_sharpness_equals_the_reference(seed: int, rays: tuple[kernels.Rays, kernels.Image]) -> None:
+    motion = np.random.default_rng(seed).normal(size=7) * [0.3, 0.3, 2, 0.2, 0.4, 0.2, 0.03]
+    value, _ = kernels.sharpness(rays[0], motion, rays[1])
+    assert value == pytest.approx(kernels.sharpness_reference(rays[0], motion, rays[1]), rel=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_gradient_is_that_of_the_objective(seed: int, rays: tuple[kernels.Rays, kernels.Image]) -> None:
+    rng = np.random.default_rng(seed)
+    mean, sigma = np.array([0.0, 0, 1, 0, 0.1, 0, 0]), np.array([0.3, 0.1, 0.8, 0.1, 0.1, 0.1, 0.05])
+    prior = Prior(mean, sigma, 0.02, PITCH)
+    z, along = rng.normal(size=7), rng.normal(size=7)
+    _, gradient = objective(z, rays[0], rays[1], prior)
+    # bilinear weights have kinks, so the difference is a mean over a small stretch
+    slopes = [objective(z + s * along, rays[0], rays[1], prior)[1] @ along for s in np.linspace(0, 0.02, 21)]
+    rise = objective(z + 0.02 * along, rays[0], rays[1], prior)[0] - objective(z, rays[0], rays[1], prior)[0]
+    assert rise / 0.02 == pytest.approx(np.mean(slopes), rel=0.02, abs=2e-3)
+    assert np.isfinite(gradient).all()
+
+
+def test_compiled_crowding_equals_the_reference(rays: tuple[kernels.Rays, kernels.Image]) -> None:
+    x, y, image = rays[0].x, rays[0].y, rays[1]
+    np.testing.assert_array_equal(kernels.crowding(x, y, image, 2), kernels.crowding_reference(x, y, image, 2))
