@@ -48,10 +48,10 @@ MAX_SHIFT: Final = 0.1
 MAX_SIGMAS: Final = 5.0
 """Of the network's covariance, with the floor _NETWORK_FLOOR."""
 
-MAX_SPEED: Final = 1.0
+MAX_SPEED: Final = 0.3
 """Largest linear velocity over the height of the camera [1/s], where it is above _CERTAIN times its sigma."""
 
-_CERTAIN: Final = 2.0
+_CERTAIN: Final = 1.0
 _NETWORK_SCALE: Final = (
     1.2  # of the network's sigma in the prior: its errors have heavier tails than a normal distribution
 )
