@@ -15,7 +15,7 @@ import copy
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -30,7 +30,8 @@ from neurove_core.models.bounds import UNSET, Bounds
 from neurove_core.models.bundle import PER_HEIGHT, Bundle
 from neurove_core.models.uncertainty import LEVEL, LEVELS, Uncertainty, half_width
 from neurove_core.networks.encoding import to_spikes
-from neurove_core.networks.neurove import NeuroVE
+from neurove_core.networks.neurove import NetworkState, NeuroVE
+from neurove_core.timescales import Answer, Longer, chosen, followed, jobs, slowed
 from neurove_core.training.batches import mirrored, with_gain, with_noise
 from neurove_core.training.config import DataConfig, TrainingConfig
 from neurove_core.training.data import Cache, Sequences
@@ -225,8 +226,8 @@ def collect_errors(bundle: Bundle, parts: list[tuple[Sequences, bool]]) -> Itera
             rng = np.random.default_rng((203, number))
             counts, twists = found.counts(index, 0, len(found.twists[index])), found.twists[index]
             variants = variants_of(rng, counts, twists)
-            seen = np.stack([network_input(seen, bundle.config) for seen, _ in variants], 1)
-            spikes = to_spikes(torch.from_numpy(seen), bundle.config.network.encoding)
+            counted = np.stack([network_input(seen, bundle.config) for seen, _ in variants], 1)
+            spikes = to_spikes(torch.from_numpy(counted), bundle.config.network.encoding)
             state, inputs, outputs = probe.initial_state(len(variants)), [], []
             for step in range(len(counts)):
                 output, state = engine(spikes[step : step + 1], state)
@@ -236,9 +237,41 @@ def collect_errors(bundle: Bundle, parts: list[tuple[Sequences, bool]]) -> Itera
                 outputs.append(output[0].double().numpy())
             truth = np.stack([true for _, true in variants], 1)
             error = np.stack(outputs) - (truth - bundle.offset.double().numpy()) / bundle.scale.double().numpy()
-            for stream, variant in enumerate(VARIANTS):
-                yield SequenceErrors(np.stack(inputs)[:, stream], error[:, stream], number, variant, hard)
+            for stream, (variant, (windows, true)) in enumerate(zip(VARIANTS, variants, strict=True)):
+                seen, off = np.stack(inputs)[:, stream], error[:, stream]
+                if bundle.config.scales:
+                    seen, off = _served(bundle, probe, engine, windows, true)
+                yield SequenceErrors(seen, off, number, variant, hard)
             number += 1
+
+
+def _served(
+    bundle: Bundle, probe: NeuroVE, engine: Engine, stored: NDArray[np.uint8], truth: NDArray[np.float32]
+) -> tuple[Array, Array]:
+    """Inputs of the spread and errors of a model with longer windows, of the answers that it would serve.
+
+    The error of an answer counts times its scale, because its sigma is divided by the scale.
+    """
+    config, offset, scale = bundle.config, bundle.offset.double().numpy(), bundle.scale.double().numpy()
+
+    def run(counts: NDArray[np.uint8], state: NetworkState) -> tuple[Array, NetworkState]:
+        output, after = engine(to_spikes(torch.from_numpy(counts)[None, None], config.network.encoding), state)
+        return output[0, 0].double().numpy() * scale + offset, after
+
+    state = probe.initial_state()
+    longer, inputs, errors = Longer(), [], []
+    for window, true in zip(network_input(stored, config), truth, strict=True):
+        twists, state = run(window, state)
+        wanted, longer = jobs(window, longer, probe, config)
+        done = [(job, *run(job.counts, cast("NetworkState", job.state))) for job in wanted]
+        longer = followed(longer, [(job, after) for job, _, after in done], config)
+        answers = [Answer(twists, state), *(Answer(slowed(t, job.scale), s, job.scale) for job, t, s in done)]
+        best = chosen(answers, longer.windows, config.scale_bounds)
+        potential = probe.log_sigma(cast("NetworkState", best.network))
+        assert potential is not None  # the probe has a spread
+        inputs.append(potential[0].double().numpy())
+        errors.append((best.twists - true) * best.scale / scale)
+    return np.stack(inputs), np.stack(errors)
 
 
 def variants_of(
