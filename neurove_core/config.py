@@ -148,6 +148,26 @@ class ModelConfig(Config):
         description="The same for events per pixel that the model sees; a stationary sensor has 0.02 to 0.12.",
     )
 
+    scales: Annotated[tuple[int, ...], Field(max_length=4)] = Field(
+        (), description="Longer windows that the network runs on too, in windows, such as 2, 4, 8; see timescales."
+    )
+    scale_bounds: tuple[float, float] = Field(
+        (4.0, 0.5),
+        description="Greatest linear (model's unit) and angular [rad/s] speed, times the scale, of a longer window.",
+    )
+
+    LATER = ("scales", "scale_bounds")
+
+    @model_validator(mode="after")
+    def _scales_rise(self) -> Self:
+        if list(self.scales) != sorted(set(self.scales)) or not all(2 <= one <= MAX_HISTORY for one in self.scales):
+            raise ValueError(f"scales={self.scales}: must rise, from at least 2 to at most {MAX_HISTORY}")
+        if not min(self.scale_bounds) > 0:
+            raise ValueError(f"scale_bounds={self.scale_bounds}: both must be above 0")
+        if self.scales and self.network.history:
+            raise ValueError(f"scales={self.scales}: a model with network.history={self.network.history} has none")
+        return self
+
     @property
     def window_shape(self) -> tuple[int, int, int]:
         """Shape (C, H, W) of a window's counts; C = 2n * parts, see `ingest.windows.Window`."""

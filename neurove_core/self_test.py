@@ -1,15 +1,19 @@
 """Self-test of a model: run its golden windows through the estimator on this machine and compare the estimates."""
 
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from neurove_core.config import ModelConfig
 from neurove_core.estimator import Estimator
+from neurove_core.models.bundle import Bundle, from_bytes
 from neurove_core.models.golden import TOLERANCE, Golden
 from neurove_protocol import Events, Sensor
-from neurove_protocol.errors import BadModel
+from neurove_protocol.errors import BadModel, InvalidField
+from neurove_protocol.fields import WrongField
 
 _INT8_GREW: Final = "; an int8 model made before the projection was in int8 too may give other estimates (decision 38)"
 
@@ -53,6 +57,28 @@ def record(estimator: Estimator, counts: NDArray[np.uint8], tolerance: float = T
         tolerance: see `Golden`.
     """
     return Golden(counts, answers(estimator, counts).astype(np.float32), tolerance)
+
+
+def with_scales(model: Bundle, scales: tuple[int, ...], bounds: tuple[float, float]) -> Bundle:
+    """A model that also runs on longer windows, with a new golden test if it has one; see `timescales`.
+
+    Args:
+        model: of any kind without a history; its weights and its uncertainty stay the same.
+        scales: `scales` of ModelConfig.
+        bounds: `scale_bounds` of ModelConfig.
+
+    Raises:
+        InvalidField: a value is wrong; the error names it.
+    """
+    try:
+        config = ModelConfig.model_validate(model.config.model_dump() | {"scales": scales, "scale_bounds": bounds})
+    except ValidationError as error:
+        wrong = WrongField.of(error)
+        raise InvalidField("model", wrong.name or "scales", wrong.value, wrong.why) from None
+    made = from_bytes(replace(model, config=config, golden=None).to_bytes(), model.name)
+    if model.golden is not None:
+        made = replace(made, golden=record(Estimator(made), model.golden.counts, model.golden.tolerance))
+    return made.with_digest()
 
 
 def answers(estimator: Estimator, counts: NDArray[np.uint8]) -> NDArray[np.float64]:

@@ -23,15 +23,16 @@ from neurove_core.models.bundle import PER_HEIGHT, Bundle
 from neurove_core.models.metadata import Metadata
 from neurove_core.networks import kinds
 from neurove_core.networks.kinds import Network
+from neurove_core.networks.neurove import NeuroVE
 from neurove_core.training.config import RecipeConfig, TrainingConfig
 from neurove_core.training.data import Sequences
+from neurove_core.training.growing import grown, narrowed
 from neurove_core.training.loss import Balance
 from neurove_core.training.ranks import ALONE, Ranks, share_norms
 from neurove_protocol.errors import BadModel, InvalidField
 from neurove_protocol.fields import WrongField
 
 _KEY = "neurove_run"
-_FIRST = "blocks.0.conv.weight"  # of a NeuroVE
 _SYMMETRIC = [0, 4, 5]  # vx wy wz: their mean is 0, because half of the segments are mirrored
 
 
@@ -217,45 +218,14 @@ def check_start(start: Bundle, config: TrainingConfig) -> None:
     """Refuse a start model whose weights do not fit the network of the configuration.
 
     The surrogate gradient and the precision of the weights may differ, because they do not change the weights' meaning.
-    A NeuroVE may begin from one without subcells or without a history; see `wider_input`.
+    A NeuroVE may begin from a smaller one; see `growing.narrowed`.
 
     Raises:
         BadModel: a field differs; the error has both values.
     """
     if start.linear_unit != PER_HEIGHT:
         raise BadModel(start.name, f"linear_unit={start.linear_unit!r}: training can start only from {PER_HEIGHT!r}")
-    check_same_network(start, _narrowed(config.model, start.config))
-
-
-def _narrowed(wanted: ModelConfig, had: ModelConfig) -> ModelConfig:
-    """The wanted configuration with the channels of a model that it may begin from."""
-    if wanted.kind != "neurove":
-        return wanted
-    grid, network = wanted.canonical, wanted.network
-    if had.canonical.subcells == 1:
-        grid = grid.model_copy(update={"subcells": 1})
-    if not had.network.history:
-        network = network.model_copy(update={"history": ()})
-    return wanted.model_copy(update={"canonical": grid, "network": network})
-
-
-def wider_input(weight: Tensor, had: ModelConfig, wanted: ModelConfig) -> Tensor:
-    """Weights of the first convolution for an input with more channels: those of a model without them, continued.
-
-    Each part of a cell gets the weights of the cell, and the history gets zeros. With one event per cell the network
-    computes what it did; with several, the parts count a little more than their sum, because log1p is concave.
-
-    Args:
-        weight: (C', C, 3, 3), C that of `had.input_shape`.
-        had: configuration of these weights.
-        wanted: configuration with the same or more channels.
-
-    Returns:
-        (C', C, 3, 3), C that of `wanted.input_shape`.
-    """
-    found = weight.repeat_interleave(wanted.canonical.parts // had.canonical.parts, dim=1)
-    missing = wanted.input_shape[0] - found.shape[1]
-    return torch.cat([found, found.new_zeros(len(found), missing, *found.shape[2:])], dim=1)
+    check_same_network(start, narrowed(config.model, start.config))
 
 
 def check_same_network(model: Bundle, config: ModelConfig) -> None:
@@ -273,8 +243,8 @@ def check_same_network(model: Bundle, config: ModelConfig) -> None:
 def _copy_weights(network: Network, start: Bundle) -> None:
     """Copy the weights and norms of a model into a network, without its uncertainty, which is fitted again later."""
     weights = {name: one for name, one in start.network.state_dict().items() if not name.startswith("spread.")}
-    if _FIRST in weights:
-        weights[_FIRST] = wider_input(weights[_FIRST], start.config, network.config)
+    if isinstance(network, NeuroVE):
+        weights = grown(weights, start.config, network)
     network.load_state_dict(weights)
 
 

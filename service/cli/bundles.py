@@ -1,4 +1,4 @@
-"""The command bundle, which needs no service: new, average, inspect, keygen, sign, verify.
+"""The command bundle, which needs no service: new, average, scale, inspect, keygen, sign, verify.
 
 Exit codes: 0 fine; 1 the bundle or its signature is not valid; 2 wrong usage, such as a missing file.
 """
@@ -73,6 +73,30 @@ def average(args: argparse.Namespace) -> int:
         print(json.dumps({"ok": True, "bundle": str(path), "digest": made.digest}))
     else:
         print(f"{path}: {made.name}, {made.digest[:12]}, not calibrated: neurove calibrate {path} --config CONFIG")
+    return 0
+
+
+@_checking
+def scale(args: argparse.Namespace) -> int:
+    """Write a bundle that also runs on longer windows, for slow motion; its weights stay the same."""
+    from neurove_core import self_test
+    from neurove_core.models import bundle
+
+    path: Path = args.out
+    if path.suffix != bundle.SUFFIX:
+        raise InvalidField("bundle scale", "--out", str(path), f"its name must end in {bundle.SUFFIX}")
+    refuse_existing("bundle scale", "--out", path, None, force=args.force)
+    given = bundle.from_bytes(_bundle(args.file), args.file.name)
+    bounds = tuple(args.bounds or given.config.scale_bounds)
+    made = self_test.with_scales(given, tuple(args.scales), (bounds[0], bounds[1]))
+    try:
+        bundle.save(made, path)
+    except OSError as error:
+        raise InvalidField("bundle scale", "--out", str(path), error.strerror or str(error)) from None
+    if args.json:
+        print(json.dumps({"ok": True, "bundle": str(path), "digest": made.digest}))
+    else:
+        print(f"{path}: {made.name}, {made.digest[:12]}, scales {' '.join(map(str, args.scales)) or 'none'}")
     return 0
 
 
@@ -231,6 +255,14 @@ def add_bundle(parser: Parser) -> None:
     _add_trust(one, default=[])
     one = subcommand(commands, "average", average)
     one.add_argument("files", type=Path, nargs="+", metavar="BUNDLE", help="2 to 8 bundles of one network")
+    one.add_argument("--out", type=Path, required=True, metavar="FILE", help="bundle to write")
+    add_force(one, "FILE")
+    one = subcommand(commands, "scale", scale)
+    one.add_argument("file", type=Path, metavar="BUNDLE", help="trained bundle")
+    about = "longer windows, in windows, rising, such as 2 4 8; none: one window only"
+    one.add_argument("--scales", type=int, nargs="*", required=True, metavar="N", help=about)
+    about = "greatest linear (1/s for a model per height, else m/s) and angular [rad/s] speed, times the scale"
+    one.add_argument("--bounds", type=float, nargs=2, metavar=("V", "W"), help=f"{about}; default: those of the bundle")
     one.add_argument("--out", type=Path, required=True, metavar="FILE", help="bundle to write")
     add_force(one, "FILE")
     one = subcommand(commands, "sign", sign)

@@ -258,6 +258,14 @@ class StreamWorker:
         if self._overload.must_shed(now_ns - self._pending[0].received_ns, now_ns):
             self._take(0)
             self._shed()
+            answered = self.stream.counters.estimates
+            while self._pending and self.stream.counters.estimates == answered:
+                self._work_some(now_ns, outlet)  # a whole window: until the next turn the rest of it would be too old
+        else:
+            self._work_some(now_ns, outlet)
+
+    def _work_some(self, now_ns: int, outlet: Outlet) -> None:
+        """Process the oldest samples: a run of small packets, or one."""
         if len(self._pending) == 1 or not self._work_run(now_ns, outlet):
             self._work(self._pending.popleft(), now_ns, outlet)
 

@@ -2,7 +2,8 @@
 
 A node on one core serves so many streams of 50 windows/s that the core would have to be `load` times as fast. The run
 prints the share of windows that were answered with all of their events, that share times the load (1 would be what the
-core can serve), and how old the estimates are.
+core can serve), the share of the service's processor time that went into these windows (the machine may be shared), and
+how old the estimates are.
 """
 
 import argparse
@@ -44,6 +45,12 @@ def window_ms(model: bundle.Bundle) -> float:
     return min(took)
 
 
+def processor_s(pid: int) -> float:
+    """Processor time that a process has used [s]."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 def run(load: float, seconds: float) -> str:
     """Serve at this load; return one line of figures."""
     model = bundle.untrained(1, CONFIG, "large")
@@ -63,15 +70,18 @@ def run(load: float, seconds: float) -> str:
         stack.enter_context(cameras(endpoint, names))
         wait_until(lambda: all(heard.count(name) > 3 for name in names), 120)
         time.sleep(5)
-        before = {name: heard.count(name) for name in names}
+        before, used_s = {name: heard.count(name) for name in names}, processor_s(process.child.pid)
         time.sleep(seconds)
+        used_s = processor_s(process.child.pid) - used_s
         found = [one for name in names for one in heard.of(name)[before[name] :]]
     clean = [one for one in found if not CLEAN.intersection(one.flags)]
     share = len(clean) / (streams * seconds * 1e6 / WINDOW_US)
     ages_ms = [one.host.age_ns / 1e6 for one in found if one.host is not None] or [math.inf]
     return (
         f"load {load:g} ({streams} streams, {cost_ms:.1f} ms a window): clean {100 * share:.0f} % of the windows, "
-        f"{share * load:.2f} of what one core serves; {len(found) - len(clean)} estimates with a gap; "
+        f"{share * load:.2f} of what one core serves, "
+        f"{len(clean) * cost_ms / 1e3 / used_s:.2f} of the service's processor time; "
+        f"{len(found) - len(clean)} estimates with a gap; "
         f"age p50 {np.percentile(ages_ms, 50):.0f} ms, p99 {np.percentile(ages_ms, 99):.0f} ms"
     )
 

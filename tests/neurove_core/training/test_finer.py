@@ -139,24 +139,38 @@ def test_the_same_seed_draws_the_same_robot_or_rocking_drive(index):
     assert np.array_equal(first.trajectory.twist(at), again.trajectory.twist(at))
 
 
-def test_a_run_begins_from_a_model_without_parts_and_history(folder):
-    plain = FINE.model.model_copy(
+@pytest.mark.parametrize("channels", [(4, 8), (7, 8)], ids=["as wide", "wider"])
+def test_a_run_begins_from_a_smaller_model_and_computes_what_it_did(folder, channels):
+    small = FINE.model.model_copy(
         update={
             "canonical": GRID.model_copy(update={"subcells": 1}),
             "network": NETWORK.model_copy(update={"history": ()}),
         }
     )
-    start = bundle.untrained(4, plain)
-    start = replace(start, linear_unit=PER_HEIGHT)
-    run = TrainingRun.begin(FINE, data.Cache(folder, FINE).open(), start=start)
+    wanted = FINE.model.model_copy(update={"network": NETWORK.model_copy(update={"channels": channels})})
+    start = replace(bundle.untrained(4, small), linear_unit=PER_HEIGHT)
+    run = TrainingRun.begin(FINE.model_copy(update={"model": wanted}), data.Cache(folder, FINE).open(), start=start)
     fine = np.zeros((6, 10, 16, 22), np.uint8)  # one event at most in a cell, in any of its quarters
     fine[:, :, ::2, 1::2] = np.random.default_rng(0).uniform(size=(6, 10, 8, 11)) < 0.3
     answers = [
         network.eval()(torch.from_numpy(network_input(fine, config)).float().log1p()[:, None], network.initial_state())
-        for network, config in ((run.network, FINE.model), (start.network, plain))
+        for network, config in ((run.network, wanted), (start.network, small))
     ]
     torch.testing.assert_close(answers[0][0], answers[1][0])
     assert answers[0][0].std() > 0
+    if channels != small.network.channels:  # in training, where norms see the batch, the new neurons fire
+        network = run.network.train()
+        _, state = network(
+            torch.from_numpy(network_input(fine, wanted)).float().log1p()[:, None], network.initial_state()
+        )
+        assert (state.membranes[0].v[:, 4:] == 0).any()
+
+
+def test_a_run_does_not_begin_from_a_wider_model(folder):
+    other = FINE.model.model_copy(update={"network": NETWORK.model_copy(update={"channels": (5, 8)})})
+    start = replace(bundle.untrained(4, other), linear_unit=PER_HEIGHT)
+    with pytest.raises(BadModel, match=r"network.channels=\(5, 8\), the configuration has \(4, 8\)"):
+        TrainingRun.begin(FINE, data.Cache(folder, FINE).open(), start=start)
 
 
 def test_a_run_does_not_begin_from_another_history(folder):

@@ -285,3 +285,23 @@ def test_average_writes_a_bundle_and_says_that_it_is_not_calibrated(run, tmp_pat
     assert (code, "--force replaces it" in err) == (2, True)
     code, out, _ = run("average", *files, "--out", tmp_path / "mean.safetensors", "--json", "--force")
     assert (code, json.loads(out)["ok"]) == (0, True)
+
+
+def test_scale_writes_a_bundle_with_longer_windows_and_the_same_weights(run, bundle_bytes, tmp_path):
+    (tmp_path / "night.safetensors").write_bytes(bundle_bytes)
+    code, out, _ = run("scale", "night.safetensors", "--scales", 2, 3, "--bounds", 3, 0.5, "--out", "s.safetensors")
+    assert code == 0
+    assert "scales 2 3" in out
+    made, before = bundle.load(tmp_path / "s.safetensors"), bundle.from_bytes(bundle_bytes, "x")
+    assert (made.config.scales, made.config.scale_bounds) == ((2, 3), (3.0, 0.5))
+    for name, tensor in before.network.state_dict().items():
+        assert torch.equal(made.network.state_dict()[name], tensor)
+    assert made.golden is not None
+    self_test.check(Estimator(made))
+    code, _, _ = run("scale", "s.safetensors", "--scales", "--bounds", 4, 0.5, "--out", "back.safetensors")
+    assert code == 0
+    assert bundle.load(tmp_path / "back.safetensors").digest == before.digest
+    code, _, err = run("scale", "night.safetensors", "--scales", 4, 2, "--out", "no.safetensors")
+    assert code == 2
+    assert "scales" in err
+    assert not (tmp_path / "no.safetensors").exists()

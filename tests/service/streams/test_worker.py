@@ -11,7 +11,9 @@ from neurove_protocol.events import PacketLimits, encode_packet
 from neurove_service.streams.intake import Arrival
 from neurove_service.streams.lanes import Lanes
 from neurove_service.streams.overload import Overload
+from neurove_service.streams.runs import SMALL_BYTES
 from neurove_service.streams.stream import Stream
+from neurove_service.streams.turns import Slots
 from neurove_service.streams.worker import Inbox, Outlet, Sample, StreamWorker
 from tests.builders import make_packet, make_packets
 from tests.live.conftest import wait_until
@@ -132,11 +134,11 @@ def test_malformed_packets_are_counted_and_lose_nothing_else(worker, published):
 def test_an_internal_error_on_a_packet_does_not_end_the_stream(worker, published, monkeypatch, caplog):
     push, planted = worker.stream.lanes.push, []
 
-    def faulty(packet):
+    def faulty(packet, **how):
         if packet.seq >= 20 and not planted:
             planted.append(packet)
             raise RuntimeError("planted")
-        return push(packet)
+        return push(packet, **how)
 
     monkeypatch.setattr(worker.stream.lanes, "push", faulty)
     for packet in make_packets(100):
@@ -258,8 +260,8 @@ class SlowModel:
     def __init__(self, stream, seconds):
         push = stream.lanes.push
 
-        def slow(packet):
-            pushing = push(packet)
+        def slow(packet, **how):
+            pushing = push(packet, **how)
             time.sleep(seconds * len(pushing.estimates))
             return pushing
 
@@ -287,6 +289,29 @@ def test_an_overloaded_worker_answers_whole_windows_of_the_newest_data(slot):
     answered = stream.counters.windows + stream.counters.shed_windows
     assert answered == published.estimates[-1].end_us // 50_000
     assert late[-1].trace.queued_ns - late[-1].trace.received_ns < 600e6
+
+
+def test_an_overloaded_worker_answers_a_window_at_each_of_its_turns(slot):
+    published, slots, turns = Published(), Slots(1), []
+    worker = StreamWorker(
+        Stream("cam0", slot, max_age_s=60), published.open, Inbox(0.5, 1 << 26), PacketLimits(), slots
+    )
+    packets = iter(make_packets(500, n=SMALL_BYTES, step_us=10_000))  # five in a window, none of them small
+    try:
+        while len(turns) < 15:  # between two turns of the worker other streams work for 0.3 s
+            with slots.serving:
+                began = time.monotonic()
+                while time.monotonic() < began + 0.3:
+                    put(worker, encode_packet(next(packets)))
+                    time.sleep(0.01)
+            turns.append(len(published.estimates))
+    finally:
+        worker.stop()
+        worker.join(5)
+    late = published.estimates[turns[7] :]
+    assert len(late) >= 5  # of eight turns
+    assert all(Flag.OVERLOAD in one.flags for one in late)
+    assert not any({Flag.GAP, Flag.RESET} & set(one.flags) for one in late)
 
 
 def test_a_stall_that_is_shorter_than_the_patience_loses_nothing():

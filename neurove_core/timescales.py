@@ -1,0 +1,121 @@
+"""Time scales: the same network on longer windows, for motion too slow to see in one.
+
+Events depend on changes of brightness, not on the time that these take. A stream in windows that are s times as long is
+therefore that of a camera that is s times as fast. The network runs again on the newest s windows, summed to n bins s
+times as long, and its twist is divided by s. This happens in every window, with s states in turn, each of which sees
+long windows that follow each other. The search begins at the shortest scale: while an estimate, sped up to the next
+scale, stays within `scale_bounds`, the next scale answers instead. A fast motion thus never reaches a scale at which it
+aliases.
+"""
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurove_core.config import ModelConfig
+from neurove_core.ingest.channels import Counts, add_saturating
+from neurove_core.networks.kinds import Network, State
+
+STEPS: Final = 3
+"""Long windows that a state must have seen before its scale answers."""
+
+
+class Longer(NamedTuple):
+    """What a stream carries for its longer windows."""
+
+    windows: int = 0  # since it began
+    recent: tuple[Counts, ...] = ()  # the newest windows before the next one, the newest first
+    states: tuple[
+        tuple[State, ...], ...
+    ] = ()  # of each scale, one for each of its turns; empty before the first window
+
+
+class Answer(NamedTuple):
+    """Twists and next state of a network for one window."""
+
+    twists: NDArray[np.float64]  # (n, 6), in the model's linear unit and rad/s
+    network: State
+    scale: int = 1  # windows that it is from
+
+
+class Job(NamedTuple):
+    """One run of the network."""
+
+    counts: Counts
+    state: State
+    scale: int
+    turn: int  # which state of its scale
+
+
+def jobs(window: Counts, longer: Longer, network: Network, config: ModelConfig) -> tuple[list[Job], Longer]:
+    """The runs that a new window of a stream asks for, and the stream's state with that window.
+
+    Args:
+        window: (2n * parts, H, W), the newest.
+        longer: state of the stream.
+        network: of the model.
+        config: of the model.
+    """
+    scales = config.scales
+    states = longer.states or tuple(tuple(network.initial_state() for _ in range(scale)) for scale in scales)
+    seen = (window, *longer.recent)
+    wanted = [
+        Job(merged(seen[:scale], config), states[at][longer.windows % scale], scale, longer.windows % scale)
+        for at, scale in enumerate(scales)
+        if len(seen) >= scale
+    ]
+    return wanted, Longer(longer.windows + 1, seen[: max(scales) - 1], states)
+
+
+def merged(newest: Sequence[Counts], config: ModelConfig) -> Counts:
+    """The counts of consecutive windows as those of one window that lasts as long as all of them.
+
+    Args:
+        newest: s windows (2n * parts, H, W), the newest first.
+        config: of the model.
+
+    Returns:
+        (2n * parts, H, W), saturating at 255.
+    """
+    bins, scale = config.window.bins, len(newest)
+    found = np.zeros(config.window_shape, np.uint8)
+    into = found.reshape(bins, -1)
+    for number, window in enumerate(reversed(newest)):
+        for at, one in enumerate(window.reshape(bins, -1)):
+            add_saturating(into[(number * bins + at) // scale], one)
+    return found
+
+
+def followed(longer: Longer, done: Sequence[tuple[Job, State]], config: ModelConfig) -> Longer:
+    """The state of a stream after its jobs."""
+    states = [list(turns) for turns in longer.states]
+    for job, state in done:
+        states[config.scales.index(job.scale)][job.turn] = state
+    return longer._replace(states=tuple(tuple(turns) for turns in states))
+
+
+def slowed(twists: NDArray[np.float64], scale: int) -> NDArray[np.float64]:
+    """Twists (n, 6) of the newest window from those of a long window: the mean of its share of the bins, over scale."""
+    bins = len(twists)
+    newest = twists[bins - max(1, bins // scale) :].mean(axis=0) / scale
+    return np.tile(newest, (bins, 1))
+
+
+def chosen(answers: Sequence[Answer], windows: int, bounds: tuple[float, float]) -> Answer:
+    """The answer of the longest scale that the motion allows.
+
+    Args:
+        answers: by scale, the shortest first.
+        windows: that the stream's longer windows have seen.
+        bounds: greatest linear and angular speed of a sped-up estimate.
+    """
+    best = answers[0]
+    for answer in answers[1:]:
+        mean = best.twists.mean(axis=0) * answer.scale
+        within = all(np.linalg.norm(part) <= bound for part, bound in zip((mean[:3], mean[3:]), bounds, strict=True))
+        if windows < STEPS * answer.scale or not within:
+            break
+        best = answer
+    return best
