@@ -21,9 +21,11 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from neurove_core.ingest.sample import Sample
 from neurove_core.refine import ground_kernels as kernels
 from neurove_core.refine.ground_kernels import Image, Rays
 from neurove_core.refine.ground_search import Prior, climb, curvature, motion_of, objective
+from neurove_core.refine.view import View
 from neurove_protocol import CameraInfo
 
 Array = NDArray[np.float64]
@@ -117,6 +119,20 @@ class Answer(NamedTuple):
     outcome: Outcome
     motion: GroundMotion | None  # also where it is not accepted, but for "few events" and "tilting"
     state: GroundState
+
+
+def events_of(view: View, sample: Sample, start_us: int) -> GroundEvents:
+    """The events of a window that begins at `start_us`, without those outside the lens model."""
+    x, y = view.rays[:, sample.y, sample.x]
+    kept = np.isfinite(x) & np.isfinite(y)
+    return GroundEvents(x[kept], y[kept], start_us + sample.t_us[kept].astype(np.int64))
+
+
+def compile_kernels(camera: CameraInfo) -> None:
+    """Run all compiled code once, on made-up events."""
+    x, y = (np.linspace(low, 0.4, LEAST_EVENTS, dtype=np.float32) for low in (-0.2, 0.2))
+    events = GroundEvents(x, y, np.arange(LEAST_EVENTS, dtype=np.int64))
+    refine(events, 0, SPAN_US, camera, np.zeros(6), np.full(3, 0.1), GroundState())
 
 
 def refine(
