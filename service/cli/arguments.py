@@ -146,6 +146,17 @@ def metres(text: str) -> float:
     return value
 
 
+def numbers(text: str) -> tuple[float, float, float]:
+    """Three numbers with commas between."""
+    try:
+        first, second, third = (float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r}: give three numbers, such as 0,10,0") from None
+    if not all(map(math.isfinite, (first, second, third))):
+        raise argparse.ArgumentTypeError(f"{text!r}: give finite numbers")
+    return first, second, third
+
+
 def sigma(text: str) -> float:
     """A standard deviation above 0."""
     try:

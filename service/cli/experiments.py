@@ -45,6 +45,31 @@ def reproduce_repriming(args: argparse.Namespace) -> int:
     return 0 if report.least_primed is not None else EXIT_FAILURE
 
 
+def reproduce_sight(args: argparse.Namespace) -> int:
+    """Shuffle, reverse and speed up the times of the events, to learn what a model sees."""
+    import torch
+
+    from neurove_core import models
+    from neurove_core.estimator import Estimator
+    from neurove_core.experiments import real, sight
+
+    if args.recordings and not args.recordings.is_dir():
+        raise InvalidField("reproduce", "--recordings", str(args.recordings), "it is not a folder")
+    _check_out(args.out)
+    torch.set_num_threads(1)
+    estimator = Estimator(models.find(args.model))
+    rows = []
+    for row in sight.run(estimator, args.recordings, quick=args.quick):
+        rows.append(row)
+        print(row["case"], file=sys.stderr)
+    about = {"model": estimator.bundle.info.model_dump()} | _made_by() | {"quick": args.quick}
+    results = about | {"sentence": sight.sentence(rows), "cases": rows}
+    print(json.dumps(results) + "\n" if args.json else sight.markdown(rows, real.title(about)), end="")
+    for file in sight.save(rows, about, args.out) if args.out else []:
+        print(f"wrote {file}", file=sys.stderr)
+    return 0
+
+
 def reproduce_sine(args: argparse.Namespace) -> int:
     """Repeat Tables I and II: regression and forecast of a sine by ASLSTM, ASLSTM-w/o, SLSTM and LTC."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -93,6 +118,30 @@ def reproduce_real(args: argparse.Namespace) -> int:
     why = "has none of the recordings that can be read" if args.recordings.is_dir() else "is not a folder"
     print(f"neurove: every check was skipped: {args.recordings} {why}", file=sys.stderr)
     return EXIT_FAILURE
+
+
+def reproduce_motion(args: argparse.Namespace) -> int:
+    """Evaluate a model on slow and fast drives, constant motion, rooms and real events, against what is asked of it."""
+    import torch
+
+    from neurove_core import models
+    from neurove_core.estimator import Estimator
+    from neurove_core.experiments.motion import run, sets
+
+    groups = args.sets.split(",") if args.sets else (*sets.GROUPS, sets.REAL)
+    if args.recordings and not args.recordings.is_dir():
+        raise InvalidField("reproduce", "--recordings", str(args.recordings), "it is not a folder")
+    for folder in (args.out, args.data):
+        _check_out(folder)
+    torch.set_num_threads(1)
+    estimator = Estimator(models.find(args.model))
+    with progress() as show:
+        found = run.run(estimator, groups, args.recordings, args.data, show, quick=args.quick)
+    results = {"model": estimator.bundle.info.model_dump()} | _made_by() | {"quick": args.quick} | found
+    print(json.dumps(results) + "\n" if args.json else run.markdown(results), end="")
+    for file in run.save(results, args.out) if args.out else []:
+        print(f"wrote {file}", file=sys.stderr)
+    return 0
 
 
 def _real_rows(model: str, recordings: Path, out: Path | None) -> tuple[list[dict[str, Any]], dict[str, Any]]:
@@ -184,7 +233,9 @@ def add_reproduce(parser: Parser) -> None:
     """Add the commands of `neurove reproduce`."""
     commands = parser.add_commands()
     _add_firing(subcommand(commands, "firing", reproduce_firing))
+    _add_motion(subcommand(commands, "motion", reproduce_motion))
     _add_repriming(subcommand(commands, "repriming", reproduce_repriming))
+    _add_sight(subcommand(commands, "sight", reproduce_sight))
     _add_sine(subcommand(commands, "sine", reproduce_sine))
     _add_real(subcommand(commands, "real", reproduce_real))
     _add_velocity(subcommand(commands, "velocity", reproduce_velocity))
@@ -195,6 +246,20 @@ def _add_firing(parser: argparse.ArgumentParser) -> None:
     _add_out(parser, "folder for table and figure (PNG, SVG)")
 
 
+def _add_motion(parser: argparse.ArgumentParser) -> None:
+    about = "file of a bundle, or the name of a built-in model; default `default`"
+    parser.add_argument("model", nargs="?", default="default", metavar="BUNDLE", help=about)
+    about = "folder of real recordings and trajectories; without it their rows are skipped"
+    parser.add_argument("--recordings", type=Path, metavar="DIR", help=about)
+    about = "folder that keeps the simulated events, about 3 GB for all sets; default runs/motion"
+    parser.add_argument("--data", type=Path, default=Path("runs/motion"), metavar="DIR", help=about)
+    about = "sets to evaluate, separated by commas; default: all"
+    parser.add_argument("--sets", metavar="SET,...", help=about)
+    about = "one second of one recording per set through a tiny camera, to check that the command works"
+    parser.add_argument("--quick", action="store_true", help=about)
+    _add_out(parser, "folder for motion.json and motion.md")
+
+
 def _add_repriming(parser: argparse.ArgumentParser) -> None:
     about = "name of a built-in model, or file of a bundle; default `default`"
     parser.add_argument("--model", default="default", metavar="BUNDLE", help=about)
@@ -202,6 +267,16 @@ def _add_repriming(parser: argparse.ArgumentParser) -> None:
     about = "numbers of windows to replay; default 8,16,32,64"
     parser.add_argument("--primed", type=_numbers, metavar="N,...", help=about)
     _add_out(parser, "folder for table, figures and picture")
+
+
+def _add_sight(parser: argparse.ArgumentParser) -> None:
+    about = "file of a bundle, or the name of a built-in model; default `default`"
+    parser.add_argument("model", nargs="?", default="default", metavar="BUNDLE", help=about)
+    about = "folder of the real recordings; without it only simulated drives are used"
+    parser.add_argument("--recordings", type=Path, metavar="DIR", help=about)
+    about = "two short drives through a small camera: a minute less, and figures that vary more"
+    parser.add_argument("--quick", action="store_true", help=about)
+    _add_out(parser, "folder for sight.json, sight.md and the figure (PNG, SVG)")
 
 
 def _add_sine(parser: argparse.ArgumentParser) -> None:
