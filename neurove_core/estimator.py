@@ -24,6 +24,8 @@ from neurove_core.models.bundle import PER_HEIGHT, Bundle, LinearUnit
 from neurove_core.networks.kinds import State
 from neurove_core.networks.neurove import NetworkState, NeuroVE
 from neurove_core.networks.runner import Runner
+from neurove_core.refine import ground
+from neurove_core.refine.ground import GroundState
 from neurove_core.refine.rotation import Filter, Given, Rate, refine
 from neurove_core.refine.search import compile_kernels
 from neurove_core.refine.view import View
@@ -49,6 +51,7 @@ class StreamState(NamedTuple):
     low_activity_below: float = 0.0  # a window with fewer visible events is flagged low_activity
     view: View | None = None  # for the refinement; None where estimates are not refined
     filter: Filter | None = None  # of the refinement
+    ground: GroundState = GroundState()  # of the refinement of the linear part
     recent: Recent = ()  # counts of earlier windows, for models with a history
     longer: Longer = Longer()  # for models with longer windows
 
@@ -113,7 +116,7 @@ class Estimator:
         bundle: the model; its network is put into evaluation mode.
         runner: runs the network; by default the fastest one. `PlainRunner(bundle.network)` runs the network itself.
         bounds: absolute bounds of sigma for `uncertain`; they take precedence over those of the bundle.
-        refine: whether to refine the angular part of estimates by the events, see `refine.rotation`. It needs the
+        refine: whether to refine estimates by the events, see `refine.rotation` and `refine.ground`. It needs the
             CameraInfo of a stream and a bundle with an uncertainty that does not refuse it.
     """
 
@@ -205,7 +208,7 @@ class Estimator:
         return stream.estimates, stream.state
 
     def refine(self, window: Window, estimate: WindowEstimate, state: StreamState) -> Refined:
-        """The last step of push: the angular part of an estimate, refined by the sample of its window.
+        """The last step of push: an estimate, refined by the sample of its window and by those before.
 
         Args:
             window: the window; without a sample the estimate stays as it is.
@@ -221,7 +224,7 @@ class Estimator:
             twists, covariance = _with_rate(estimate.twists, estimate.covariance, found.rate)
             uncertain = self.is_uncertain(twists, covariance)
             estimate = estimate._replace(twists=twists, covariance=covariance, source="refined", uncertain=uncertain)
-        return estimate, state._replace(filter=found.filter)
+        return _over_ground(self, window, estimate, state._replace(filter=found.filter))
 
     def is_uncertain(self, twists: NDArray[np.float64], covariance: NDArray[np.float64]) -> bool:
         """Whether sigma exceeds the bounds, see `Uncertainty.is_uncertain`; False for a model without uncertainty."""
@@ -328,6 +331,7 @@ def _is_finite(estimator: Estimator, state: StreamState) -> bool:
     """Whether the estimates of some events are finite; this compiles all code."""
     if state.view is not None:
         compile_kernels(state.view.grid)
+        ground.compile_kernels(_warm_camera(state.sensor))
     for given in _warm_events(state.sensor, estimator.config.window.duration_us):
         answer = estimator.push(given, state._replace(windows=WindowsState()), 0)
         state = answer.state
@@ -335,6 +339,25 @@ def _is_finite(estimator: Estimator, state: StreamState) -> bool:
         if not (finite and state.network.finite()):  # a membrane of nan never fires, so the answer does not show it
             return False
     return True
+
+
+def _over_ground(
+    estimator: Estimator, window: Window, estimate: WindowEstimate, state: StreamState
+) -> tuple[WindowEstimate, StreamState]:
+    """The estimate with the motion over level ground, where it is accepted; see `refine.ground`."""
+    if window.sample is None or state.view is None or state.camera is None or estimate.covariance is None:
+        return estimate, state
+    if estimator.bundle.linear_unit != PER_HEIGHT and state.camera.height_m is None:
+        return estimate, state  # the network knows metres, the ground does not
+    events = ground.events_of(state.view, window.sample, window.start_us)
+    known = estimate.twists.mean(axis=0), np.sqrt(np.diagonal(estimate.covariance)[3:])
+    answer = ground.refine(events, estimate.start_us, estimate.end_us, state.camera, *known, state.ground)
+    state = state._replace(ground=answer.state)
+    if answer.outcome != "accepted" or answer.motion is None:
+        return estimate, state
+    twists, covariance = np.tile(answer.motion.twist, (len(estimate.twists), 1)), answer.motion.covariance
+    uncertain = estimator.is_uncertain(twists, covariance)
+    return estimate._replace(twists=twists, covariance=covariance, source="refined", uncertain=uncertain), state
 
 
 def _warm_events(sensor: Sensor, duration_us: int) -> tuple[Events, WireEvents]:

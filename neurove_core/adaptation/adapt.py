@@ -44,7 +44,7 @@ class Recipe:
     """How much is learned."""
 
     updates: int = 600  # 0: only the gains
-    learning_rate: float = 3e-4
+    learning_rate: float = 1e-4
     simulated: int = 16  # sequences
     calibration_sequences: int = calibration.SEQUENCES
     workers: int = 1

@@ -211,8 +211,8 @@ def add_adapt(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--held-out", type=_share_of, default=0.2, metavar="SHARE", help=about)
     about = "updates of the weights; default 600; 0: fit only a gain per axis, in seconds"
     parser.add_argument("--updates", type=_whole, default=600, metavar="N", help=about)
-    about = "peak of the learning rate; default 3e-4"
-    parser.add_argument("--learning-rate", type=_rate, default=3e-4, metavar="R", help=about)
+    about = "peak of the learning rate; default 1e-4"
+    parser.add_argument("--learning-rate", type=_rate, default=1e-4, metavar="R", help=about)
     about = "training configuration that gives augmentations and simulated scenes; default `wider`"
     parser.add_argument("--config", default="wider", metavar="CONFIG", help=about)
     about = "simulated sequences that are mixed in, so that nothing is forgotten; default 16"

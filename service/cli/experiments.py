@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from neurove_protocol.errors import EXIT_FAILURE, InvalidField
-from neurove_service.cli.arguments import check_folder, commit, count, seed, subcommand
+from neurove_service.cli.arguments import add_refine_flag, check_folder, commit, count, seed, subcommand
 from neurove_service.cli.bars import progress
 from neurove_service.cli.parser import Parser
 
@@ -57,7 +57,7 @@ def reproduce_sight(args: argparse.Namespace) -> int:
         raise InvalidField("reproduce", "--recordings", str(args.recordings), "it is not a folder")
     _check_out(args.out)
     torch.set_num_threads(1)
-    estimator = Estimator(models.find(args.model))
+    estimator = Estimator(models.find(args.model), refine=args.refine == "auto")
     rows = []
     for row in sight.run(estimator, args.recordings, quick=args.quick):
         rows.append(row)
@@ -111,7 +111,7 @@ def reproduce_real(args: argparse.Namespace) -> int:
     from neurove_core.experiments import real
 
     _check_out(args.out)
-    rows, about = _real_rows(args.model, args.recordings, args.out)
+    rows, about = _real_rows(args.model, args.recordings, args.out, refine=args.refine == "auto")
     print(json.dumps(about | {"checks": rows}) if args.json else real.markdown(rows, real.title(about)), end="")
     if any(row["skipped"] is None for row in rows):
         return 0
@@ -134,7 +134,7 @@ def reproduce_motion(args: argparse.Namespace) -> int:
     for folder in (args.out, args.data):
         _check_out(folder)
     torch.set_num_threads(1)
-    estimator = Estimator(models.find(args.model))
+    estimator = Estimator(models.find(args.model), refine=args.refine == "auto")
     with progress() as show:
         found = run.run(estimator, groups, args.recordings, args.data, show, quick=args.quick)
     results = {"model": estimator.bundle.info.model_dump()} | _made_by() | {"quick": args.quick} | found
@@ -144,7 +144,9 @@ def reproduce_motion(args: argparse.Namespace) -> int:
     return 0
 
 
-def _real_rows(model: str, recordings: Path, out: Path | None) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+def _real_rows(
+    model: str, recordings: Path, out: Path | None, *, refine: bool = True
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Run all checks of a model, print the name of each, and write them into `out`.
 
     Returns:
@@ -157,7 +159,7 @@ def _real_rows(model: str, recordings: Path, out: Path | None) -> tuple[list[dic
     from neurove_core.experiments import real
 
     torch.set_num_threads(1)
-    estimator = Estimator(models.find(model))
+    estimator = Estimator(models.find(model), refine=refine)
     rows = []
     for row in real.run(estimator, recordings):
         rows.append(row)
@@ -257,6 +259,7 @@ def _add_motion(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--sets", metavar="SET,...", help=about)
     about = "one second of one recording per set through a tiny camera, to check that the command works"
     parser.add_argument("--quick", action="store_true", help=about)
+    add_refine_flag(parser)
     _add_out(parser, "folder for motion.json and motion.md")
 
 
@@ -276,6 +279,7 @@ def _add_sight(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--recordings", type=Path, metavar="DIR", help=about)
     about = "two short drives through a small camera: a minute less, and figures that vary more"
     parser.add_argument("--quick", action="store_true", help=about)
+    add_refine_flag(parser)
     _add_out(parser, "folder for sight.json, sight.md and the figure (PNG, SVG)")
 
 
@@ -295,6 +299,7 @@ def _add_real(parser: argparse.ArgumentParser) -> None:
     about = "file of a bundle, or the name of a built-in model; default `default`"
     parser.add_argument("model", nargs="?", default="default", metavar="BUNDLE", help=about)
     parser.add_argument("--recordings", type=Path, required=True, metavar="DIR", help="folder of the recordings")
+    add_refine_flag(parser)
     _add_out(parser, "folder for real.json and real.md")
 
 
