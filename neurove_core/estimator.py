@@ -4,7 +4,7 @@
 one batch; `estimates` runs over a whole recording. Windows and encoding are the same as in training.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -24,6 +24,11 @@ from neurove_core.models.bundle import PER_HEIGHT, Bundle, LinearUnit
 from neurove_core.networks.kinds import State
 from neurove_core.networks.neurove import NetworkState, NeuroVE
 from neurove_core.networks.runner import Runner
+from neurove_core.refine import ground
+from neurove_core.refine.ground import GroundState
+from neurove_core.refine.rotation import Filter, Given, Rate, refine
+from neurove_core.refine.search import compile_kernels
+from neurove_core.refine.view import View
 from neurove_core.timescales import Answer, Longer, chosen, followed, jobs, slowed
 from neurove_protocol import CameraInfo, Events, Sensor
 from neurove_protocol.errors import BadModel
@@ -44,6 +49,9 @@ class StreamState(NamedTuple):
     age: int  # windows since the network state began
     end_us: int | None = None  # end of the newest window that the network has processed
     low_activity_below: float = 0.0  # a window with fewer visible events is flagged low_activity
+    view: View | None = None  # for the refinement; None where estimates are not refined
+    filter: Filter | None = None  # of the refinement
+    ground: GroundState = GroundState()  # of the refinement of the linear part
     recent: Recent = ()  # counts of earlier windows, for models with a history
     longer: Longer = Longer()  # for models with longer windows
 
@@ -83,6 +91,10 @@ class Push(NamedTuple):
     horizon_us: int
 
 
+Refined = tuple[WindowEstimate, StreamState]
+"""A refined estimate, and the state of the stream after it."""
+
+
 @dataclass
 class _Progress:
     """One stream during a push."""
@@ -92,6 +104,10 @@ class _Progress:
     lost: tuple[int, int, int] = (0, 0, 0)  # late events, events outside, skipped windows
     estimates: list[WindowEstimate] = field(default_factory=list)
 
+    def refine(self, refine_one: Callable[..., Refined]) -> None:
+        for index, window in enumerate(self.windows):
+            self.estimates[index], self.state = refine_one(window, self.estimates[index], self.state)
+
 
 class Estimator:
     """A loaded model that serves any number of streams. It holds no stream's state and is safe to share.
@@ -100,10 +116,15 @@ class Estimator:
         bundle: the model; its network is put into evaluation mode.
         runner: runs the network; by default the fastest one. `PlainRunner(bundle.network)` runs the network itself.
         bounds: absolute bounds of sigma for `uncertain`; they take precedence over those of the bundle.
+        refine: whether to refine estimates by the events, see `refine.rotation` and `refine.ground`. It needs the
+            CameraInfo of a stream and a bundle with an uncertainty that does not refuse it.
     """
 
-    def __init__(self, bundle: Bundle, runner: Runner | None = None, bounds: Bounds = UNSET) -> None:
+    def __init__(
+        self, bundle: Bundle, runner: Runner | None = None, bounds: Bounds = UNSET, *, refine: bool = False
+    ) -> None:
         self.bundle = bundle
+        self._refines = refine and bundle.uncertainty is not None and bundle.metadata.refine == "auto"
         self._bounds = bounds
         self.config = bundle.config
         self.network = bundle.network.eval().requires_grad_(requires_grad=False)
@@ -124,7 +145,8 @@ class Estimator:
         per_pixel = self.config.low_activity_per_pixel * np.count_nonzero(lut >= 0)
         least = max(float(self.config.low_activity_events), float(per_pixel))
         network = self.network.initial_state()
-        return StreamState(sensor, camera, lut, WindowsState(), network, 0, low_activity_below=least)
+        view = View.of(camera) if self._refines and camera is not None else None
+        return StreamState(sensor, camera, lut, WindowsState(), network, 0, low_activity_below=least, view=view)
 
     def estimates(self, recording: Recording, camera: CameraInfo | None = None) -> Iterator[WindowEstimate]:
         """Estimates of all complete windows of a recording by its events alone, as the service answers its packets.
@@ -164,22 +186,45 @@ class Estimator:
         Args:
             pushes: at most one packet of each stream.
         """
-        streams = [self._begin(push) for push in pushes]
+        streams = [_begin(push, self.to_windows(*push)) for push in pushes]
         self._answer(streams)
+        for stream in streams:
+            stream.refine(self.refine)
         return [PushResult(stream.estimates, stream.state, *stream.lost) for stream in streams]
 
     def to_windows(self, events: Events | WireEvents, state: StreamState, horizon_us: int) -> Pushed:
         """The first half of push: the windows that some events complete, not yet processed by the network."""
-        return windows.push(events, horizon_us, state.windows, state.lut, self.config.window, self.config.canonical)
+        about = state.windows, state.lut, self.config.window, self.config.canonical
+        return windows.push(events, horizon_us, *about, sampled=state.view is not None)
 
     def follow(self, complete: Iterable[Window], state: StreamState) -> tuple[list[WindowEstimate], StreamState]:
         """The second half of push: estimate windows that this model, or one with the same windows, has made.
 
-        Where a window does not begin at the end of the one before, the network state is reset, unless it is bridged.
+        These are the network's estimates; `refine` is the last step of a push. Where a window does not begin at the end
+        of the one before, the network state is reset, unless it is bridged.
         """
         stream = _Progress(state, tuple(complete))
         self._answer([stream])
         return stream.estimates, stream.state
+
+    def refine(self, window: Window, estimate: WindowEstimate, state: StreamState) -> Refined:
+        """The last step of push: an estimate, refined by the sample of its window and by those before.
+
+        Args:
+            window: the window; without a sample the estimate stays as it is.
+            estimate: the network's.
+            state: of the stream.
+        """
+        if window.sample is None or state.view is None or estimate.covariance is None:
+            return estimate, state
+        height_m = (state.camera.height_m if state.camera else None) or 1.0
+        about = window.start_us, self.config.window.duration_us, window.sample, state.view, estimate.twists.mean(axis=0)
+        found = refine(Given(*about, estimate.covariance, estimate.low_activity, state.filter, height_m))
+        if found.outcome == "accepted":
+            twists, covariance = _with_rate(estimate.twists, estimate.covariance, found.rate)
+            uncertain = self.is_uncertain(twists, covariance)
+            estimate = estimate._replace(twists=twists, covariance=covariance, source="refined", uncertain=uncertain)
+        return _over_ground(self, window, estimate, state._replace(filter=found.filter))
 
     def is_uncertain(self, twists: NDArray[np.float64], covariance: NDArray[np.float64]) -> bool:
         """Whether sigma exceeds the bounds, see `Uncertainty.is_uncertain`; False for a model without uncertainty."""
@@ -189,12 +234,6 @@ class Estimator:
     def has_same_windows(self, other: "Estimator") -> bool:
         """Whether both models use the same windows and canonical camera, so that one can use the other's windows."""
         return (self.config.window, self.config.canonical) == (other.config.window, other.config.canonical)
-
-    def _begin(self, push: Push) -> _Progress:
-        pushed = self.to_windows(*push)
-        outside = sum(window.outside for window in pushed.windows)
-        lost = (pushed.late_events, outside, pushed.skipped_windows)
-        return _Progress(push.state._replace(windows=pushed.state), pushed.windows, lost)
 
     def _answer(self, streams: list[_Progress]) -> None:
         """Run all windows of some streams: the first window of each in one batch, then the second, and so on."""
@@ -242,22 +281,8 @@ class Estimator:
             BadModel: the model computes numbers that are not finite.
         """
         sensor = Sensor(self.config.canonical.width, self.config.canonical.height)
-        duration = self.config.window.duration_us
-        t = np.arange(0, 4 * duration, max(1, duration // 500))
-        rng = np.random.default_rng(0)
-        x, y, p = (rng.integers(0, high, t.size) for high in (sensor.width, sensor.height, 2))
-        events = Events.from_columns(t, x, y, p)
-        packet = EventPacket("warm", 0, sensor, 0, events)
-        from_wire = read_packet(
-            encode_packet(packet), PacketLimits(max_side_px=max(sensor.width, sensor.height))
-        ).events
-        state = self.initial_state(sensor)
-        for given in (events, from_wire):
-            answer = self.push(given, state._replace(windows=WindowsState()), 0)
-            state = answer.state
-            finite = all(np.isfinite(estimate.twists).all() for estimate in answer.estimates)
-            if not (finite and state.network.finite()):  # a membrane of nan never fires, so the answer does not show it
-                raise BadModel(self.bundle.name, "it computes numbers that are not finite")
+        if not _is_finite(self, self.initial_state(sensor, _warm_camera(sensor) if self._refines else None)):
+            raise BadModel(self.bundle.name, "it computes numbers that are not finite")
 
     def _covariance(self, answer: Answer, metres: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Covariance (6, 6) of the twists of an answer, in the units of the estimate."""
@@ -272,7 +297,6 @@ class Estimator:
     def _estimate(self, window: Window, answer: Answer, before: StreamState) -> WindowEstimate:
         metres, age = _to_metres(before.camera, self.bundle.linear_unit), before.age
         twists, covariance = answer.twists * metres, self._covariance(answer, metres)
-        unsure = self.bundle.uncertainty
         return WindowEstimate(
             start_us=window.start_us,
             end_us=window.start_us + self.config.window.duration_us,
@@ -283,10 +307,81 @@ class Estimator:
             low_activity=window.events - window.outside < before.low_activity_below,
             saturated=bool(window.counts.max() == 255),
             covariance=covariance,
-            uncertain=covariance is not None
-            and unsure is not None
-            and unsure.is_uncertain(twists, covariance, self._bounds),
+            uncertain=covariance is not None and self.is_uncertain(twists, covariance),
         )
+
+
+def _begin(push: Push, pushed: Pushed) -> _Progress:
+    outside = sum(window.outside for window in pushed.windows)
+    lost = (pushed.late_events, outside, pushed.skipped_windows)
+    return _Progress(push.state._replace(windows=pushed.state), pushed.windows, lost)
+
+
+def _with_rate(
+    twists: NDArray[np.float64], covariance: NDArray[np.float64], rate: Rate
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Twists (n, 6) and covariance (6, 6) with another angular part, which does not correlate with the linear part."""
+    twists, joint = twists.copy(), np.zeros((6, 6))
+    twists[:, 3:] = rate.w_rad_s
+    joint[:3, :3], joint[3:, 3:] = covariance[:3, :3], (rate.covariance + rate.covariance.T) / 2
+    return twists, joint
+
+
+def _is_finite(estimator: Estimator, state: StreamState) -> bool:
+    """Whether the estimates of some events are finite; this compiles all code."""
+    if state.view is not None:
+        compile_kernels(state.view.grid)
+        ground.compile_kernels(_warm_camera(state.sensor))
+    for given in _warm_events(state.sensor, estimator.config.window.duration_us):
+        answer = estimator.push(given, state._replace(windows=WindowsState()), 0)
+        state = answer.state
+        finite = all(np.isfinite(estimate.twists).all() for estimate in answer.estimates)
+        if not (finite and state.network.finite()):  # a membrane of nan never fires, so the answer does not show it
+            return False
+    return True
+
+
+def _over_ground(
+    estimator: Estimator, window: Window, estimate: WindowEstimate, state: StreamState
+) -> tuple[WindowEstimate, StreamState]:
+    """The estimate with the motion over level ground, where it is accepted; see `refine.ground`."""
+    if window.sample is None or state.view is None or state.camera is None or estimate.covariance is None:
+        return estimate, state
+    if estimator.bundle.linear_unit != PER_HEIGHT and state.camera.height_m is None:
+        return estimate, state  # the network knows metres, the ground does not
+    events = ground.events_of(state.view, window.sample, window.start_us)
+    known = estimate.twists.mean(axis=0), np.sqrt(np.diagonal(estimate.covariance)[3:])
+    answer = ground.refine(events, estimate.start_us, estimate.end_us, state.camera, *known, state.ground)
+    state = state._replace(ground=answer.state)
+    if answer.outcome != "accepted" or answer.motion is None:
+        return estimate, state
+    twists, covariance = np.tile(answer.motion.twist, (len(estimate.twists), 1)), answer.motion.covariance
+    uncertain = estimator.is_uncertain(twists, covariance)
+    return estimate._replace(twists=twists, covariance=covariance, source="refined", uncertain=uncertain), state
+
+
+def _warm_events(sensor: Sensor, duration_us: int) -> tuple[Events, WireEvents]:
+    """The events of four windows, as columns and in the layout of a packet."""
+    t = np.arange(0, 4 * duration_us, max(1, duration_us // 500))
+    rng = np.random.default_rng(0)
+    x, y, p = (rng.integers(0, high, t.size) for high in (sensor.width, sensor.height, 2))
+    events = Events.from_columns(t, x, y, p)
+    data = encode_packet(EventPacket("warm", 0, sensor, 0, events))
+    return events, read_packet(data, PacketLimits(max_side_px=max(sensor.width, sensor.height))).events
+
+
+def _warm_camera(sensor: Sensor) -> CameraInfo:
+    focal, middle_x, middle_y = float(sensor.width), sensor.width / 2, sensor.height / 2
+    return CameraInfo(
+        stream="warm",
+        lens="pinhole",
+        width=sensor.width,
+        height=sensor.height,
+        fx=focal,
+        fy=focal,
+        cx=middle_x,
+        cy=middle_y,
+    )
 
 
 def _to_metres(camera: CameraInfo | None, unit: LinearUnit) -> NDArray[np.float64]:

@@ -176,6 +176,7 @@ class StreamStatus(Message):
     uncounted_packets: Count = 0  # all had the sequence number 0, so losses before this node cannot be counted
     refused_cameras: Count = 0  # CameraInfo messages that were refused or do not belong to the sensor
     refusal: str = ""  # why the newest packet or CameraInfo was refused
+    unrefined_windows: Count = 0  # answered by the network alone, because the stream was behind; no loss
     imu: ImuStatus | None = None  # None for a stream without an inertial unit
 
 

@@ -156,12 +156,17 @@ class ServiceConfig(_Settings):
         le=(MAX_PACKET_BYTES - (1 << 16)) // 8,
         description="Larger packets are refused; the bound is the largest message of the transport, 32 MiB.",
     )
+    refine: Literal["auto", "off"] = Field(
+        "auto",
+        description="Refine the angular velocity by the events of each window where a stream has a CameraInfo: auto or "
+        "off.",
+    )
     tables_mib: int = Field(
         512,
         ge=1,
         le=1 << 16,
-        description="Maximum memory of the look-up tables of all sensors, 4 bytes a pixel; further sensors are "
-        "refused [MiB].",
+        description="Maximum memory of the look-up tables of all sensors, 4 bytes a pixel and 8 for the "
+        "refinement; further sensors are refused [MiB].",
     )
     max_side_px: int = Field(4096, ge=16, le=32768, description="Larger sensors are refused.")
     idle_evict_s: float = Field(

@@ -44,13 +44,17 @@ MAY_IMPORT = {
     "neurove_core.evaluation": "compiled figures geometry networks models estimator inertial aided io",
     "neurove_core.training": (
         "config files extras figures geometry ingest networks "
-        "engine models estimator self_test io io.formats sim sources"
+        "engine models estimator self_test io io.formats sim sources timescales"
+    ),
+    "neurove_core.adaptation": (
+        "config files geometry models estimator self_test io io.formats sources evaluation training"
     ),
     "neurove_core.bench": (
-        "config compiled figures geometry spiking ingest networks engine models estimator sim sources"
+        "config compiled figures geometry spiking ingest networks engine models refine estimator sim sources"
     ),
     "neurove_core.experiments": (
-        "config files extras figures spiking ingest networks engine models estimator io sim sources evaluation training"
+        "config files extras figures geometry spiking ingest networks engine models estimator io sim sources "
+        "evaluation training"
     ),
     "neurove_core": "spiking models estimator sources",
     # neurove_service

@@ -18,10 +18,11 @@ from neurove_core.estimator import Estimator
 from neurove_core.evaluation.evaluate import NoTruth, estimate_recording
 from neurove_core.evaluation.metrics import SKIP_S
 from neurove_core.experiments import save_text
+from neurove_core.geometry.motion import Twists
 from neurove_core.io.recording import Recording
 from neurove_core.sim.render.camera import CAMERAS
 from neurove_core.sources import open_source
-from neurove_protocol import CameraInfo
+from neurove_protocol import CameraInfo, Events
 from neurove_protocol.errors import NeuroVEError
 
 Array = NDArray[np.float64]
@@ -38,6 +39,9 @@ It is stationary until 0.65 s; the estimator settles during the first two window
 
 _GYRO: Final = "ecd/shapes_rotation"
 """Folder of the gyro (imu.txt) of both recordings of shapes_rotation; it covers 0 to 1.6 s and 43.3 to 43.8 s."""
+
+_PROFILE: Final = "ecd/shapes_rotation_1.43s.txt"
+_EVBENCH: Final = ("evbench/seq_0001_e.mat", "evbench/seq_0002_e.mat")
 
 _GYRO_REST_US: Final = 600_000
 """The camera of shapes_rotation is at rest up to this time: the mean of its gyro is its bias."""
@@ -136,6 +140,46 @@ def _shown(value: float | list[float]) -> str:
     return " ".join(f"{one:.3g}" for one in value) if isinstance(value, list) else f"{value:.3g}"
 
 
+class TurningRecording(NamedTuple):
+    """A real recording of a camera that turns, with its truth."""
+
+    name: str
+    events: Events
+    camera: CameraInfo
+    truth: Twists  # nan where unknown
+    axis: int  # the known one of vx vy vz wx wy wz
+
+
+def turning_recordings(folder: Path) -> Iterator[TurningRecording]:
+    """The recordings of the checks whose rate of turning is known: yaw of shapes_rotation_1.43s, and both of evbench.
+
+    Args:
+        folder: holds the recordings; missing ones are left out.
+    """
+    if (folder / _PROFILE).exists() and (folder / _GYRO).exists():
+        recording = open_source(str(folder / _PROFILE))
+        yield _turning("shapes_rotation yaw", recording, _gyro_twists(folder), 4)
+    for name in _EVBENCH:
+        if (folder / name).exists():
+            recording = open_source(str(folder / name))
+            truth = recording.twists()
+            if truth is not None:
+                yield _turning(f"evbench {_EVBENCH.index(name) + 1} about x", recording, _constant(recording, truth), 3)
+
+
+def _constant(recording: Recording, truth: Twists) -> Twists:
+    """The mean rate about x for the whole recording; the rest is nan."""
+    t = np.arange(0, _last_us(recording) + 100_000, 10_000, dtype=np.int64)
+    twist = np.full((t.size, 6), np.nan)
+    twist[:, 3] = np.nanmean(truth.twist[:, 3])
+    return Twists(t, twist)
+
+
+def _turning(name: str, recording: Recording, truth: Twists, axis: int) -> TurningRecording:
+    events = Events.join([Events.empty(), *recording.chunks()])
+    return TurningRecording(name, events, _lens(recording, name), truth, axis)
+
+
 # --- what each check measures -----------------------------------------------------------------------------------------
 
 
@@ -168,12 +212,7 @@ def _estimate_series(estimator: Estimator, path: Path) -> _EstimateSeries:
     sensor; that camera is stationary.
     """
     recording = open_source(str(path))
-    camera = recording.camera("real") or CAMERAS["davis346" if "davis346" in path.name else "davis240c"]
-    if camera.sensor != recording.sensor:
-        wider, higher = recording.sensor.width / camera.width, recording.sensor.height / camera.height
-        size = {"width": recording.sensor.width, "height": recording.sensor.height}
-        lens = {"fx": camera.fx * wider, "fy": camera.fy * higher, "cx": camera.cx * wider, "cy": camera.cy * higher}
-        camera = camera.model_copy(update=size | lens)
+    camera = _lens(recording, path.name)
     answers = estimate_recording(estimator, recording, camera)
     window_us = answers.bin_us * answers.twists.shape[1]
     first_us, last_us = int(next(recording.chunks()).t[0]), _last_us(recording)
@@ -185,6 +224,16 @@ def _estimate_series(estimator: Estimator, path: Path) -> _EstimateSeries:
     return _EstimateSeries(
         recording, camera, start_us, (start_us - start_us[0]) / 1e6, twist, answers.events[complete], low, window_us
     )
+
+
+def _lens(recording: Recording, name: str) -> CameraInfo:
+    camera = recording.camera("real") or CAMERAS["davis346" if "davis346" in name else "davis240c"]
+    if camera.sensor == recording.sensor:
+        return camera
+    wider, higher = recording.sensor.width / camera.width, recording.sensor.height / camera.height
+    size = {"width": recording.sensor.width, "height": recording.sensor.height}
+    lens = {"fx": camera.fx * wider, "fy": camera.fy * higher, "cx": camera.cx * wider, "cy": camera.cy * higher}
+    return camera.model_copy(update=size | lens)
 
 
 def _last_us(recording: Recording) -> int:
@@ -240,11 +289,17 @@ def _profile_error(name: str, estimator: Estimator, folder: Path) -> Measurement
 
 def _gyro(folder: Path, series: _EstimateSeries, chosen: NDArray[np.bool_] | slice) -> Array:
     """Mean rates (W, 3) [rad/s] of the gyro of shapes_rotation over the chosen windows, without its bias."""
+    truth = _gyro_twists(folder)
+    return _window_means(truth.t, truth.twist[:, 3:], series, chosen)
+
+
+def _gyro_twists(folder: Path) -> Twists:
+    """Rates of the gyro of shapes_rotation without its bias; the linear part is nan."""
     t, rate = _imu(open_source(str(folder / _GYRO)))
     rest = t < _GYRO_REST_US
     if not rest.any():
         raise NoTruth(f"the gyro's bias is not known: {_GYRO}/imu.txt is missing, or has no sample before 0.6 s")
-    return _window_means(t, rate - rate[rest].mean(axis=0), series, chosen)
+    return Twists(t, np.hstack([np.full_like(rate, np.nan), rate - rate[rest].mean(axis=0)]))
 
 
 def _imu(recording: Recording) -> tuple[NDArray[np.int64], Array]:
@@ -267,8 +322,11 @@ def _window_means(
 
 def _stationary_rotation(name: str, estimator: Estimator, folder: Path) -> Measurement:
     series = _estimate_series(estimator, folder / name)
-    rates = np.linalg.norm(series.twist[series.later(*_STATIONARY_S), 3:], axis=1)
-    return Measurement(float(rates.max()), {"median": float(np.median(rates))})
+    speeds, rates = (
+        np.linalg.norm(series.twist[series.later(*_STATIONARY_S), part], axis=1) for part in (slice(0, 3), slice(3, 6))
+    )
+    made_of = {"median": float(np.median(rates)), "speed at 1 m [m/s]": float(np.median(speeds))}
+    return Measurement(float(rates.max()), made_of)
 
 
 def _gyro_sign(name: str, estimator: Estimator, folder: Path) -> Measurement:
@@ -306,11 +364,15 @@ def _check(
 
 
 _UNIT, _SHAPES = "the pan-tilt unit", "the gyro, less its bias"
+_TURNING, _SPEED = "turning at rest [rad/s]", "speed at rest at 1 m [m/s]"
+STATIONARY_CHECKS: Final = (_TURNING, _SPEED)
+"""Checks of the three recordings of a stationary camera, one for each."""
+
 _REST: Final = "a stationary camera"
 
 CHECKS: Final = (
-    _check("evbench/seq_0001_e.mat", "rotation about x over its truth", _UNIT, (0.7, 1.3), _pitch),
-    _check("evbench/seq_0002_e.mat", "rotation about x over its truth", _UNIT, (0.7, 1.3), _pitch),
+    _check(_EVBENCH[0], "rotation about x over its truth", _UNIT, (0.7, 1.3), _pitch),
+    _check(_EVBENCH[1], "rotation about x over its truth", _UNIT, (0.7, 1.3), _pitch),
     _check(
         "slider_depth/events_chunk.txt",
         "direction of motion, off by [deg]",
@@ -321,11 +383,11 @@ CHECKS: Final = (
     _check(
         "ecd/shapes_rotation/events.txt", "rate of turning at 43.5 s, relative error", _SHAPES, (-math.inf, 0.15), _rate
     ),
-    _check("ecd/shapes_rotation_1.43s.txt", "yaw, correlation", _SHAPES, (0.99, math.inf), _profile),
-    _check("ecd/shapes_rotation_1.43s.txt", "yaw, RMS error [rad/s]", _SHAPES, (-math.inf, 0.06), _profile_error),
+    _check(_PROFILE, "yaw, correlation", _SHAPES, (0.99, math.inf), _profile),
+    _check(_PROFILE, "yaw, RMS error [rad/s]", _SHAPES, (-math.inf, 0.06), _profile_error),
     _check(
-        "ecd/shapes_rotation_1.43s.txt",
-        "turning at rest [rad/s]",
+        _PROFILE,
+        _TURNING,
         _REST,
         (-math.inf, STATIONARY_RAD_S),
         _stationary_rotation,
@@ -341,7 +403,7 @@ CHECKS: Final = (
         _check(f"aedat4/{name}.aedat4", what, _REST, span, measure)
         for name in ("davis346", "dvxplorer")
         for what, span, measure in (
-            ("speed at rest at 1 m [m/s]", (-math.inf, STATIONARY_M_S), _stationary_speed),
+            (_SPEED, (-math.inf, STATIONARY_M_S), _stationary_speed),
             ("share of windows flagged low activity", (0.5, math.inf), _low_activity),
         )
     ),

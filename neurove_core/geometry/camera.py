@@ -81,6 +81,26 @@ def _fill(
     return steps
 
 
+def ray_table(camera: CameraInfo) -> NDArray[np.float32]:
+    """The ray through each pixel.
+
+    Args:
+        camera: the lens.
+
+    Returns:
+        (2, height, width) of x/z and y/z; nan where the lens model has no ray in front of the camera.
+    """
+    table = np.empty((2, camera.height, camera.width), np.float32)
+    step = max(1, PIECE_PX // camera.width)
+    u = np.arange(camera.width, dtype=np.float64)
+    for first in range(0, camera.height, step):
+        v = np.arange(first, min(first + step, camera.height), dtype=np.float64)[:, None]
+        xd, yd = np.broadcast_arrays((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
+        with np.errstate(over="ignore"):  # a ray that float32 cannot hold is infinite
+            table[:, first : first + step] = undistort(xd, yd, camera)
+    return table
+
+
 def _cell(row: NDArray[Any], column: NDArray[Any], canonical: CanonicalConfig) -> NDArray[Any]:
     """The entry of a table for a row and column of the fine grid."""
     n = canonical.subcells

@@ -2,17 +2,19 @@
 
 import threading
 import weakref
-from typing import Any
+from collections.abc import Callable
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.config import CanonicalConfig
-from neurove_core.geometry.camera import lookup_table
+from neurove_core.geometry.camera import lookup_table, ray_table
 from neurove_protocol import CameraInfo, Sensor
 from neurove_protocol.errors import NoTable
 
 _Key = tuple[Any, ...]
+_Table = NDArray[np.int32] | NDArray[np.float32]
 
 
 def table_bytes(sensor: Sensor) -> int:
@@ -33,7 +35,7 @@ class Tables:
 
     def __init__(self, max_bytes: int | None = None) -> None:
         self.max_bytes = max_bytes
-        self._tables: weakref.WeakValueDictionary[_Key, NDArray[np.int32]] = weakref.WeakValueDictionary()
+        self._tables: weakref.WeakValueDictionary[_Key, _Table] = weakref.WeakValueDictionary()
         self._building: dict[_Key, threading.Lock] = {}
         self._under_way = 0
         self._lock = threading.Lock()
@@ -54,6 +56,21 @@ class Tables:
             NoTable: there is no memory for it. InvalidField: the camera info describes a sensor of another size.
         """
         key = _key(canonical, sensor, camera)
+        made = self._shared(key, sensor, table_bytes(sensor), lambda: lookup_table(canonical, sensor, camera))
+        return cast("NDArray[np.int32]", made)
+
+    def rays(self, camera: CameraInfo) -> NDArray[np.float32]:
+        """The ray of each pixel, see `ray_table`, 8 bytes a pixel; shared and bounded like the look-up tables.
+
+        Raises:
+            NoTable: there is no memory for it.
+        """
+        sensor = camera.sensor
+        key = ("rays", sensor, *_lens(camera))
+        made = self._shared(key, sensor, 2 * table_bytes(sensor), lambda: ray_table(camera))
+        return cast("NDArray[np.float32]", made)
+
+    def _shared(self, key: _Key, sensor: Sensor, needed: int, make: Callable[[], _Table]) -> _Table:
         with self._lock:
             found = self._tables.get(key)
             if found is not None:
@@ -62,13 +79,10 @@ class Tables:
         with building:
             found = self._tables.get(key)
             if found is None:
-                found = self._built(key, canonical, sensor, camera)
+                found = self._built(key, sensor, needed, make)
             return found
 
-    def _built(
-        self, key: _Key, canonical: CanonicalConfig, sensor: Sensor, camera: CameraInfo | None
-    ) -> NDArray[np.int32]:
-        needed = table_bytes(sensor)
+    def _built(self, key: _Key, sensor: Sensor, needed: int, make: Callable[[], _Table]) -> _Table:
         with self._lock:
             used = self.in_use
             if self.max_bytes is not None and used + needed > self.max_bytes:
@@ -76,7 +90,7 @@ class Tables:
                 raise NoTable(str(sensor), needed, used, self.max_bytes)
             self._under_way += needed
         try:
-            table = lookup_table(canonical, sensor, camera)
+            table = make()
             with self._lock:
                 self._tables[key] = table
             return table
@@ -94,5 +108,8 @@ def _key(canonical: CanonicalConfig, sensor: Sensor, camera: CameraInfo | None) 
     grid = (canonical.width, canonical.height, canonical.hfov_deg, canonical.subcells)
     if camera is None:
         return (*grid, sensor)
-    lens = (camera.lens, camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion)
-    return (*grid, sensor, camera.sensor, *lens)
+    return (*grid, sensor, camera.sensor, *_lens(camera))
+
+
+def _lens(camera: CameraInfo) -> _Key:
+    return camera.lens, camera.fx, camera.fy, camera.cx, camera.cy, camera.distortion

@@ -111,7 +111,8 @@ def judge(track: Track) -> Agreement:
     start_us, end_us = track.start_us[inside], track.end_us[inside]
     events = _centred(track.events_rad_s[inside])
     refined = bool(track.refined[inside].mean() > 0.5)
-    gyro = np.stack([_centred(_between(track, start_us + lag, end_us + lag)) for lag in lags])  # (L, K, 3)
+    gyro = _between(track, start_us + lags[:, None], end_us + lags[:, None])  # (L, K, 3)
+    gyro -= gyro.mean(axis=1, keepdims=True)
     middle = lags.size // 2
     excited = gyro[middle].std(0) > EXCITED_RAD_S
     if not excited.any():
@@ -153,11 +154,12 @@ def _wrong(matrix: Array, told: NDArray[np.bool_], excited: NDArray[np.bool_], j
 
 
 def _between(track: Track, start_us: NDArray[np.int64], end_us: NDArray[np.int64]) -> Array:
-    """Mean angular velocity (K, 3) of the gyroscope over some spans within the grid [rad/s]."""
+    """Mean angular velocity (..., 3) of the gyroscope over some spans (...) within the grid [rad/s]."""
     angles = [
-        np.stack([np.interp(t_us, track.grid_us, axis) for axis in track.angle_rad.T], 1) for t_us in (start_us, end_us)
+        np.stack([np.interp(t_us, track.grid_us, axis) for axis in track.angle_rad.T], -1)
+        for t_us in (start_us, end_us)
     ]
-    return np.asarray((angles[1] - angles[0]) / ((end_us - start_us) * 1e-6)[:, None])
+    return np.asarray((angles[1] - angles[0]) / ((end_us - start_us) * 1e-6)[..., None])
 
 
 def _centred(values: Array) -> Array:

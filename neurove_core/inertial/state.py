@@ -126,7 +126,8 @@ def _compared(state: InertialState, window: Window, known: Imu) -> InertialState
         first_us = int(track.grid_us[-1]) if known.n and track.grid_us[-1] >= known.t[0] else first_us
     if known.n and known.t[0] <= first_us <= known.t[-1]:
         grid_us = np.arange(first_us, int(known.t[-1]) + 1, agreement.GRID_US)
-        track = agreement.add_angles(track, grid_us, gyro.turned(known, grid_us))
+        near = known.span(max(0, int(known.t.searchsorted(first_us, "right")) - 1), known.n)
+        track = agreement.add_angles(track, grid_us, gyro.turned(near, grid_us))
     if not window.low_activity:
         mean = window.twists[:, 3:].mean(0)
         track = agreement.add_window(track, window.start_us, window.end_us, mean, refined=window.refined)

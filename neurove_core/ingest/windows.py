@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from neurove_core.config import CanonicalConfig, WindowConfig
 from neurove_core.ingest.counting import count_events
+from neurove_core.ingest.sample import Sample, Sampler
 from neurove_core.ingest.wire import count_wire
 from neurove_protocol import Events
 from neurove_protocol.events import WireEvents
@@ -26,6 +27,7 @@ class Window(NamedTuple):
     events: int  # of the whole sensor
     outside: int  # those whose pixel has no cell of the grid
     bridged: bool = False  # windows before it were left out on purpose: the network state goes on over them
+    sample: Sample | None = None  # of its events at full resolution; None where no sample is wanted
 
 
 class WindowsState(NamedTuple):
@@ -37,6 +39,7 @@ class WindowsState(NamedTuple):
     events: int = 0
     outside: int = 0
     bridged: bool = False  # as in Window
+    sampler: Sampler | None = None  # None while the open window is empty, or where no sample is wanted
 
 
 class Pushed(NamedTuple):
@@ -55,6 +58,8 @@ def push(
     lut: NDArray[np.int32],
     config: WindowConfig,
     canonical: CanonicalConfig,
+    *,
+    sampled: bool = False,
 ) -> Pushed:
     """Add events to a stream's open window and close every window that is complete.
 
@@ -65,6 +70,7 @@ def push(
         lut: (sensor.height, sensor.width) from geometry.lookup_table.
         config: length and bins of a window.
         canonical: size of the grid.
+        sampled: whether to keep a sample of the events of each window.
 
     Returns:
         the windows that end at or before the newest known time, oldest first, and the next state.
@@ -84,7 +90,7 @@ def push(
     events = events.span(late, events.n) if late else events
     windows: list[Window] = []
     skipped = 0
-    open_window = _Open(start_us, state, config, canonical)
+    open_window = _Open(start_us, state, config, canonical, sampled)
     while newest_us >= open_window.start_us + duration:
         end_us = open_window.start_us + duration
         inside = events.before(end_us)
@@ -96,7 +102,7 @@ def push(
         if gap > config.max_hole_windows:
             skipped += gap
             end_us = next_us
-        open_window = _Open(end_us, WindowsState(), config, canonical)
+        open_window = _Open(end_us, WindowsState(), config, canonical, sampled)
     open_window.add(events, lut)
     return Pushed(windows, open_window.state(newest_us), late, skipped)
 
@@ -111,24 +117,33 @@ def _inside(
     newest_us = max(events.last_us, horizon_us)
     if newest_us >= start_us + config.duration_us or events.first_us < start_us:
         return None
+    if state.sampler is not None:
+        state.sampler.add(events)
     where = start_us, config.bin_us, lut, counts
     outside = count_wire(events, *where) if isinstance(events, WireEvents) else count_events(events, *where)
     horizon_us = max(newest_us, state.horizon_us)
-    return WindowsState(start_us, horizon_us, counts, state.events + events.n, state.outside + outside, state.bridged)
+    counted = state.events + events.n, state.outside + outside
+    return WindowsState(start_us, horizon_us, counts, *counted, state.bridged, state.sampler)
 
 
 class _Open:
     """The window into which events are counted."""
 
-    def __init__(self, start_us: int, state: WindowsState, config: WindowConfig, canonical: CanonicalConfig) -> None:
+    def __init__(
+        self, start_us: int, state: WindowsState, config: WindowConfig, canonical: CanonicalConfig, sampled: bool
+    ) -> None:
         self.start_us, self.counts, self.events, self.outside = start_us, state.counts, state.events, state.outside
         self._bridged, self._bin_us = state.bridged, config.bin_us
+        self._sampled, self._sampler = sampled and (state.sampler is not None or not state.events), state.sampler
         self._shape = (2 * config.bins, canonical.parts * canonical.height, canonical.width)
         self._window = (-1, canonical.height, canonical.width)
 
     def add(self, events: Events | WireEvents, lut: NDArray[np.int32]) -> None:
         if not events.n:
             return
+        if self._sampled:
+            self._sampler = self._sampler or Sampler(self.start_us)
+            self._sampler.add(events)
         where = self.start_us, self._bin_us, lut, self._grid()
         self.outside += count_wire(events, *where) if isinstance(events, WireEvents) else count_events(events, *where)
         self.events += events.n
@@ -139,7 +154,11 @@ class _Open:
         return self.counts
 
     def close(self) -> Window:
-        return Window(self.start_us, self._grid().reshape(self._window), self.events, self.outside, self._bridged)
+        sample = self._sampler.sample() if self._sampler is not None else None
+        counts = self._grid().reshape(self._window)
+        return Window(self.start_us, counts, self.events, self.outside, self._bridged, sample)
 
     def state(self, horizon_us: int) -> WindowsState:
-        return WindowsState(self.start_us, horizon_us, self.counts, self.events, self.outside, self._bridged)
+        return WindowsState(
+            self.start_us, horizon_us, self.counts, self.events, self.outside, self._bridged, self._sampler
+        )

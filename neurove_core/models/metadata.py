@@ -3,7 +3,7 @@
 Every field may be missing. Older bundles without these fields load as before.
 """
 
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal
 
 from pydantic import Field, JsonValue
 
@@ -53,6 +53,9 @@ class Metadata(Config):
         None, ge=0, le=256, description="Windows that a stream replays to settle; None: settle_windows."
     )
     limits: BundleLimits | None = None
+    refine: Literal["auto", "off"] = Field(
+        "auto", description="Whether a node may refine the angular velocity of this model's estimates."
+    )
 
     def non_default_fields(self) -> set[str]:
         """Names of the fields whose values are not the defaults."""

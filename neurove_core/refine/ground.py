@@ -21,15 +21,17 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from neurove_core.ingest.sample import Sample
 from neurove_core.refine import ground_kernels as kernels
 from neurove_core.refine.ground_kernels import Image, Rays
 from neurove_core.refine.ground_search import Prior, climb, curvature, motion_of, objective
+from neurove_core.refine.view import View
 from neurove_protocol import CameraInfo
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
-Outcome = Literal["accepted", "tilting", "few events", "contradicted"]
+Outcome = Literal["accepted", "tilting", "few events", "noise", "contradicted"]
 
 SPAN_US: Final = 200_000
 """Time whose events are used. One constant motion is assumed; shorter spans are worse below 2 m/s."""
@@ -41,7 +43,7 @@ WINDOW_EVENTS: Final = 2000
 """Most events that are kept of one window; 16 bytes each."""
 
 LEAST_EVENTS: Final = 200
-"""With fewer events on the ground there is no answer: the camera is stationary, or the ground has no texture."""
+"""With fewer events on the ground there is no answer."""
 
 PITCH: Final = math.radians(5)
 """Pitch of a camera before anything is known [rad], positive downwards."""
@@ -50,6 +52,10 @@ PITCH_SIGMA: Final = math.radians(4)
 
 MAX_TILT_RAD_S: Final = 0.15
 """Greatest rate of pitch and roll of a vehicle. Streets shake a camera at .03 rad/s."""
+
+MIN_STRUCTURE: Final = (0.52, 0.23)
+"""Least structure of few events, and what EVENTS add to it, by the square of their number. That of noise is .35 to .5
+with 1000 events and .5 to .66 with EVENTS, that of a street at 0.3 m/s from 1 m is .63 or more with 1900."""
 
 MAX_SIGMAS: Final = 5.0
 """Greatest distance from what was known before."""
@@ -66,6 +72,7 @@ _WEIGHT: Final = 0.02  # of the prior
 _SIGMA_M_S: Final = (0.3, 0.1, 0.8)  # of the velocity: right, into the ground, ahead
 _SIGMA_SHARE: Final = 0.1  # the same as a share of the speed, above 10 m/s
 _SIGMA_RAD_S: Final = (0.02, 0.1)  # bounds of the sigma of the angular velocity
+_DRAWN: Final = 4 / 9  # mean square of the weights of an event that is drawn into four cells, two axes
 _STEPS: Final = 25  # evaluations of a search
 _TOLERANCE: Final = 0.02  # of a search [sigma]
 _DIFFERENCE: Final = 0.1  # for second derivatives [sigma]
@@ -101,8 +108,8 @@ class GroundMotion(NamedTuple):
     pitch: float  # [rad], positive downwards
     gain: float  # logarithm of the sharpness, over that of the motion known before
     gain_moving: float  # the same, over that of turning without moving
+    structure: float  # the same, over that of as many events that do not belong together
     distance: float  # from what was known before [sigma]
-    share: float  # of the events that lie on sharper edges than without moving
     events: int  # of the search
 
 
@@ -112,6 +119,20 @@ class Answer(NamedTuple):
     outcome: Outcome
     motion: GroundMotion | None  # also where it is not accepted, but for "few events" and "tilting"
     state: GroundState
+
+
+def events_of(view: View, sample: Sample, start_us: int) -> GroundEvents:
+    """The events of a window that begins at `start_us`, without those outside the lens model."""
+    x, y = view.rays[:, sample.y, sample.x]
+    kept = np.isfinite(x) & np.isfinite(y)
+    return GroundEvents(x[kept], y[kept], start_us + sample.t_us[kept].astype(np.int64))
+
+
+def compile_kernels(camera: CameraInfo) -> None:
+    """Run all compiled code once, on made-up events."""
+    x, y = (np.linspace(low, 0.4, LEAST_EVENTS, dtype=np.float32) for low in (-0.2, 0.2))
+    events = GroundEvents(x, y, np.arange(LEAST_EVENTS, dtype=np.int64))
+    refine(events, 0, SPAN_US, camera, np.zeros(6), np.full(3, 0.1), GroundState())
 
 
 def refine(
@@ -139,6 +160,7 @@ def refine(
         - the camera pitches or rolls faster than MAX_TILT_RAD_S, or has done so in the last SPAN_US ("tilting"): a
           camera in a hand is not at a known height and pitch;
         - there are fewer than LEAST_EVENTS on the ground ("few events");
+        - its events do not belong together ("noise"), as those of a stationary camera;
         - it is more than MAX_SIGMAS from what was known before ("contradicted").
     """
     recent = state.recent if state.end_us in (None, start_us) else ()
@@ -155,6 +177,8 @@ def refine(
         return Answer("few events", None, state._replace(last=None))
     begin_us = end_us - min(SPAN_US, (end_us - start_us) * len(state.recent))
     found, unknowns, pitch_sigma = _searched(seen, (begin_us + end_us) // 2, camera, twist, sigma_rad_s, state)
+    if found.structure < MIN_STRUCTURE[0] + MIN_STRUCTURE[1] * (found.events / EVENTS) ** 2:
+        return Answer("noise", found, state._replace(last=None))
     if found.distance > MAX_SIGMAS:
         return Answer("contradicted", found, state._replace(last=None))
     pitch, pitch_sigma = _learned(state, found.pitch, pitch_sigma, 1 / len(state.recent))
@@ -215,8 +239,8 @@ def _searched(
         pitch=prior.pitch + float(unknowns[6]),
         gain=sharp - before,
         gain_moving=sharp - still,
+        structure=sharp - _own(rays, image),
         distance=float(np.linalg.norm(z[:6])),
-        share=float((kernels.scores(rays, motion, image) > kernels.scores(rays, turning, image)).mean()),
         events=rays.x.size,
     )
     return found, motion[:6], math.sqrt(covariance[6, 6]) / _CALIBRATION
@@ -246,6 +270,12 @@ def _bell(sigma: float) -> NDArray[np.float32]:
     reach = math.ceil(_REACH * sigma)
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
     return np.asarray(weights / weights.sum(), np.float32)
+
+
+def _own(rays: Rays, image: Image) -> float:
+    """The logarithm of the part of the sharpness that each event has by itself."""
+    middle = (float(kernel[kernel.size // 2]) ** 2 for kernel in (image.narrow, image.wide))
+    return math.log(float((rays.weight**2).sum()) * (next(middle) - next(middle)) * _DRAWN)
 
 
 def _prior(twist: Array, height_m: float, sigma_rad_s: Array, state: GroundState) -> Prior:
@@ -281,4 +311,5 @@ def _covariance(z: Array, gradient: Array, rays: Rays, image: Image, prior: Prio
     turn = np.eye(7)
     pitch = prior.pitch + float(prior.mean[6] + prior.sigma[6] * z[6])
     turn[1:3, 1:3] = [[math.cos(pitch), -math.sin(pitch)], [math.sin(pitch), math.cos(pitch)]]
-    return np.asarray(turn @ along @ turn.T)
+    found = turn @ along @ turn.T
+    return np.asarray((found + found.T) / 2)  # symmetric to the last bit, as the wire format requires

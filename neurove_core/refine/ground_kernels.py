@@ -195,22 +195,6 @@ def _blur_reference(cells: Array, kernel: Floats) -> Array:
 
 
 @compiled
-def scores(rays: Rays, motion: Array, image: Image) -> Array:  # pragma: no cover (machine code)
-    """The value (N,) of the band-passed image at each moved event; 0 for a dropped one."""
-    columns, rows = np.empty(rays.x.size), np.empty(rays.x.size)
-    cells, out = np.zeros((image.height, image.width), np.float32), np.zeros(rays.x.size)
-    place(rays, motion, image, columns, rows, cells)
-    band = _banded(cells, image)
-    for i in range(rays.x.size):
-        if columns[i] >= 0:
-            column, row = int(columns[i]), int(rows[i])
-            u, v = columns[i] - column, rows[i] - row
-            above = band[row, column] * (1 - u) + band[row, column + 1] * u
-            out[i] = above * (1 - v) + (band[row + 1, column] * (1 - u) + band[row + 1, column + 1] * u) * v
-    return out
-
-
-@compiled
 def crowding(x: Array, y: Array, image: Image, reach: int) -> Array:  # pragma: no cover (machine code)
     """The number of events (N,) within `reach` cells of each event, without motion."""
     counts, rows = np.zeros((image.height, image.width)), np.zeros((image.height, image.width))

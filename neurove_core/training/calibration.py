@@ -15,7 +15,7 @@ import copy
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -30,7 +30,8 @@ from neurove_core.models.bounds import UNSET, Bounds
 from neurove_core.models.bundle import PER_HEIGHT, Bundle
 from neurove_core.models.uncertainty import LEVEL, LEVELS, Uncertainty, half_width
 from neurove_core.networks.encoding import to_spikes
-from neurove_core.networks.neurove import NeuroVE
+from neurove_core.networks.neurove import NetworkState, NeuroVE
+from neurove_core.timescales import Answer, Longer, chosen, followed, jobs, slowed
 from neurove_core.training.batches import mirrored, with_gain, with_noise
 from neurove_core.training.config import DataConfig, TrainingConfig
 from neurove_core.training.data import Cache, Sequences
@@ -50,6 +51,7 @@ _SEED_SHIFT: Final = 450_000_000  # distance from the seeds of training
 _SEEDS: Final = 900_000_000
 _KIND_SEEDS: Final = 1_000_000  # distance between the sets of sequences
 _FOLDS: Final = 4
+_PROVENANCE_CHARS: Final = 1000
 _PENALTY: Final = 0.003  # on the weights of the spread; its inputs have variance 1 on average
 _NEWTON_STEPS: Final = 50
 _CLIPPED: Final = 3.0  # limit of an error in the correlation, in sigma, so that one bad sequence does not dominate
@@ -187,6 +189,28 @@ def with_uncertainty(
     return Calibration(made.with_digest(), _report(held, factor, provenance))
 
 
+def with_wider_sigma(bundle: Bundle, factor: Array, provenance: str) -> Bundle:
+    """Multiply the sigma of each axis of a calibrated bundle; its twists stay the same.
+
+    Args:
+        bundle: with an uncertainty.
+        factor: (6), above 0.
+        provenance: one line on where the factors come from; it is added to that of the uncertainty.
+
+    Raises:
+        BadModel: the bundle has no uncertainty.
+    """
+    network = _copy(bundle)
+    if bundle.uncertainty is None or network.spread is None:
+        raise BadModel(bundle.name, "it has no uncertainty: neurove calibrate adds it")
+    leak = 1 - float(torch.sigmoid(network.kappa_logit.detach()))
+    with torch.no_grad():  # the leaky neuron integrates log(factor) * leak to log(factor)
+        network.spread.bias.add_(torch.from_numpy(np.log(factor) * leak).float())
+    about = f"{bundle.uncertainty.provenance}; {provenance}"[:_PROVENANCE_CHARS]
+    changed = replace(bundle.uncertainty, provenance=about)
+    return replace(bundle, network=network.eval(), uncertainty=changed).with_digest()
+
+
 def collect_errors(bundle: Bundle, parts: list[tuple[Sequences, bool]]) -> Iterator[SequenceErrors]:
     """Run a model on every variant of all sequences, and yield its errors; the bool marks the hard sets."""
     probe = _copy(bundle)
@@ -202,8 +226,8 @@ def collect_errors(bundle: Bundle, parts: list[tuple[Sequences, bool]]) -> Itera
             rng = np.random.default_rng((203, number))
             counts, twists = found.counts(index, 0, len(found.twists[index])), found.twists[index]
             variants = variants_of(rng, counts, twists)
-            seen = np.stack([network_input(seen, bundle.config) for seen, _ in variants], 1)
-            spikes = to_spikes(torch.from_numpy(seen), bundle.config.network.encoding)
+            counted = np.stack([network_input(seen, bundle.config) for seen, _ in variants], 1)
+            spikes = to_spikes(torch.from_numpy(counted), bundle.config.network.encoding)
             state, inputs, outputs = probe.initial_state(len(variants)), [], []
             for step in range(len(counts)):
                 output, state = engine(spikes[step : step + 1], state)
@@ -213,9 +237,41 @@ def collect_errors(bundle: Bundle, parts: list[tuple[Sequences, bool]]) -> Itera
                 outputs.append(output[0].double().numpy())
             truth = np.stack([true for _, true in variants], 1)
             error = np.stack(outputs) - (truth - bundle.offset.double().numpy()) / bundle.scale.double().numpy()
-            for stream, variant in enumerate(VARIANTS):
-                yield SequenceErrors(np.stack(inputs)[:, stream], error[:, stream], number, variant, hard)
+            for stream, (variant, (windows, true)) in enumerate(zip(VARIANTS, variants, strict=True)):
+                seen, off = np.stack(inputs)[:, stream], error[:, stream]
+                if bundle.config.scales:
+                    seen, off = _served(bundle, probe, engine, windows, true)
+                yield SequenceErrors(seen, off, number, variant, hard)
             number += 1
+
+
+def _served(
+    bundle: Bundle, probe: NeuroVE, engine: Engine, stored: NDArray[np.uint8], truth: NDArray[np.float32]
+) -> tuple[Array, Array]:
+    """Inputs of the spread and errors of a model with longer windows, of the answers that it would serve.
+
+    The error of an answer counts times its scale, because its sigma is divided by the scale.
+    """
+    config, offset, scale = bundle.config, bundle.offset.double().numpy(), bundle.scale.double().numpy()
+
+    def run(counts: NDArray[np.uint8], state: NetworkState) -> tuple[Array, NetworkState]:
+        output, after = engine(to_spikes(torch.from_numpy(counts)[None, None], config.network.encoding), state)
+        return output[0, 0].double().numpy() * scale + offset, after
+
+    state = probe.initial_state()
+    longer, inputs, errors = Longer(), [], []
+    for window, true in zip(network_input(stored, config), truth, strict=True):
+        twists, state = run(window, state)
+        wanted, longer = jobs(window, longer, probe, config)
+        done = [(job, *run(job.counts, cast("NetworkState", job.state))) for job in wanted]
+        longer = followed(longer, [(job, after) for job, _, after in done], config)
+        answers = [Answer(twists, state), *(Answer(slowed(t, job.scale), s, job.scale) for job, t, s in done)]
+        best = chosen(answers, longer.windows, config.scale_bounds)
+        potential = probe.log_sigma(cast("NetworkState", best.network))
+        assert potential is not None  # the probe has a spread
+        inputs.append(potential[0].double().numpy())
+        errors.append((best.twists - true) * best.scale / scale)
+    return np.stack(inputs), np.stack(errors)
 
 
 def variants_of(

@@ -86,7 +86,7 @@ def train(
     out: Path,
     data: Path,
     *,
-    more: Sequence[Path] = (),
+    more: Sequence[Path | Span] = (),
     held: Held | None = None,
     resume: bool = False,
     start: Bundle | None = None,
@@ -100,7 +100,7 @@ def train(
         config: of the run.
         out: folder for the checkpoint, run.json, the curve and the bundle.
         data: folder of the sequences, filled by `Cache.fill` and `RecordedSequences.fill`.
-        more: files of further sequences, as `data.save` writes them.
+        more: files of further sequences, as `data.save` writes them, or spans of their windows.
         held: windows that validate the run; without them it is not validated and not stopped early. With them, the
             held-out parts of the recordings are not trained on; see `RecordedSequences.split`.
         resume: continue from the checkpoint in `out`, if it exists.

@@ -110,9 +110,10 @@ def validate(network: Network, held: Held, config: TrainingConfig, scaling: tupl
         if segment is None:
             continue
         error = _error(copy, Segment(*(one.to(device) for one in segment)), config, scaling)
+        # an axis without truth, such as the lateral one of a wheel, counts as no error; a part without truth has none
         for part, unit, values in (("linear", "m_s", error[..., :3]), ("angular", "rad_s", error[..., 3:])):
-            lengths = torch.linalg.vector_norm(values, dim=-1)
-            known = lengths.isfinite()
+            known = values.isfinite().any(-1)
+            lengths = torch.linalg.vector_norm(values.nan_to_num(0.0), dim=-1)
             if known.any():
                 point[f"{name}_{part}_error_{unit}"] = float(lengths[known].mean())
     return point

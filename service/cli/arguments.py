@@ -61,6 +61,12 @@ def add_lens_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--height", type=metres, metavar="M", help="height of the camera above the ground [m]")
 
 
+def add_refine_flag(parser: argparse.ArgumentParser) -> None:
+    """Add whether the angular part of estimates is refined."""
+    about = "refine the angular velocity by the events of each window; default auto: if the lens is known"
+    parser.add_argument("--refine", choices=("auto", "off"), default="auto", help=about)
+
+
 def add_axes_flag(parser: argparse.ArgumentParser) -> None:
     """Add the mounting of the inertial unit, if the recording lacks it."""
     about = "axes of the inertial unit along x (right), y (down), z (forward) of the camera, such as -x,y,-z; write "
@@ -138,6 +144,17 @@ def metres(text: str) -> float:
     if not 0 < value < math.inf:
         raise argparse.ArgumentTypeError(f"{text!r}: give metres above 0")
     return value
+
+
+def numbers(text: str) -> tuple[float, float, float]:
+    """Three numbers with commas between."""
+    try:
+        first, second, third = (float(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r}: give three numbers, such as 0,10,0") from None
+    if not all(map(math.isfinite, (first, second, third))):
+        raise argparse.ArgumentTypeError(f"{text!r}: give finite numbers")
+    return first, second, third
 
 
 def sigma(text: str) -> float:

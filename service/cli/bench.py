@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 ALL = (
     "ingest",
     "window",
+    "refinement",
     "end-to-end",
     "train",
     "streams",
@@ -63,13 +64,14 @@ def bench(args: argparse.Namespace) -> int:
 
 
 def _rows(name: str, args: argparse.Namespace, missing: list[str]) -> Iterator["Row"]:
-    from neurove_core.bench import ingest, processes, simulate, sine, window
+    from neurove_core.bench import ingest, processes, refinement, simulate, sine, window
     from neurove_service.clients import bench_wire
 
     options = {"quick": args.quick, "with_peers": args.peers}
     run: dict[str, Callable[[], list[Row]]] = {
         "ingest": lambda: ingest.ingest(_rounds(args, 21), missing, **options),
         "window": lambda: window.window(_rounds(args, 15), missing, **options),
+        "refinement": lambda: refinement.refinement(_rounds(args, 15), quick=args.quick),
         "end-to-end": lambda: ingest.end_to_end(_rounds(args, 15), missing, **options),
         "train": lambda: window.train(_rounds(args, 3), missing, **options),
         "streams": lambda: window.streams(_rounds(args, 21), quick=args.quick),

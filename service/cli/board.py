@@ -256,6 +256,8 @@ def status_notes(status: StreamStatus) -> Iterator[str]:
         yield f"{status.stream}: {status.verdict}: {status.why}"
     if status.refusal and status.refusal not in status.why:
         yield f"{status.stream}: refused: {status.refusal}"
+    if status.unrefined_windows:
+        yield f"{status.stream}: {status.unrefined_windows:,} windows not refined, because the node was behind"
     if status.imu is not None:
         yield f"{status.stream}: {imu_text(status.imu)}"
     if status.uncounted_packets:

@@ -44,6 +44,7 @@ COMMANDS = (
     ),
     Command("train", "Train a model on simulated sequences and recordings.", "training", "train"),
     Command("calibrate", "Fit the uncertainty of a trained model on new simulated sequences.", "training", "train"),
+    Command("adapt", "Make a model better on one robot, from its recorded drive with odometry.", "adapting", "train"),
     Command("evaluate", "Compare a model's estimates with the truth, as RMSE and RE.", "training", "serve"),
     Command("reproduce", "Repeat the experiments of the paper.", "experiments", "experiments"),
     Command("bench", "Measure the speed of this machine, as ratios within one run.", "bench", "bench"),

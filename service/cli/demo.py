@@ -47,7 +47,7 @@ def run(
     source: str,
     *,
     playing: Sequence[str],
-    model: str | None,
+    serving: Sequence[str],
     stop: threading.Event,
     console: Console,
     screenshot: Path | None = None,
@@ -58,7 +58,7 @@ def run(
     Args:
         source: as sources.open_source.
         playing: flags of `neurove drive` that say how to read and to play the source.
-        model: as `neurove serve --model`.
+        serving: flags of `neurove serve`, such as its model.
         stop: ends the demo early.
         console: receives the live table, if it is a terminal.
         screenshot: SVG file to write the last live table to.
@@ -74,7 +74,7 @@ def run(
     config = ClientConfig(connect=(endpoint,))
     comparison = Comparison(truth)
     board = Board(truth=None if truth is None else comparison.truth_of)
-    serve = ["serve", "--listen", endpoint, "--node", "demo", *(["--model", model] if model else [])]
+    serve = ["serve", "--listen", endpoint, "--node", "demo", *serving]
     drive = ["drive", source, "--connect", endpoint, "--stream", STREAM, "--wait", "10", "--json", *playing]
     with _process(*serve) as service, _session(config, service, stop, console) as transport:
 

@@ -20,6 +20,7 @@ from neurove_service.cli.arguments import (
     add_force,
     add_lens_flags,
     add_recording_flags,
+    add_refine_flag,
     command,
     duration,
     refuse_existing,
@@ -167,7 +168,7 @@ def estimate(args: argparse.Namespace) -> int:
     refuse_existing("estimate", "--out", path, args.source, force=args.force)
     camera = lens_of(recording, args.calibration, args.height)
     torch.set_num_threads(1)
-    estimator = Estimator(models.find(args.model))
+    estimator = Estimator(models.find(args.model), refine=args.refine == "auto")
     offline = Offline(estimator, camera, getattr(recording, "stream", _STREAM))
     told = _Told(estimator, recording)
     with event_count(recording.name) as show, estimate_file(path) as add:
@@ -267,6 +268,7 @@ def add_estimate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--model", default="default", metavar="BUNDLE", help=about)
     add_lens_flags(parser)
     add_recording_flags(parser)
+    add_refine_flag(parser)
     add_axes_flag(parser)
     parser.add_argument("--no-imu", action="store_true", help="use the events alone, not the inertial samples")
     parser.add_argument("--seconds", type=duration, metavar="S", help="seconds of the recording to read; default: all")

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from neurove_protocol.errors import EXIT_FAILURE, InvalidField
-from neurove_service.cli.arguments import check_folder, commit, count, seed, subcommand
+from neurove_service.cli.arguments import add_refine_flag, check_folder, commit, count, seed, subcommand
 from neurove_service.cli.bars import progress
 from neurove_service.cli.parser import Parser
 
@@ -43,6 +43,31 @@ def reproduce_repriming(args: argparse.Namespace) -> int:
     for file in files:
         print(f"wrote {file}", file=sys.stderr)
     return 0 if report.least_primed is not None else EXIT_FAILURE
+
+
+def reproduce_sight(args: argparse.Namespace) -> int:
+    """Shuffle, reverse and speed up the times of the events, to learn what a model sees."""
+    import torch
+
+    from neurove_core import models
+    from neurove_core.estimator import Estimator
+    from neurove_core.experiments import real, sight
+
+    if args.recordings and not args.recordings.is_dir():
+        raise InvalidField("reproduce", "--recordings", str(args.recordings), "it is not a folder")
+    _check_out(args.out)
+    torch.set_num_threads(1)
+    estimator = Estimator(models.find(args.model), refine=args.refine == "auto")
+    rows = []
+    for row in sight.run(estimator, args.recordings, quick=args.quick):
+        rows.append(row)
+        print(row["case"], file=sys.stderr)
+    about = {"model": estimator.bundle.info.model_dump()} | _made_by() | {"quick": args.quick}
+    results = about | {"sentence": sight.sentence(rows), "cases": rows}
+    print(json.dumps(results) + "\n" if args.json else sight.markdown(rows, real.title(about)), end="")
+    for file in sight.save(rows, about, args.out) if args.out else []:
+        print(f"wrote {file}", file=sys.stderr)
+    return 0
 
 
 def reproduce_sine(args: argparse.Namespace) -> int:
@@ -86,7 +111,7 @@ def reproduce_real(args: argparse.Namespace) -> int:
     from neurove_core.experiments import real
 
     _check_out(args.out)
-    rows, about = _real_rows(args.model, args.recordings, args.out)
+    rows, about = _real_rows(args.model, args.recordings, args.out, refine=args.refine == "auto")
     print(json.dumps(about | {"checks": rows}) if args.json else real.markdown(rows, real.title(about)), end="")
     if any(row["skipped"] is None for row in rows):
         return 0
@@ -95,7 +120,33 @@ def reproduce_real(args: argparse.Namespace) -> int:
     return EXIT_FAILURE
 
 
-def _real_rows(model: str, recordings: Path, out: Path | None) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+def reproduce_motion(args: argparse.Namespace) -> int:
+    """Evaluate a model on slow and fast drives, constant motion, rooms and real events, against what is asked of it."""
+    import torch
+
+    from neurove_core import models
+    from neurove_core.estimator import Estimator
+    from neurove_core.experiments.motion import run, sets
+
+    groups = args.sets.split(",") if args.sets else (*sets.GROUPS, sets.REAL)
+    if args.recordings and not args.recordings.is_dir():
+        raise InvalidField("reproduce", "--recordings", str(args.recordings), "it is not a folder")
+    for folder in (args.out, args.data):
+        _check_out(folder)
+    torch.set_num_threads(1)
+    estimator = Estimator(models.find(args.model), refine=args.refine == "auto")
+    with progress() as show:
+        found = run.run(estimator, groups, args.recordings, args.data, show, quick=args.quick)
+    results = {"model": estimator.bundle.info.model_dump()} | _made_by() | {"quick": args.quick} | found
+    print(json.dumps(results) + "\n" if args.json else run.markdown(results), end="")
+    for file in run.save(results, args.out) if args.out else []:
+        print(f"wrote {file}", file=sys.stderr)
+    return 0
+
+
+def _real_rows(
+    model: str, recordings: Path, out: Path | None, *, refine: bool = True
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
     """Run all checks of a model, print the name of each, and write them into `out`.
 
     Returns:
@@ -108,7 +159,7 @@ def _real_rows(model: str, recordings: Path, out: Path | None) -> tuple[list[dic
     from neurove_core.experiments import real
 
     torch.set_num_threads(1)
-    estimator = Estimator(models.find(model))
+    estimator = Estimator(models.find(model), refine=refine)
     rows = []
     for row in real.run(estimator, recordings):
         rows.append(row)
@@ -184,7 +235,9 @@ def add_reproduce(parser: Parser) -> None:
     """Add the commands of `neurove reproduce`."""
     commands = parser.add_commands()
     _add_firing(subcommand(commands, "firing", reproduce_firing))
+    _add_motion(subcommand(commands, "motion", reproduce_motion))
     _add_repriming(subcommand(commands, "repriming", reproduce_repriming))
+    _add_sight(subcommand(commands, "sight", reproduce_sight))
     _add_sine(subcommand(commands, "sine", reproduce_sine))
     _add_real(subcommand(commands, "real", reproduce_real))
     _add_velocity(subcommand(commands, "velocity", reproduce_velocity))
@@ -195,6 +248,21 @@ def _add_firing(parser: argparse.ArgumentParser) -> None:
     _add_out(parser, "folder for table and figure (PNG, SVG)")
 
 
+def _add_motion(parser: argparse.ArgumentParser) -> None:
+    about = "file of a bundle, or the name of a built-in model; default `default`"
+    parser.add_argument("model", nargs="?", default="default", metavar="BUNDLE", help=about)
+    about = "folder of real recordings and trajectories; without it their rows are skipped"
+    parser.add_argument("--recordings", type=Path, metavar="DIR", help=about)
+    about = "folder that keeps the simulated events, about 3 GB for all sets; default runs/motion"
+    parser.add_argument("--data", type=Path, default=Path("runs/motion"), metavar="DIR", help=about)
+    about = "sets to evaluate, separated by commas; default: all"
+    parser.add_argument("--sets", metavar="SET,...", help=about)
+    about = "one second of one recording per set through a tiny camera, to check that the command works"
+    parser.add_argument("--quick", action="store_true", help=about)
+    add_refine_flag(parser)
+    _add_out(parser, "folder for motion.json and motion.md")
+
+
 def _add_repriming(parser: argparse.ArgumentParser) -> None:
     about = "name of a built-in model, or file of a bundle; default `default`"
     parser.add_argument("--model", default="default", metavar="BUNDLE", help=about)
@@ -202,6 +270,17 @@ def _add_repriming(parser: argparse.ArgumentParser) -> None:
     about = "numbers of windows to replay; default 8,16,32,64"
     parser.add_argument("--primed", type=_numbers, metavar="N,...", help=about)
     _add_out(parser, "folder for table, figures and picture")
+
+
+def _add_sight(parser: argparse.ArgumentParser) -> None:
+    about = "file of a bundle, or the name of a built-in model; default `default`"
+    parser.add_argument("model", nargs="?", default="default", metavar="BUNDLE", help=about)
+    about = "folder of the real recordings; without it only simulated drives are used"
+    parser.add_argument("--recordings", type=Path, metavar="DIR", help=about)
+    about = "two short drives through a small camera: a minute less, and figures that vary more"
+    parser.add_argument("--quick", action="store_true", help=about)
+    add_refine_flag(parser)
+    _add_out(parser, "folder for sight.json, sight.md and the figure (PNG, SVG)")
 
 
 def _add_sine(parser: argparse.ArgumentParser) -> None:
@@ -220,6 +299,7 @@ def _add_real(parser: argparse.ArgumentParser) -> None:
     about = "file of a bundle, or the name of a built-in model; default `default`"
     parser.add_argument("model", nargs="?", default="default", metavar="BUNDLE", help=about)
     parser.add_argument("--recordings", type=Path, required=True, metavar="DIR", help="folder of the recordings")
+    add_refine_flag(parser)
     _add_out(parser, "folder for real.json and real.md")
 
 

@@ -18,6 +18,7 @@ from neurove_service.cli.arguments import (
     add_force,
     add_lens_flags,
     add_playback_flags,
+    add_refine_flag,
     add_service_flags,
     add_source,
     client_config,
@@ -171,7 +172,7 @@ def demo(args: argparse.Namespace) -> int:
     summary = run(
         args.source,
         playing=_playing(args, duration_s),
-        model=args.model,
+        serving=["--refine", args.refine, *(["--model", args.model] if args.model else [])],
         stop=stop,
         console=shown,
         screenshot=args.screenshot,
@@ -243,6 +244,7 @@ def add_demo(parser: argparse.ArgumentParser) -> None:
     add_lens_flags(parser)
     most = f"{_DEFAULT_DEMO_S:.0f} s of an endless source that no terminal shows"
     add_playback_flags(parser, f"seconds of the source to play; default: until its end or Ctrl-C, {most}")
+    add_refine_flag(parser)
     about = "bundle to serve, or the name of a built-in model; default `default`"
     parser.add_argument("--model", metavar="BUNDLE", help=about)
     parser.add_argument("--screenshot", type=Path, metavar="FILE", help="write the last live table as SVG")

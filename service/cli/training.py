@@ -12,6 +12,7 @@ from neurove_service.cli.arguments import (
     add_force,
     add_lens_flags,
     add_recording_flags,
+    add_refine_flag,
     check_folder,
     command,
     count,
@@ -109,7 +110,7 @@ def evaluate(args: argparse.Namespace) -> int:
     from neurove_core.sources import open_source
 
     torch.set_num_threads(1)
-    estimator = Estimator(models.find(args.model))
+    estimator = Estimator(models.find(args.model), refine=args.refine == "auto")
     given = motion.twists(read_truth(args.truth)) if args.truth else None
     if args.plot:
         check_folder("evaluate", "--plot", args.plot)
@@ -243,6 +244,7 @@ def add_evaluate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--truth", type=Path, metavar="FILE", help=about)
     add_recording_flags(parser)
     add_lens_flags(parser)
+    add_refine_flag(parser)
     parser.add_argument("--no-imu", action="store_true", help="use the events alone, not the inertial samples")
     parser.add_argument("--plot", type=Path, metavar="DIR", help="draw truth and estimate over time into this folder")
 

@@ -38,6 +38,7 @@ class Rules(NamedTuple):
     prime_s: float = 15.0  # maximum wait for windows that a bundle needs beyond those that are kept [s]
     warm_up_share: float = 1.0  # bound of the 99th percentile of the time for a window, as a share of its duration
     bounds: Bounds = UNSET  # of sigma, for the flag `uncertain`; they take precedence over those of a bundle
+    refine: bool = False  # whether models may refine their estimates, see `Estimator`
 
 
 class Context(NamedTuple):
@@ -182,7 +183,7 @@ class Change:
         if self._plan.shapes.need_child(found.config, free):
             self._report("compiling", "code for a network of this shape, in a process of its own")
             precompile.in_child(found.config, self._plan.closing)
-        estimator = Estimator(found, bounds=self._rules.bounds)
+        estimator = Estimator(found, bounds=self._rules.bounds, refine=self._rules.refine)
         self._report("loaded", f"{found.info.parameters:,} parameters")
         admission.check_first_windows(estimator, share)
         estimator.warm_up()

@@ -2,7 +2,6 @@
 
 from neurove_core import self_test
 from neurove_core.estimator import Estimator
-from neurove_core.models.bounds import Bounds
 from neurove_core.models.bundle import Bundle
 from neurove_protocol.errors import BadModel, UnknownModel, Untrained
 from neurove_service import logs
@@ -47,9 +46,9 @@ def kept(library: Library, digest: str, trained_only: bool) -> Bundle | None:
         return None
 
 
-def try_again(shared: SharedPlan, tried: Bundle, bounds: Bounds) -> None:
+def try_again(shared: SharedPlan, estimator: Estimator) -> None:
     """Let a model serve whose probation waited for windows before the restart; `resume` goes on with the probation."""
-    first, estimator = shared.current.active.estimator, Estimator(tried, bounds=bounds)
+    first, tried = shared.current.active.estimator, estimator.bundle
     try:
         estimator.warm_up()
         self_test.check(estimator)

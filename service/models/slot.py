@@ -61,7 +61,8 @@ class ModelSlot:
     ) -> None:
         library = Library(models_dir, pushed)
         active, previous = (restart.kept(library, digest, trained_only) if digest else None for digest in kept)
-        estimator = Estimator(restart.first(library, model, active, trained_only), bounds=rules.bounds)
+        first = restart.first(library, model, active, trained_only)
+        estimator = Estimator(first, bounds=rules.bounds, refine=rules.refine)
         name, takes = estimator.bundle.name, "up to 30 s at the first start on a machine"
         log.info("compiling the kernels of the model; `ready` follows", model=name, takes=takes)
         estimator.warm_up()
@@ -79,7 +80,7 @@ class ModelSlot:
         )
         tried = restart.kept(library, trial, trained_only) if trial else None
         if tried is not None and tried.digest != estimator.bundle.digest:
-            restart.try_again(self._shared, tried, rules.bounds)
+            restart.try_again(self._shared, Estimator(tried, bounds=rules.bounds, refine=rules.refine))
 
     def resume(self) -> None:
         """Go on with the probation that waited for windows before a restart; does nothing without one."""

@@ -45,6 +45,7 @@ def _rules(config: ServiceConfig) -> Rules:
         shadow=TrialLimits(config.shadow_divergence),
         probation=TrialLimits(config.probation_divergence),
         bounds=Bounds(config.uncertain_m_s, config.uncertain_rad_s),
+        refine=config.refine == "auto",
     )
 
 

@@ -35,6 +35,7 @@ def stream_status(node: str, stream: Stream, now_ns: int | None = None) -> Strea
         uncounted_packets=counters.uncounted_packets,
         refused_cameras=counters.refused_cameras,
         refusal=stream.activity.refusal,
+        unrefined_windows=counters.unrefined_windows,
         imu=stream.inertial.status(),
     )
 

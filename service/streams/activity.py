@@ -43,6 +43,7 @@ class Counters:
     recovered_packets: int = 0
     uncounted_packets: int = 0
     refused_cameras: int = 0
+    unrefined_windows: int = 0
 
     def losses(self) -> Losses:
         """The counters of data that is not part of an estimate."""

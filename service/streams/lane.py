@@ -26,7 +26,7 @@ class NotFinite(ArithmeticError):
 
 
 class TimedEstimate(NamedTuple):
-    """An estimate and its cost."""
+    """The network's estimate and its cost."""
 
     estimate: WindowEstimate
     rate: float  # share of the estimator's cells that fired
@@ -118,6 +118,28 @@ class Lane:
             answers.append(TimedEstimate(estimate, _rate(state), took_ms))
         self.state = state
         return answers
+
+    def refine(
+        self, answers: list[TimedEstimate], windows: list[Window], *, behind: bool
+    ) -> tuple[list[WindowEstimate], int]:
+        """Refine the angular parts of answers, unless the stream is behind.
+
+        Args:
+            answers: of these windows, in order.
+            windows: those without a sample are not refined.
+            behind: whether to leave the answers as they are.
+
+        Returns:
+            the estimates, and the number of windows that were not refined because the stream is behind.
+        """
+        if behind:
+            return [answer.estimate for answer in answers], sum(window.sample is not None for window in windows)
+        by_start, found = {window.start_us: window for window in windows}, list[WindowEstimate]()
+        for answer in answers:
+            window = by_start[answer.estimate.start_us]
+            estimate, self.state = self.estimator.refine(window, answer.estimate, self.state)
+            found.append(estimate)
+        return found, 0
 
 
 def _rate(state: StreamState) -> float:

@@ -28,6 +28,7 @@ class Pushing(NamedTuple):
     late_events: int
     outside_events: int
     skipped_windows: int
+    unrefined_windows: int = 0  # not refined, because the node is behind
 
 
 class Lanes:
@@ -103,8 +104,10 @@ class Lanes:
         self._roles = roles
         return skipped
 
-    def push(self, packet: Packet) -> Pushing:
-        """Answer every window that a packet completes.
+    def push(self, packet: Packet, *, behind: bool = False) -> Pushing:
+        """Answer every window that a packet completes; without refinement if the stream is behind.
+
+        The comparison gets the network's answers: the refinement makes two models more alike than they are.
 
         After ServingModelFailed, assign the roles again and push the same packet: the standby model answers it.
 
@@ -131,8 +134,9 @@ class Lanes:
         if standby is not None:
             self._add_to_trial(answers, standby, packet, entries)
         outside = sum(window.outside for window in pushed.windows)
-        estimates = [one.estimate for one in answers if lane.may_answer(one.estimate.start_us)]
-        return Pushing(estimates, lane.serving, pushed.late_events, outside, pushed.skipped_windows)
+        refined, unrefined = lane.refine(answers, pushed.windows, behind=behind)
+        estimates = [one for one in refined if lane.may_answer(one.start_us)]
+        return Pushing(estimates, lane.serving, pushed.late_events, outside, pushed.skipped_windows, unrefined)
 
     def run_standby(self) -> None:
         """Process the oldest entry of the standby model's backlog."""
@@ -170,7 +174,7 @@ class Lanes:
         new = self._lane(roles.serving, packet)
         self.serving_lane = new
         if new.estimator.has_same_windows(old.estimator):
-            new.state = new.state._replace(windows=old.state.windows)
+            new.state = new.state._replace(windows=old.state.windows, filter=old.state.filter, ground=old.state.ground)
             return 0
         open_us = old.state.windows.start_us
         new.answer_from(old.state.end_us)

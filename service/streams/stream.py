@@ -25,6 +25,11 @@ log = logs.get(__name__)
 CLOCK_RESET_US = 1_000_000
 """If the sensor time goes back by more than this, the sensor clock was reset; otherwise the packet is late."""
 
+UNREFINED_NS = 50_000_000
+"""The windows of a packet that waited longer are not refined: a slow node leaves out the refinement first.
+
+It is half of the time after which a packet counts as behind, see `overload`."""
+
 _PROCESSED = (None, Order.FIRST, Order.AFTER_GAP, Order.AFTER_RESTART, Order.RECOVERED, Order.UNCOUNTED)
 
 
@@ -120,15 +125,16 @@ class Stream:
 
     def _process(self, packet: Packet, arrival: Arrival, first: Packet) -> list[TwistEstimate]:
         activity, window = self.activity, self.lanes.open_window
-        pushing = self._push(self._intake.without_shed_events(packet, window.start_us if window else None))
+        kept = self._intake.without_shed_events(packet, window.start_us if window else None)
+        pushing = self._push(kept, behind=arrival.queued_ns - arrival.received_ns > UNREFINED_NS)
         self.counters.outside_events += pushing.outside_events
+        self.counters.unrefined_windows += pushing.unrefined_windows
         if pushing.late_events:
             activity.lost("late_events", pushing.late_events)
         if pushing.skipped_windows:
             activity.lost("skipped_windows", pushing.skipped_windows)
-        about = pushing.serving, self.calibration, packet, arrival
         aided = self.inertial.aid(pushing.estimates, pushing.serving.estimator, self.calibration)
-        estimates = [self._answers.of(one, *about) for one in aided]
+        estimates = [self._answers.of(one, pushing.serving, self.calibration, packet, arrival) for one in aided]
         self._intake.compare(first)  # later: the windows ended before this packet
         return estimates
 
@@ -212,15 +218,15 @@ class Stream:
             self._restart()
             self._intake.ages.forget()
 
-    def _push(self, packet: Packet) -> Pushing:
+    def _push(self, packet: Packet, *, behind: bool) -> Pushing:
         self._assign_models(packet)
         try:
-            return self.lanes.push(packet)
+            return self.lanes.push(packet, behind=behind)
         except ServingModelFailed as failure:
             assert self.lanes.serving_lane is not None
             self.models.fault(self.lanes.serving_lane.serving, f"stream {self.name}: {failure}")
             self._assign_models(packet)
-            return self.lanes.push(packet)
+            return self.lanes.push(packet, behind=behind)
 
     def _assign_models(self, packet: Packet) -> None:
         optics = packet.sensor, self.calibration

@@ -1,5 +1,8 @@
 """Time scales: a slow stream in longer windows is estimated as a fast one, divided by the scale."""
 
+from dataclasses import replace
+from typing import cast
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -10,7 +13,10 @@ from neurove_core.geometry.camera import lookup_table
 from neurove_core.ingest import windows
 from neurove_core.ingest.windows import Window, WindowsState
 from neurove_core.models import bundle
+from neurove_core.models.bundle import PER_HEIGHT
 from neurove_core.timescales import STEPS, merged
+from neurove_core.training.calibration import collect_errors
+from neurove_core.training.data import Sequences
 from neurove_protocol import Events, Sensor
 from tests.builders import make_events
 
@@ -113,3 +119,28 @@ def test_scales_and_a_history_exclude_each_other():
     network = PLAIN.network.model_copy(update={"history": (1,)})
     with pytest.raises(ValidationError, match=r"scales=\(2,\): a model with network.history=\(1,\) has none"):
         ModelConfig.model_validate(PLAIN.model_dump() | {"network": network, "scales": (2,)})
+
+
+def test_a_calibration_fits_the_answers_that_the_service_gives():
+    model = scaled((2, 3), (30.0, 30.0))
+    plain = bundle.untrained(3, model)
+    made = replace(plain, scale=plain.scale * 20, linear_unit=PER_HEIGHT)  # so that the bounds divide the windows
+    stored = np.stack([window.counts for window in windows_of(events_of(0.2), PLAIN)])
+    truth = np.random.default_rng(0).normal(size=(len(stored), 5, 6)).astype(np.float32)
+
+    class Drawn:
+        twists = (truth,)
+
+        def __len__(self) -> int:
+            return 1
+
+        def counts(self, _: int, first: int, stop: int) -> np.ndarray:
+            return stored[first:stop]
+
+    errors = next(collect_errors(made, [(cast("Sequences", Drawn()), False)]))
+    estimator = Estimator(made)
+    served, _ = estimator.follow(windows_of(events_of(0.2), PLAIN), estimator.initial_state(SENSOR))
+    off = np.stack([one.twists for one in served]) - truth
+    scale = np.round(errors.error * 20 / off).mean((1, 2))
+    assert set(scale) == {1.0, 2.0, 3.0}
+    np.testing.assert_allclose(errors.error * 20, off * scale[:, None, None], rtol=1e-3, atol=1e-3)

@@ -93,6 +93,7 @@ STATUS: Fields = {
     "uncounted_packets": 0,
     "refused_cameras": 1,
     "refusal": "t0_us=-1: must be 0 or more",
+    "unrefined_windows": 2,
     "imu": {
         "rate_hz": 1000.5,
         "samples": 4_000,

@@ -56,7 +56,14 @@ NULLABLE = {
 }
 FREE_MAPS = ("details", "unreadable", "figures", "partial", "internal_errors")
 DEFAULTED = {"release", "figures", "signature"}  # of a ModelInfo
-DEFAULTED |= {"recovered_packets", "uncounted_packets", "refused_cameras", "refusal", "imu"}  # of a StreamStatus
+DEFAULTED |= {
+    "recovered_packets",
+    "uncounted_packets",
+    "refused_cameras",
+    "refusal",
+    "unrefined_windows",
+    "imu",
+}  # of a StreamStatus
 OUT_OF_BOUND: dict[str, dict[str, tuple[Any, ...]]] = {
     "EventPacket": {
         "stream": ("", "a/b", "@node", "*", "**", ".", "..", "-a", "a" * 65, "caf\u00e9", "a b", "a\n", "$*", "#", "?"),

@@ -23,6 +23,9 @@ from neurove_protocol.errors import InvalidField
 NANOSECONDS_FROM: Final = 1e14
 """A whole-numbered time above this is in ns: in seconds it would be three million years."""
 
+US_PER_UNIT: Final = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
+"""Microseconds in each unit of time."""
+
 _LINES = 20_000  # parsed at once
 _COLUMNS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 _LAYOUTS = (
@@ -33,8 +36,12 @@ _LAYOUTS = (
 )
 
 
-def read_poses(path: Path) -> Poses:
+def read_poses(path: Path, unit: str | None = None) -> Poses:
     """Read the poses of a text file or an HDF5 file, see the module; times in us.
+
+    Args:
+        path: of the file.
+        unit: unit of the times of a text file, s, ms, us or ns; by default as the module says.
 
     Raises:
         InvalidField: a pose is invalid, or its time is not after the previous one; the error names the line or the row.
@@ -50,12 +57,12 @@ def read_poses(path: Path) -> Poses:
         if fault:
             raise UnknownSource(path, fault)
         with path.open(encoding="utf-8-sig", errors="backslashreplace") as text:
-            return _text_poses(path, text)
+            return _text_poses(path, text, unit)
     except OSError as error:
         raise UnknownSource(path, error.strerror or str(error)) from None
 
 
-def read_truth(path: Path) -> Poses:
+def read_truth(path: Path, unit: str | None = None) -> Poses:
     """Read the poses of a file that the user gives as the truth of a recording; see `read_poses`.
 
     Raises:
@@ -63,13 +70,13 @@ def read_truth(path: Path) -> Poses:
             `read_poses`, like BrokenRecording and MissingExtra.
     """
     try:
-        return read_poses(path)
+        return read_poses(path, unit)
     except UnknownSource as error:
         why = f"{error.details['why']}; a truth file has poses of the camera: lines `{' '.join(_COLUMNS)}`, or HDF5"
         raise InvalidField("truth", "FILE", str(path), why) from None
 
 
-def _text_poses(path: Path, text: TextIO) -> Poses:
+def _text_poses(path: Path, text: TextIO, unit: str | None) -> Poses:
     """The poses of a text file; see the module."""
     times: list[NDArray[Any]] = []
     rows: list[NDArray[np.float64]] = []
@@ -89,8 +96,9 @@ def _text_poses(path: Path, text: TextIO) -> Poses:
     t, rest, line = np.concatenate(times), np.concatenate(rows), np.concatenate(numbers)
     whole_numbers = all(part.dtype.kind == "i" for part in times)
     scale = 1e-3 if whole_numbers and (commas or t[-1] > NANOSECONDS_FROM) else 1e6
+    scale = US_PER_UNIT[unit] if unit is not None else scale
     with np.errstate(all="ignore"):
-        t_us = t * scale if t.dtype.kind == "f" or scale > 1 else np.rint(t / 1000)
+        t_us = t * scale if t.dtype.kind == "f" or scale >= 1 else np.rint(t / 1000)
     return checked_poses(t_us, rest[:, :3], rest[:, 3:], lambda i: f"{path}: line {line[i]}")
 
 

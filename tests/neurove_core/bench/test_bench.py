@@ -2,7 +2,20 @@
 
 import pytest
 
-from neurove_core.bench import Row, chart, ingest, interleaved, machine, peers, processes, rows, simulate, sine, window
+from neurove_core.bench import (
+    Row,
+    chart,
+    ingest,
+    interleaved,
+    machine,
+    peers,
+    processes,
+    refinement,
+    rows,
+    simulate,
+    sine,
+    window,
+)
 from neurove_core.config import ModelConfig
 
 QUICK = {"quick": True, "with_peers": True}
@@ -19,6 +32,12 @@ def test_the_fused_recurrence_and_plain_steps_have_equal_results():
 def test_our_pixels_and_the_algorithm_of_v2e_give_the_same_events():
     (row,) = simulate.compare(rounds=1, frames=10)
     assert row.equal
+
+
+def test_the_kernels_of_the_refinement_and_their_plain_form_have_equal_results():
+    alignment, whole = refinement.refinement(1, quick=True)
+    assert alignment.equal
+    assert whole.name == "refinement of a window of 5,000 events"
 
 
 def test_every_round_runs_all_functions_in_turn():

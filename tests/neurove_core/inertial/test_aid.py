@@ -167,3 +167,21 @@ def test_nothing_is_said_about_a_camera_that_hardly_turns():
     _, state = run(units.samples(straight, 8.2), straight, windows=160)
     assert state.agreement == inertial.Agreement()
     assert not state.disagrees
+
+
+@pytest.mark.parametrize("seed", range(20150, 20154))
+def test_any_valid_samples_give_a_finite_estimate_in_bounded_memory(seed):
+    rng, state = np.random.default_rng(seed), InertialState()
+    for number in range(400):
+        now_us, size = number * 10_000, rng.choice([1e-3, 1.0, 1e3])
+        jump_us = int(rng.choice([0, -5_000_000, 3_000_000, 2**61, -(2**61)], p=[0.9, *[0.025] * 4]))
+        n = int(rng.integers(1, 30))
+        t = np.sort(now_us + jump_us + rng.integers(0, 20_000, n))
+        accel, gyro = (np.clip(rng.normal(0, size, (n, 3)), -1e3, 1e3) for _ in range(2))
+        state, _ = inertial.push(state, Imu(t, accel, gyro))
+        if number % 5 == 4:
+            aided, state = inertial.aid(state, units.window(now_us - 40_000, units.shaking, speed=1.0))
+            assert np.isfinite(aided.twists).all()
+            assert (np.diagonal(aided.covariance) > 0).all()
+    assert state.samples.n <= 8192
+    assert state.track.grid_us.size <= 4000

@@ -251,3 +251,17 @@ def test_the_half_width_of_an_interval_is_that_of_a_normal_distribution():
     assert half_width(0.5) == pytest.approx(0.6745, abs=1e-4)
     rng = np.random.default_rng(0)
     assert coverage(rng.normal(size=(20_000, 6)), np.ones((20_000, 6)), 0.5) == pytest.approx(0.5, abs=0.02)
+
+
+def test_a_wider_sigma_multiplies_the_covariance_and_leaves_the_twists(made):
+    """As `neurove adapt` does where the validation pieces need it; the factor is exact in the steady state."""
+    factor = np.array([1.0, 2.0, 3.0, 1.5, 1.0, 4.0])
+    wider = calibration.with_wider_sigma(made.bundle, factor, "by a test")
+    assert wider.digest != made.bundle.digest
+    assert wider.uncertainty.provenance.endswith("; by a test")
+    for one, other in zip(answers(made.bundle), answers(wider), strict=True):
+        np.testing.assert_array_equal(one.twists, other.twists)
+    ratio = np.sqrt(np.diagonal(other.covariance) / np.diagonal(one.covariance))
+    np.testing.assert_allclose(ratio, factor, rtol=0.1)
+    with pytest.raises(BadModel, match="has no uncertainty"):
+        calibration.with_wider_sigma(bundle.untrained(1, SMALL), factor, "by a test")

@@ -122,6 +122,20 @@ def test_without_events_on_the_ground_there_is_no_answer() -> None:
         assert (found.outcome, found.motion) == ("few events", None)
 
 
+@pytest.mark.parametrize("events", [1000, 20_000])
+def test_noise_of_a_stationary_camera_is_not_taken_for_motion(events: int) -> None:
+    rng, state = np.random.default_rng(events), GroundState()
+    for number in range(5):
+        start_us = number * WINDOW_US
+        u, v = rng.integers(0, 172, events), rng.integers(0, 130, events)
+        x, y = ((side - centre) / np.float32(112) for side, centre in ((u, 85.5), (v, 64.5)))
+        t_us = np.sort(rng.integers(start_us, start_us + WINDOW_US, events))
+        noise = GroundEvents(x.astype(np.float32), y.astype(np.float32), t_us)
+        found = refine(noise, start_us, start_us + WINDOW_US, camera(), ahead(0.1), SIGMA_RAD_S, state)
+        state = found.state
+        assert found.outcome == "noise"
+
+
 def test_a_camera_that_pitches_is_not_refined_until_it_has_been_calm() -> None:
     truth = ahead(1.0)
     pitching = truth + np.array([0.0, 0, 0, 0.4, 0, 0])

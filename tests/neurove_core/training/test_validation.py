@@ -103,6 +103,19 @@ def test_the_error_of_a_validation_is_the_mean_length_in_metres_and_ignores_unkn
     assert found == {"step": 0, "recorded_angular_error_rad_s": pytest.approx(expected, rel=1e-5)}
 
 
+def test_an_axis_without_truth_counts_as_no_error_in_a_validation(sequences, held):
+    """As wheel speed has it, of which only vz is known."""
+    run = TrainingRun.begin(TINY, sequences)
+    segment = held.simulated._replace(twists=held.simulated.twists.clone())
+    segment.twists[..., [0, 1, 3, 4, 5]] = torch.nan
+    with torch.no_grad():
+        for parameter in run.network.parameters():
+            parameter.zero_()  # every output is 0: the estimate is the offset
+    found = validate(run.network, Held(segment, None), TINY, (run.offset, run.scale), 0)
+    error = (run.offset - segment.twists).abs()[..., 2] * segment.height_m[:, None]
+    assert found == {"step": 0, "recorded_linear_error_m_s": pytest.approx(float(error.mean()), rel=1e-5)}
+
+
 def test_a_validated_run_takes_the_same_steps_as_one_that_is_not(sequences, held, tmp_path):
     one, other = (TrainingRun.begin(TINY, sequences) for _ in range(2))
     for name, run, sets in (("one", one, None), ("other", other, held)):

@@ -134,11 +134,11 @@ def test_malformed_packets_are_counted_and_lose_nothing_else(worker, published):
 def test_an_internal_error_on_a_packet_does_not_end_the_stream(worker, published, monkeypatch, caplog):
     push, planted = worker.stream.lanes.push, []
 
-    def faulty(packet):
+    def faulty(packet, **how):
         if packet.seq >= 20 and not planted:
             planted.append(packet)
             raise RuntimeError("planted")
-        return push(packet)
+        return push(packet, **how)
 
     monkeypatch.setattr(worker.stream.lanes, "push", faulty)
     for packet in make_packets(100):
@@ -260,8 +260,8 @@ class SlowModel:
     def __init__(self, stream, seconds):
         push = stream.lanes.push
 
-        def slow(packet):
-            pushing = push(packet)
+        def slow(packet, **how):
+            pushing = push(packet, **how)
             time.sleep(seconds * len(pushing.estimates))
             return pushing
 

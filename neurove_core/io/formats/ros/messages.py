@@ -51,6 +51,13 @@ class PoseSample(NamedTuple):
     orientation: tuple[float, float, float, float]
 
 
+class TwistSample(NamedTuple):
+    """One twist: vx vy vz [m/s] wx wy wz [rad/s] in the frame that the header names."""
+
+    stamp_ns: int
+    twist: tuple[float, float, float, float, float, float]
+
+
 class Fields:
     """Reads the fields of a message one after the other.
 
@@ -206,6 +213,13 @@ def odometry(data: bytes, *, cdr: bool) -> PoseSample:
 def _pose(stamp_ns: int, fields: Fields) -> PoseSample:
     numbers = fields.numbers("d", 7)
     return PoseSample(stamp_ns, numbers[:3], numbers[3:])
+
+
+def twist(data: bytes, *, cdr: bool) -> TwistSample:
+    """Parse a geometry_msgs/TwistStamped or the beginning of a TwistWithCovarianceStamped."""
+    fields = Fields(data, cdr=cdr)
+    stamp_ns = fields.header_ns()
+    return TwistSample(stamp_ns, fields.numbers("d", 6))
 
 
 def camera_info(data: bytes, *, cdr: bool) -> CameraInfo | None:

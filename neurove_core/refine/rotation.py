@@ -1,0 +1,197 @@
+"""Refinement of the angular velocity of one window: a stage after the network.
+
+It combines three sources: the network's answer, the refined motion of the window before (a Kalman filter whose
+prediction is that the motion goes on), and the events themselves, by contrast maximisation. The first two are the prior
+of the search, so its result is the most probable motion given all three, and its covariance is that of the posterior.
+
+The motion has a part of three numbers for the translation over the depth of the scene. It keeps a translation from
+being taken for a rotation where the depths differ little. Where they differ much, the parts of the image disagree with
+every motion, and the refinement is not accepted.
+
+The refined motion is accepted if
+- the window is not flagged `low_activity` and has at least MIN_EVENTS events in the view;
+- the events are spread over the image: MIN_SPREAD;
+- the parts of the image agree: their motions differ by at most MAX_APART times what noise explains, and the alignment
+  is at a maximum for MIN_SHARP of the events;
+- the events stay in the image, and the motion is at most MAX_TURN_RAD and MAX_SHIFT over the window;
+- the network does not contradict it: MAX_SIGMAS;
+- the network is not certain that the camera moves fast, which moves near and far things differently: MAX_SPEED;
+- the result is more certain than the network.
+Else the network's answer stands.
+"""
+
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurove_core.ingest.sample import Sample
+from neurove_core.refine.alignment import Grid, Rays
+from neurove_core.refine.search import Agreement, Found, Gaussian, agreement, search
+from neurove_core.refine.view import View
+
+Array = NDArray[np.float64]
+
+Outcome = Literal[
+    "accepted", "few events", "narrow", "disagreeing", "out of range", "contradicted", "moving", "no gain"
+]
+
+MIN_EVENTS: Final = 500
+MIN_SPREAD: Final = 0.04
+"""Effective share of 16 x 16 tiles of the view that hold the events: (sum n)^2 / (256 sum n^2)."""
+
+MAX_APART: Final = 2.0
+MIN_SHARP: Final = 0.8
+MIN_INSIDE: Final = 0.8
+MAX_TURN_RAD: Final = 0.4
+MAX_SHIFT: Final = 0.1
+MAX_SIGMAS: Final = 5.0
+"""Of the network's covariance, with the floor _NETWORK_FLOOR."""
+
+MAX_SPEED: Final = 0.3
+"""Largest linear velocity over the height of the camera [1/s], where it is above _CERTAIN times its sigma."""
+
+_CERTAIN: Final = 1.0
+_NETWORK_SCALE: Final = (
+    1.2  # of the network's sigma in the prior: its errors have heavier tails than a normal distribution
+)
+_REPEATED: Final = 3.0
+"""Factor of the network's sigma while the filter runs: errors of the network last for many windows, and the filter has
+the earlier answers already."""
+
+_NETWORK_FLOOR: Final = 0.02  # [rad/s]
+_SHIFT_SIGMA: Final = 0.05  # of the translation over depth, when nothing is known [1/s]
+_SHIFT_KEPT: Final = 0.95  # share of it that goes on to the next window
+_TURN_NOISE: Final = 0.1  # growth of sigma of the angular velocity per window [rad/s]
+_TURN_NOISE_SHARE: Final = 0.3  # the same, as a share of the angular velocity
+_SHIFT_NOISE: Final = 0.016  # growth of sigma of the translation over depth [1/s]
+_DISPERSION: Final = 2.0  # variance of the events' gradient over that of independent events
+_LOST_SIGMA: Final = 0.5  # the filter begins again above this [rad/s]
+
+
+class Rate(NamedTuple):
+    """An angular velocity with its covariance."""
+
+    w_rad_s: Array  # (3,)
+    covariance: Array  # (3, 3)
+
+
+class Filter(NamedTuple):
+    """State of the Kalman filter of one stream."""
+
+    motion: Array  # (6,) angular velocity [rad/s], and translation over depth [1/s]
+    covariance: Array  # (6, 6)
+    end_us: int  # end of its newest window
+
+
+class Given(NamedTuple):
+    """What is known about one window."""
+
+    start_us: int
+    window_us: int
+    sample: Sample
+    view: View
+    twist: Array  # (6,) the network's, mean of the window [m/s, rad/s]
+    covariance: Array  # (6, 6)
+    low_activity: bool
+    before: Filter | None
+    height_m: float = 1.0  # of the camera, or what the linear part assumes
+
+
+class Refined(NamedTuple):
+    """The angular velocity of one window."""
+
+    rate: Rate
+    outcome: Outcome
+    filter: Filter | None  # for the next window
+
+
+def refine(given: Given) -> Refined:
+    """Refine the angular velocity of a window; if it is not accepted, it is the network's."""
+    known = Rate(given.twist[3:], _with_floor(given.covariance[3:, 3:]))
+    before = _predicted(given.before, given.start_us, given.window_us)
+    not_accepted = Rate(known.w_rad_s, given.covariance[3:, 3:])
+    rays = given.view.rays_of(given.sample, given.window_us)
+    if given.low_activity or rays.x.size < MIN_EVENTS:
+        return Refined(not_accepted, "few events", before)
+    speed, sigma = np.linalg.norm(given.twist[:3]), np.sqrt(np.trace(given.covariance[:3, :3]))
+    if speed > MAX_SPEED * given.height_m and speed > _CERTAIN * sigma:
+        return Refined(not_accepted, "moving", before)
+    if spread(rays, given.view.grid) < MIN_SPREAD:
+        return Refined(not_accepted, "narrow", before)
+    try:
+        return _searched(given, known, before, not_accepted, rays)
+    except np.linalg.LinAlgError:  # events that make no finite Hessian
+        return Refined(not_accepted, "few events", None)
+
+
+def _searched(given: Given, known: Rate, before: Filter | None, not_accepted: Rate, rays: Rays) -> Refined:
+    seconds = given.window_us / 1e6
+    prior = _prior(known, before, seconds)
+    found = search(rays, given.view.grid, prior, _guesses(known, before, seconds))
+    covariance = np.asarray(np.linalg.inv(found.information / _DISPERSION + prior.information) / seconds**2, np.float64)
+    outcome = _outcome(found, agreement(found), rays, known, covariance, seconds)
+    if outcome != "accepted":
+        return Refined(not_accepted, outcome, before)
+    motion, end_us = found.motion / seconds, given.start_us + given.window_us
+    return Refined(Rate(motion[:3], covariance[:3, :3]), outcome, Filter(motion, covariance, end_us))
+
+
+def spread(rays: Rays, grid: Grid) -> float:
+    """Effective share of 16 x 16 tiles of the image that hold the events."""
+    column = ((rays.x - grid.left) * (16 * grid.focal / grid.width)).astype(np.int64).clip(0, 15)
+    row = ((rays.y - grid.top) * (16 * grid.focal / grid.height)).astype(np.int64).clip(0, 15)
+    counts = np.bincount(row * 16 + column, minlength=256).astype(np.float64)
+    return float(counts.sum() ** 2 / (256 * (counts**2).sum()))
+
+
+def _with_floor(covariance: Array) -> Array:
+    return covariance * _NETWORK_SCALE**2 + np.eye(3) * _NETWORK_FLOOR**2
+
+
+def _predicted(before: Filter | None, start_us: int, window_us: int) -> Filter | None:
+    """The filter at the next window: less certain by each window since its newest one; None where it is lost."""
+    if before is None or before.end_us > start_us:
+        return None
+    windows = 1 + (start_us - before.end_us) // window_us
+    turn = _TURN_NOISE + _TURN_NOISE_SHARE * float(np.linalg.norm(before.motion[:3]))
+    growth = np.array([turn**2] * 3 + [_SHIFT_NOISE**2] * 3) * windows
+    kept = np.array([1.0] * 3 + [_SHIFT_KEPT**windows] * 3)
+    covariance = before.covariance * np.outer(kept, kept) + np.diag(growth)
+    if turn * np.sqrt(windows) > max(_LOST_SIGMA, 2 * turn):
+        return None
+    return Filter(before.motion * kept, covariance, start_us)
+
+
+def _prior(known: Rate, before: Filter | None, seconds: float) -> Gaussian:
+    """The prior of the motion over the window: the product of the network's and the filter's."""
+    information, scale = np.zeros((6, 6)), 1.0 if before is None else _REPEATED**2
+    information[:3, :3] = np.linalg.inv(known.covariance * scale)
+    weighted = np.concatenate([information[:3, :3] @ known.w_rad_s, np.zeros(3)])
+    information[3:, 3:] = np.eye(3) / _SHIFT_SIGMA**2
+    if before is not None:
+        information[3:, 3:] = 0.0
+        more = np.linalg.inv(before.covariance)
+        information, weighted = information + more, weighted + more @ before.motion
+    return Gaussian(np.linalg.solve(information, weighted) * seconds, information / seconds**2)
+
+
+def _guesses(known: Rate, before: Filter | None, seconds: float) -> list[Array]:
+    """Where the search begins: the network, twice its rate (it is often low), and the last motion."""
+    guesses = [np.concatenate([rate, np.zeros(3)]) * seconds for rate in (known.w_rad_s, 2 * known.w_rad_s)]
+    return guesses if before is None else [*guesses, before.motion * seconds]
+
+
+def _outcome(found: Found, parts: Agreement, rays: Rays, known: Rate, covariance: Array, seconds: float) -> Outcome:
+    turn, shift = float(np.linalg.norm(found.motion[:3])), float(np.linalg.norm(found.motion[3:]))
+    inside = float(found.tiles.events.sum()) / rays.x.size
+    if turn > MAX_TURN_RAD or shift > MAX_SHIFT or inside < MIN_INSIDE:
+        return "out of range"
+    if parts.apart > MAX_APART * parts.noise or parts.sharp < MIN_SHARP:
+        return "disagreeing"
+    off = found.motion[:3] / seconds - known.w_rad_s
+    if float(off @ np.linalg.solve(known.covariance, off)) > MAX_SIGMAS**2:
+        return "contradicted"
+    if np.trace(covariance[:3, :3]) > np.trace(known.covariance):
+        return "no gain"
+    return "accepted"
