@@ -55,6 +55,10 @@ class StreamState(NamedTuple):
     recent: Recent = ()  # counts of earlier windows, for models with a history
     longer: Longer = Longer()  # for models with longer windows
 
+    def without_refinement(self) -> "StreamState":
+        """The state in which the refinement begins again."""
+        return self._replace(filter=None, ground=GroundState())
+
 
 class WindowEstimate(NamedTuple):
     """The estimate of one window."""
@@ -347,8 +351,8 @@ def _over_ground(
     """The estimate with the motion over level ground, where it is accepted; see `refine.ground`."""
     if window.sample is None or state.view is None or state.camera is None or estimate.covariance is None:
         return estimate, state
-    if estimator.bundle.linear_unit != PER_HEIGHT and state.camera.height_m is None:
-        return estimate, state  # the network knows metres, the ground does not
+    if state.camera.height_m is None:
+        return estimate, state  # nothing says that the camera looks at level ground
     events = ground.events_of(state.view, window.sample, window.start_us)
     known = estimate.twists.mean(axis=0), np.sqrt(np.diagonal(estimate.covariance)[3:])
     answer = ground.refine(events, estimate.start_us, estimate.end_us, state.camera, *known, state.ground)

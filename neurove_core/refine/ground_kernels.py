@@ -164,6 +164,7 @@ def sharpness(rays: Rays, motion: Array, image: Image) -> tuple[float, Array]:  
         for x in range(image.width):
             line += cells[y, x] * band[y, x]
         total += float(line)
+    total = max(total, _FLAT)  # rounding may make the form negative where almost no event is in the image
     return np.log(total), slope(rays, motion, image, columns, rows, band) * (2 / total)
 
 

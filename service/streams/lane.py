@@ -10,9 +10,12 @@ import torch
 from neurove_core.estimator import Estimator, StreamState, WindowEstimate
 from neurove_core.ingest.windows import Window
 from neurove_core.networks.neurove import NetworkState
+from neurove_service import logs
 from neurove_service.streams.comparison import WindowResult
 from neurove_service.streams.ring import PackedWindow
 from neurove_service.streams.roles import Serving
+
+log = logs.get(__name__)
 
 PRIME_WINDOWS = 64
 """Windows that are replayed if the bundle does not say how many. More windows leave less of the change visible; no
@@ -130,16 +133,22 @@ class Lane:
             behind: whether to leave the answers as they are.
 
         Returns:
-            the estimates, and the number of windows that were not refined because the stream is behind.
+            the estimates, and the number of windows that were not refined, because the stream is behind or because
+            the refinement failed. Then the model's answer stands, and the refinement begins again.
         """
         if behind:
             return [answer.estimate for answer in answers], sum(window.sample is not None for window in windows)
-        by_start, found = {window.start_us: window for window in windows}, list[WindowEstimate]()
+        by_start, found, failed = {window.start_us: window for window in windows}, list[WindowEstimate](), 0
         for answer in answers:
-            window = by_start[answer.estimate.start_us]
-            estimate, self.state = self.estimator.refine(window, answer.estimate, self.state)
+            estimate, window = answer.estimate, by_start[answer.estimate.start_us]
+            try:
+                estimate, self.state = self.estimator.refine(window, estimate, self.state)
+            except Exception as error:  # it must not cost the answer of the model
+                log.error("refinement failed", window=window.start_us, exc_info=error)
+                self.state = self.state.without_refinement()
+                failed += 1
             found.append(estimate)
-        return found, 0
+        return found, failed
 
 
 def _rate(state: StreamState) -> float:

@@ -90,6 +90,30 @@ def test_a_network_that_is_certain_of_another_rate_is_not_contradicted():
     rejected("contradicted", w=np.array([0.4, 0.9, 0.3]), covariance=np.diag([0.05] * 6) ** 2)
 
 
+def test_events_that_are_hardly_sharper_with_motion_leave_the_answer_of_the_network():
+    slow = sample_of(of_rotation(ECD, 0.08 * W, 0.05, points=30000))
+    rejected("still", sample=slow, w=np.zeros(3))
+    assert refine(given(slow, w=0.08 * W)).outcome == "accepted"
+
+
+def clusters(seed):
+    """Events in random places, as a flickering light makes them, and a random answer of the network."""
+    rng = np.random.default_rng(seed)
+    count, places = int(rng.integers(600, 4000)), int(rng.integers(8, 60))
+    middle = rng.uniform(0, [239, 179], (places, 2))[rng.integers(0, places, count)]
+    x, y = np.clip(np.rint(middle + rng.normal(0, 6, (count, 2))), 0, [239, 179]).astype(np.uint16).T
+    t_us = np.sort(rng.integers(0, 50_000, count)).astype(np.int32)
+    return given(Sample(t_us, x, y), w=rng.normal(0, 0.5, 3), covariance=np.eye(6) * 10 ** rng.uniform(-2, 1))
+
+
+def test_a_covariance_is_positive_whatever_the_events():
+    found = [refine(clusters(seed)) for seed in range(60)]
+    assert "no maximum" in {one.outcome for one in found}
+    for one in found:
+        assert np.linalg.eigvalsh(one.rate.covariance)[0] > 0
+        assert one.filter is None or np.linalg.eigvalsh(one.filter.covariance)[0] > 0
+
+
 def test_a_fast_drive_leaves_the_answer_of_the_network():
     rejected("moving", v=(0.0, 0.0, 8.0))
     assert refine(given(v=(0.0, 0.0, 8.0), height_m=40.0)).outcome == "accepted"

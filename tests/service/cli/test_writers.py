@@ -1,5 +1,6 @@
 """Every command that writes a file: a full disk is one sentence, a signal ends it, and neither leaves anything."""
 
+import functools
 import os
 import resource
 import signal
@@ -131,7 +132,10 @@ def test_a_key_on_a_full_disk_is_not_left(run, tmp_path, small_files):
 @pytest.mark.parametrize(("number", "name"), [(signal.SIGTERM, "a.h5"), (signal.SIGHUP, "a.mcap")])
 def test_a_signal_ends_a_writer_as_control_c_does(tmp_path, number, name):
     command = [sys.executable, "-m", "neurove_service.cli", "simulate", "wall", "--seconds", "9999", "--out"]
-    with subprocess.Popen([*command, str(tmp_path / name)], stderr=subprocess.PIPE, text=True) as child:
+    usual = functools.partial(signal.signal, number, signal.SIG_DFL)  # `nohup make test` ignores SIGHUP
+    with subprocess.Popen(
+        [*command, str(tmp_path / name)], stderr=subprocess.PIPE, text=True, preexec_fn=usual
+    ) as child:
         while not any(part.stat().st_size > 200_000 for part in tmp_path.glob("*.part")):
             assert child.poll() is None
             time.sleep(0.01)

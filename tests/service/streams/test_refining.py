@@ -71,6 +71,18 @@ def test_the_refined_estimates_do_not_depend_on_the_packets(estimator):
     assert [one.model_copy(update={"trace": None, "host": None}) for one in found] == whole
 
 
+def test_a_refinement_that_fails_leaves_the_answer_of_the_model_and_is_counted(estimator, monkeypatch):
+    plain = answered(stream_of(OneModel(Estimator(estimator.bundle))))
+    stream = stream_of(OneModel(estimator))
+    monkeypatch.setattr(estimator, "refine", lambda *_: 1 / 0)
+    found = answered(stream)
+    assert [(one.twists, one.flags, one.source) for one in found] == [
+        (one.twists, one.flags, "network") for one in plain
+    ]
+    status = stream_status("edge", stream, 0)
+    assert (status.unrefined_windows, status.resets, status.lost.nonzero()) == (6, 0, {})
+
+
 def test_a_stream_that_is_behind_leaves_out_the_refinement_and_counts_it(estimator):
     stream = stream_of(OneModel(estimator))
     found = answered(stream, waited_ns=UNREFINED_NS + 1)
