@@ -88,7 +88,8 @@ def test_a_bug_keeps_its_traceback(error):
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_a_signal_ends_a_command_like_control_c(run, monkeypatch, number):
+def test_a_signal_ends_a_command_like_control_c(run, monkeypatch, number, signals_as_before):
+    signal.signal(number, signal.SIG_DFL)  # `nohup make test` ignores SIGHUP
     cleaned = []
 
     def working(*_):
