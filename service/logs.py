@@ -28,8 +28,9 @@ _FLUSH_S = 1.0
 class _Handler(logging.Handler):
     """Formats lines and hands them to the writer."""
 
-    def __init__(self, stream: TextIO) -> None:
+    def __init__(self, stream: TextIO, stamp: structlog.processors.TimeStamper) -> None:
         super().__init__()
+        self._stamp = stamp
         self._limiter = Limiter()
         self.writer = LogWriter(stream, self._dropped, self._left_out)
 
@@ -54,8 +55,12 @@ class _Handler(logging.Handler):
         ]
 
     def _line(self, event: str, **fields: object) -> str:
-        line = {"event": event, "level": "warning", "logger": __name__, **fields}
-        return self.format(logging.makeLogRecord({"name": __name__, "level": logging.WARNING, "msg": line}))
+        line: dict[str, Any] = {"event": event, "level": "warning", "logger": __name__, **fields}
+        stamped = _clipped(None, "warning", self._stamp(None, "warning", line))
+        about = {"_logger": None, "_name": "warning"}  # what marks a record as that of structlog
+        return self.format(
+            logging.makeLogRecord({"name": __name__, "levelno": logging.WARNING, "msg": stamped, **about})
+        )
 
 
 _handlers: list[_Handler] = []  # the present one, if any
@@ -65,15 +70,16 @@ def configure(level: str = "info") -> None:
     """Send the logs of structlog and of the standard library, which include Zenoh's, to stderr."""
     stream = unfiltered(sys.stderr) if sys.stderr is not None else Path(os.devnull).open("w")  # noqa: SIM115
     human = stream.isatty()
+    stamp = structlog.processors.TimeStamper(fmt="%H:%M:%S" if human else "iso", utc=not human)
     shared: list[structlog.typing.Processor] = [
         structlog.stdlib.add_log_level,
         structlog.stdlib.add_logger_name,
-        structlog.processors.TimeStamper(fmt="%H:%M:%S" if human else "iso", utc=not human),
+        stamp,
         _clipped,
     ]
     renderer = structlog.dev.ConsoleRenderer() if human else structlog.processors.JSONRenderer()
     tail: list[structlog.typing.Processor] = [] if human else [structlog.processors.dict_tracebacks]
-    handler = _Handler(stream)
+    handler = _Handler(stream, stamp)
     handler.setFormatter(
         structlog.stdlib.ProcessorFormatter(
             foreign_pre_chain=shared,

@@ -30,6 +30,7 @@ _REST_S = 0.01  # pause of the loop after an error in it
 _RETRY_STANDBY_S = 0.002
 _MAX_PAUSE_S = 0.02
 _SOON_NS, _GATHER_S = 300_000, 0.001  # packets that follow this soon are gathered: a wake-up costs more than a packet
+_MAX_TURN_NS = 50_000_000  # of a worker that leaves out windows: the other streams wait for it
 _SAMPLE_BYTES = 256
 _MAX_CAMERAS = 16  # CameraInfo messages that wait for the worker
 _MAX_IMU = 1024  # IMU packets that wait for the worker: seconds of a usual driver
@@ -257,10 +258,12 @@ class StreamWorker:
         now_ns = time.monotonic_ns()
         if self._overload.must_shed(now_ns - self._pending[0].received_ns, now_ns):
             self._take(0)
-            self._shed()
-            answered = self.stream.counters.estimates
-            while self._pending and self.stream.counters.estimates == answered:
-                self._work_some(now_ns, outlet)  # a whole window: until the next turn the rest of it would be too old
+            before = self.stream.counters.estimates if self._shed() else None
+            self._work_some(now_ns, outlet)
+            while self._pending and self.stream.counters.estimates == before:  # the rest would be too old next time
+                if time.monotonic_ns() - now_ns > _MAX_TURN_NS:
+                    break
+                self._work_some(now_ns, outlet)
         else:
             self._work_some(now_ns, outlet)
 
@@ -293,16 +296,17 @@ class StreamWorker:
             self.stream.failed(len(packets))
         return True
 
-    def _shed(self) -> None:
-        """Leave out all windows before the newest one whose events have all arrived."""
+    def _shed(self) -> bool:
+        """Leave out all windows before the newest one whose events have all arrived; False if there are none."""
         window = self.stream.lanes.open_window
         payloads = [None if one.is_camera else one.payload for one in self._pending]
         found = newest_whole_window(payloads, self._limits, window) if window is not None else None
         if found is None:
-            return
+            return False
         left_out = [self._pending.popleft() for _ in range(found.packets)]
         self._pending.extendleft(reversed([sample for sample in left_out if sample.is_camera]))
         self.stream.shed(sum(not sample.is_camera for sample in left_out), found.start_us)
+        return True
 
     def _run_standby(self) -> float:
         """Run one step of the standby model; return the pause after it [s], which leaves the processor to others."""

@@ -19,8 +19,8 @@ def pipe():
         yield reader, writer
 
 
-def logged(program, **kwargs):
-    code = f"from neurove_service import logs\nlogs.configure()\nlog = logs.get('test')\n{program}"
+def logged(program, before="", **kwargs):
+    code = f"{before}\nfrom neurove_service import logs\nlogs.configure()\nlog = logs.get('test')\n{program}"
     done = subprocess.run([sys.executable, "-c", code], stderr=subprocess.PIPE, check=True, timeout=60, **kwargs)
     return [json.loads(line) for line in done.stderr.splitlines()]
 
@@ -92,6 +92,19 @@ def test_one_kind_of_line_is_bounded_and_the_rest_is_told_in_number():
 def test_ten_thousand_lines_of_one_kind_are_ten_lines():
     lines = logged("for i in range(10_000): log.warning('packet refused', stream='cam0', total=i)")
     assert [line["total"] for line in lines] == list(range(10))
+
+
+def test_the_lines_that_were_left_out_are_one_line_with_fields():
+    lines = logged(
+        "for i in range(15): log.warning('packet refused', stream='cam0')\nlate.append(20)\nlog.info('next')",
+        before="import time\nreal, late = time.monotonic, [0]\ntime.monotonic = lambda: real() + sum(late)",
+    )
+    told = lines[10]
+    assert (told["event"], told["level"], told["kind"], told["stream"], told["lines"]) == (
+        "similar log lines left out", "warning", "packet refused", "cam0", 5
+    )  # fmt: skip
+    assert told["timestamp"]
+    assert [line["event"] for line in lines[11:]] == ["next"]
 
 
 def test_what_comes_from_outside_is_clipped_and_has_no_control_characters():
