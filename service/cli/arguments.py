@@ -135,15 +135,19 @@ def seed(text: str) -> int:
     return int(text)
 
 
-def metres(text: str) -> float:
-    """A number of metres above 0."""
+def _above_0(text: str, what: str) -> float:
     try:
         value = float(text)
     except ValueError:
         value = math.nan
     if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r}: give metres above 0")
+        raise argparse.ArgumentTypeError(f"{text!r}: give {what} above 0")
     return value
+
+
+def metres(text: str) -> float:
+    """A number of metres above 0."""
+    return _above_0(text, "metres")
 
 
 def numbers(text: str) -> tuple[float, float, float]:
@@ -159,13 +163,7 @@ def numbers(text: str) -> tuple[float, float, float]:
 
 def sigma(text: str) -> float:
     """A standard deviation above 0."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r}: give a finite number above 0")
-    return value
+    return _above_0(text, "a finite number")
 
 
 def sensor_size(text: str) -> Sensor:

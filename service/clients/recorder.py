@@ -5,13 +5,13 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 from neurove_core.io.formats.packet_log.reader import LIMITS
 from neurove_core.io.formats.packet_log.writer import PacketWriter
 from neurove_protocol.errors import NeuroVEError
-from neurove_protocol.events import decode_packet
-from neurove_protocol.imu import decode_imu
+from neurove_protocol.events import EventPacket, decode_packet
+from neurove_protocol.imu import ImuPacket, decode_imu
 from neurove_protocol.keys import Keys
 from neurove_service import logs
 from neurove_service.transport import Transport
@@ -20,6 +20,8 @@ log = logs.get(__name__)
 
 QUEUE_BYTES: Final = 64 << 20
 """Most bytes that wait to be written; a message that does not fit is dropped and counted."""
+
+PacketT = TypeVar("PacketT", EventPacket, ImuPacket)
 
 _ASK_S = 0.5
 _POLL_S = 0.1
@@ -168,15 +170,9 @@ class Recorder:
     def _count(self, message: _Message) -> None:
         summary = self._summary(message.stream)
         summary.packets += 1
-        summary.bytes += len(message.payload)
-        try:
-            packet = decode_packet(message.payload, LIMITS)
-        except NeuroVEError as error:
-            if not summary.refused:
-                log.warning("packet refused", stream=message.stream, why=error.message)
-            summary.refused += 1
+        packet = self._decoded(message, lambda data: decode_packet(data, LIMITS), summary)
+        if packet is None:
             return
-        self._follow(message, packet.seq, summary)
         summary.events += packet.events.n
         first_us = int(packet.events.t[0]) if packet.events.n else packet.t0_us
         summary.first_us = first_us if summary.first_us is None else summary.first_us
@@ -185,16 +181,22 @@ class Recorder:
     def _count_samples(self, message: _Message) -> None:
         summary = self._summary(message.stream)
         summary.imu_packets += 1
+        packet = self._decoded(message, decode_imu, summary)
+        if packet is not None:
+            summary.samples += packet.samples.n
+
+    def _decoded(self, message: _Message, decode: Callable[[bytes], PacketT], summary: StreamSummary) -> PacketT | None:
+        """A packet, followed by its number; None if it is refused, which is counted."""
         summary.bytes += len(message.payload)
         try:
-            packet = decode_imu(message.payload)
+            packet = decode(message.payload)
         except NeuroVEError as error:
             if not summary.refused:
                 log.warning("packet refused", stream=message.stream, why=error.message)
             summary.refused += 1
-            return
+            return None
         self._follow(message, packet.seq, summary)
-        summary.samples += packet.samples.n
+        return packet
 
     def _follow(self, message: _Message, seq: int, summary: StreamSummary) -> None:
         """Count the numbers that are missing before a packet."""

@@ -13,6 +13,7 @@ from neurove_protocol.control import ImuStatus
 from neurove_protocol.errors import InvalidField, NeuroVEError
 from neurove_protocol.imu import decode_imu
 from neurove_service import logs
+from neurove_service.guard import Guard
 
 log = logs.get(__name__)
 
@@ -29,10 +30,11 @@ class Inertial:
     Args:
         stream: its name.
         now_ns: monotonic clock of this node [ns].
+        guard: counts errors of the stage, which cost no answer.
     """
 
-    def __init__(self, stream: str, now_ns: Callable[[], int]) -> None:
-        self._stream, self._now_ns = stream, now_ns
+    def __init__(self, stream: str, now_ns: Callable[[], int], guard: Guard | None = None) -> None:
+        self._stream, self._now_ns, self._guard = stream, now_ns, guard or Guard()
         self._state = InertialState()
         self._expected: int | None = None
         self._received_ns = 0
@@ -42,6 +44,10 @@ class Inertial:
 
     def accept(self, payload: bytes, received_ns: int) -> None:
         """Add the samples of a packet; one that breaks a rule is counted and costs nothing else."""
+        with self._guard.at("imu packet", stream=self._stream):
+            self._add(payload, received_ns)
+
+    def _add(self, payload: bytes, received_ns: int) -> None:
         try:
             packet = decode_imu(payload)
             if packet.stream != self._stream:
@@ -72,7 +78,7 @@ class Inertial:
     def aid(
         self, estimates: list[WindowEstimate], estimator: Estimator, camera: CameraInfo | None
     ) -> list[WindowEstimate]:
-        """The estimates of consecutive windows by events and gyroscope; unchanged without a unit.
+        """The estimates of consecutive windows by events and gyroscope; unchanged without a unit or after an error.
 
         Args:
             estimates: by the events.
@@ -84,7 +90,11 @@ class Inertial:
         found = []
         for estimate in estimates:
             disagreed = self._state.disagrees
-            one, self._state = aided(estimator, estimate, self._state, camera)
+            try:
+                one, self._state = aided(estimator, estimate, self._state, camera)
+            except Exception as error:  # noqa: BLE001  # it must not cost the answer of the events
+                self._guard.caught("gyroscope", error, stream=self._stream)
+                one, self._state = estimate, InertialState()
             found.append(one)
             self._used = one.source == "gyro"
             self._missed = not self._used and not self._state.disagrees

@@ -10,12 +10,10 @@ import torch
 from neurove_core.estimator import Estimator, StreamState, WindowEstimate
 from neurove_core.ingest.windows import Window
 from neurove_core.networks.neurove import NetworkState
-from neurove_service import logs
+from neurove_service.guard import Guard
 from neurove_service.streams.comparison import WindowResult
 from neurove_service.streams.ring import PackedWindow
 from neurove_service.streams.roles import Serving
-
-log = logs.get(__name__)
 
 PRIME_WINDOWS = 64
 """Windows that are replayed if the bundle does not say how many. More windows leave less of the change visible; no
@@ -123,13 +121,14 @@ class Lane:
         return answers
 
     def refine(
-        self, answers: list[TimedEstimate], windows: list[Window], *, behind: bool
+        self, answers: list[TimedEstimate], windows: list[Window], guard: Guard, *, behind: bool
     ) -> tuple[list[WindowEstimate], int]:
         """Refine the angular parts of answers, unless the stream is behind.
 
         Args:
             answers: of these windows, in order.
             windows: those without a sample are not refined.
+            guard: counts errors of the refinement.
             behind: whether to leave the answers as they are.
 
         Returns:
@@ -143,8 +142,8 @@ class Lane:
             estimate, window = answer.estimate, by_start[answer.estimate.start_us]
             try:
                 estimate, self.state = self.estimator.refine(window, estimate, self.state)
-            except Exception as error:  # it must not cost the answer of the model
-                log.error("refinement failed", window=window.start_us, exc_info=error)
+            except Exception as error:  # noqa: BLE001  # it must not cost the answer of the model
+                guard.caught("refinement", error)
                 self.state = self.state.without_refinement()
                 failed += 1
             found.append(estimate)

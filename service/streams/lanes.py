@@ -6,6 +6,7 @@ from neurove_core.estimator import WindowEstimate
 from neurove_core.ingest.windows import Pushed, WindowsState
 from neurove_protocol.events import Packet
 from neurove_service import logs
+from neurove_service.guard import Guard
 from neurove_service.streams.comparison import Comparison
 from neurove_service.streams.history import History, Optics, Primed, RingSize, prime, zero_lane
 from neurove_service.streams.lane import Lane, OpenWindow, Pace, TimedEstimate, replay
@@ -39,10 +40,11 @@ class Lanes:
     Args:
         stream: its name, for the log.
         size: bounds of the history.
+        guard: counts errors of the refinement.
     """
 
-    def __init__(self, stream: str, size: RingSize) -> None:
-        self._stream = stream
+    def __init__(self, stream: str, size: RingSize, guard: Guard) -> None:
+        self._stream, self._guard = stream, guard
         self.comparison: Comparison | None = None
         self.serving_lane: Lane | None = None
         self.standby: Standby | None = None
@@ -108,7 +110,6 @@ class Lanes:
         """Answer every window that a packet completes; without refinement if the stream is behind.
 
         The comparison gets the network's answers: the refinement makes two models more alike than they are.
-
         After ServingModelFailed, assign the roles again and push the same packet: the standby model answers it.
 
         Raises:
@@ -134,9 +135,9 @@ class Lanes:
         if standby is not None:
             self._add_to_trial(answers, standby, packet, entries)
         outside = sum(window.outside for window in pushed.windows)
-        refined, unrefined = lane.refine(answers, pushed.windows, behind=behind)
-        estimates = [one for one in refined if lane.may_answer(one.start_us)]
-        return Pushing(estimates, lane.serving, pushed.late_events, outside, pushed.skipped_windows, unrefined)
+        refined, unrefined = lane.refine(answers, pushed.windows, self._guard, behind=behind)
+        refined = [one for one in refined if lane.may_answer(one.start_us)]
+        return Pushing(refined, lane.serving, pushed.late_events, outside, pushed.skipped_windows, unrefined)
 
     def run_standby(self) -> None:
         """Process the oldest entry of the standby model's backlog."""

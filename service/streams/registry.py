@@ -144,7 +144,14 @@ class StreamRegistry:
             return None
         settings = self._settings
         worker = StreamWorker(
-            Stream(name, self._models, ring=settings.ring, node=settings.node, max_age_s=settings.max_age_s),
+            Stream(
+                name,
+                self._models,
+                ring=settings.ring,
+                node=settings.node,
+                max_age_s=settings.max_age_s,
+                guard=self._guard,
+            ),
             lambda: self._open_outlet(name),
             Inbox(settings.queue_s, settings.queue_bytes),
             settings.limits,

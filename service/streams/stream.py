@@ -7,6 +7,7 @@ from neurove_protocol import CameraInfo, Flag, Sensor, TwistEstimate
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Packet, PacketLimits
 from neurove_service import logs
+from neurove_service.guard import Guard
 from neurove_service.streams.activity import Activity
 from neurove_service.streams.age import newest_us
 from neurove_service.streams.answers import Answers
@@ -43,6 +44,7 @@ class Stream:
         ring: bounds of the windows that are kept to prime another model.
         node: name of the node, for the estimates.
         max_age_s: older packets are dropped [s].
+        guard: counts errors of refinement and gyroscope, which cost no answer.
     """
 
     def __init__(
@@ -53,16 +55,17 @@ class Stream:
         ring: RingSize = RingSize(),  # noqa: B008  # immutable
         node: str | None = None,
         max_age_s: float = 1.0,
+        guard: Guard | None = None,
     ) -> None:
-        self.name = name
+        self.name, guard = name, guard or Guard()
         self.sensor: Sensor | None = None
         self.camera: CameraInfo | None = None
         self.activity = Activity(now_ns)
         self.counters = self.activity.counters
         self.verdicts = Verdicts(self.activity)
-        self.lanes = Lanes(name, ring)
+        self.lanes = Lanes(name, ring, guard)
         self.models = models
-        self.inertial = Inertial(name, now_ns)
+        self.inertial = Inertial(name, now_ns, guard)
         self._flags = Flags()
         self._intake = Intake(name, self.activity, self._flags, max_age_s)
         self._answers = Answers(name, node, self.activity, self._flags, self._intake, now_ns, max_age_s)
@@ -129,10 +132,9 @@ class Stream:
         pushing = self._push(kept, behind=arrival.queued_ns - arrival.received_ns > UNREFINED_NS)
         self.counters.outside_events += pushing.outside_events
         self.counters.unrefined_windows += pushing.unrefined_windows
-        if pushing.late_events:
-            activity.lost("late_events", pushing.late_events)
-        if pushing.skipped_windows:
-            activity.lost("skipped_windows", pushing.skipped_windows)
+        for name in ("late_events", "skipped_windows"):
+            if number := getattr(pushing, name):
+                activity.lost(name, number)
         aided = self.inertial.aid(pushing.estimates, pushing.serving.estimator, self.calibration)
         estimates = [self._answers.of(one, pushing.serving, self.calibration, packet, arrival) for one in aided]
         self._intake.compare(first)  # later: the windows ended before this packet
@@ -194,8 +196,7 @@ class Stream:
 
     def _restart(self) -> None:
         """Forget the recurrent state and the open window; the next packet begins a new sequence."""
-        window = self.lanes.open_window
-        if window is not None and window.events:
+        if (window := self.lanes.open_window) is not None and window.events:
             self.activity.lost("restart_windows", 1)
         self.lanes.restart()
         self.inertial.restart()

@@ -251,21 +251,18 @@ class StreamWorker:
         inertial, missing = self._inbox.take_imu()  # after the packets: samples up to their time have arrived
         self.stream.inertial.drop(missing)
         for one in inertial:
-            with self._guard.at("imu packet", stream=self.stream.name):
-                self.stream.inertial.accept(one.payload, one.received_ns)
+            self.stream.inertial.accept(one.payload, one.received_ns)
 
     def _work_next(self, outlet: Outlet) -> None:
-        now_ns = time.monotonic_ns()
+        now_ns, answered = time.monotonic_ns(), -1
         if self._overload.must_shed(now_ns - self._pending[0].received_ns, now_ns):
             self._take(0)
-            before = self.stream.counters.estimates if self._shed() else None
-            self._work_some(now_ns, outlet)
-            while self._pending and self.stream.counters.estimates == before:  # the rest would be too old next time
-                if time.monotonic_ns() - now_ns > _MAX_TURN_NS:
-                    break
-                self._work_some(now_ns, outlet)
-        else:
-            self._work_some(now_ns, outlet)
+            answered = self.stream.counters.estimates if self._shed() else -1
+        self._work_some(now_ns, outlet)
+        while (
+            self._pending and self.stream.counters.estimates == answered and time.monotonic_ns() < now_ns + _MAX_TURN_NS
+        ):
+            self._work_some(now_ns, outlet)  # the rest of the window would be too old at the next turn
 
     def _work_some(self, now_ns: int, outlet: Outlet) -> None:
         """Process the oldest samples: a run of small packets, or one."""

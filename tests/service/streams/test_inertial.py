@@ -10,7 +10,9 @@ from neurove_protocol import ImuPacket
 from neurove_protocol.events import PacketLimits
 from neurove_protocol.imu import encode_imu
 from neurove_service.cli.inertial_text import imu_text
+from neurove_service.guard import Guard
 from neurove_service.node.health import stream_status
+from neurove_service.streams import inertial
 from neurove_service.streams.history import RingSize
 from neurove_service.streams.inertial import Inertial
 from neurove_service.streams.registry import StreamRegistry, StreamSettings
@@ -59,6 +61,16 @@ def test_a_stream_without_a_unit_loses_nothing(slot, stream):
     plain = feed(stream, make_packets(100))
     assert {one.source for one in plain} == {"network"}
     assert stream_status("n1", stream).imu is None
+
+
+def test_an_error_of_the_stage_leaves_the_answer_of_the_events_and_is_counted(slot, monkeypatch):
+    guard = Guard()
+    stream = Stream("cam0", slot, guard=guard)
+    monkeypatch.setattr(inertial, "aided", lambda *_: 1 / 0)
+    estimates = feed(stream, make_packets(100), imu_packets(units.samples(units.shaking, 0.5), size=2))
+    assert [(one.seq, one.source) for one in estimates] == [(number, "network") for number in range(7)]
+    assert guard.counts == {"gyroscope": 7}
+    assert (stream.counters.resets, stream.counters.losses().nonzero()) == (0, {})
 
 
 def test_packets_that_are_refused_or_lost_are_counted_and_the_events_are_unharmed(slot, stream):

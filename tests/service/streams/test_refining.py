@@ -11,6 +11,7 @@ from neurove_core.ingest.wire import read_packet
 from neurove_protocol import EventPacket
 from neurove_protocol.events import PacketLimits, encode_packet
 from neurove_service.cli.estimating import OneModel
+from neurove_service.guard import Guard
 from neurove_service.node.health import stream_status
 from neurove_service.streams.intake import Arrival
 from neurove_service.streams.roles import Roles, Serving
@@ -73,7 +74,9 @@ def test_the_refined_estimates_do_not_depend_on_the_packets(estimator):
 
 def test_a_refinement_that_fails_leaves_the_answer_of_the_model_and_is_counted(estimator, monkeypatch):
     plain = answered(stream_of(OneModel(Estimator(estimator.bundle))))
-    stream = stream_of(OneModel(estimator))
+    guard = Guard()
+    stream = Stream("cam0", OneModel(estimator), guard=guard)
+    stream.set_camera(CAMERA)
     monkeypatch.setattr(estimator, "refine", lambda *_: 1 / 0)
     found = answered(stream)
     assert [(one.twists, one.flags, one.source) for one in found] == [
@@ -81,6 +84,7 @@ def test_a_refinement_that_fails_leaves_the_answer_of_the_model_and_is_counted(e
     ]
     status = stream_status("edge", stream, 0)
     assert (status.unrefined_windows, status.resets, status.lost.nonzero()) == (6, 0, {})
+    assert guard.counts == {"refinement": 6}
 
 
 def test_a_stream_that_is_behind_leaves_out_the_refinement_and_counts_it(estimator):
