@@ -132,8 +132,10 @@ def adapt(
     scores = [compare.score(one) for one in checked]
     best = int(np.argmin(scores))
     if recipe.updates:
-        told = ", ".join(f"{name} {score:.3f}" for (name, _, _), score in zip(candidates, scores, strict=True))
-        notes.append(f"kept: {candidates[best][0]}; product of the RMSE of both parts on the validation pieces: {told}")
+        compared = ", ".join(f"{name} {score:.3f}" for (name, _, _), score in zip(candidates, scores, strict=True))
+        notes.append(
+            f"kept: {candidates[best][0]}; product of the RMSE of both parts on the validation pieces: {compared}"
+        )
     _, made, found = candidates[best]
     if made.uncertainty is not None:
         factor = compare.sigma_factor(checked[best])

@@ -58,17 +58,17 @@ def joined(parts: list[Paired]) -> Paired:
 
 def figures(found: Paired) -> dict[str, Any]:
     """RE and RMSE of both parts over their known axes, and RMSE and coverage of each axis; None where unknown."""
-    told: dict[str, Any] = {"bins": len(found.truth)}
+    report: dict[str, Any] = {"bins": len(found.truth)}
     for name, part, floor in _PARTS:
         axes = np.arange(6)[part][np.isfinite(found.truth[:, part]).any(0)]
         known = np.isfinite(found.truth[:, axes]).all(1) & (len(axes) > 0)
         error, true = (found.estimate - found.truth)[known][:, axes], found.truth[known][:, axes]
-        told[name] = {
+        report[name] = {
             "re": relative_error(error, true, floor) if len(true) else None,
             "rmse": rmse(error) if len(true) else None,
         }
-    told["axes"] = {axis: _axis(found, i) for i, axis in enumerate(AXES)}
-    return told
+    report["axes"] = {axis: _axis(found, i) for i, axis in enumerate(AXES)}
+    return report
 
 
 def sigma_factor(found: Paired) -> Array:
@@ -102,8 +102,8 @@ def gains(found: Paired) -> Array:
 
 def score(found: Paired) -> float:
     """Product of the RMSE of the known parts; smaller is better."""
-    told = figures(found)
-    return float(np.prod([told[name]["rmse"] for name, _, _ in _PARTS if told[name]["rmse"] is not None]))
+    report = figures(found)
+    return float(np.prod([report[name]["rmse"] for name, _, _ in _PARTS if report[name]["rmse"] is not None]))
 
 
 def verdict(before: dict[str, Any], after: dict[str, Any]) -> tuple[bool, str]:

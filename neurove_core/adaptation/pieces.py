@@ -75,10 +75,10 @@ def inside_any(start_us: NDArray[np.int64], end_us: NDArray[np.int64], spans: tu
     return found
 
 
-def told(spans: tuple[Span, ...], zero_us: int) -> str:
+def in_seconds(spans: tuple[Span, ...], zero_us: int) -> str:
     """Spans as people read them, in seconds since a time.
 
-    >>> told(((2_000_000, 3_500_000), (9_000_000, 10_000_000)), 1_000_000)
+    >>> in_seconds(((2_000_000, 3_500_000), (9_000_000, 10_000_000)), 1_000_000)
     '1.0 to 2.5 s, 8.0 to 9.0 s'
     """
     return ", ".join(f"{(first - zero_us) / 1e6:.1f} to {(last - zero_us) / 1e6:.1f} s" for first, last in spans)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from neurove_core.adaptation import clock
 from neurove_core.adaptation import truth as truths
-from neurove_core.adaptation.pieces import Pieces, divide, told
+from neurove_core.adaptation.pieces import Pieces, divide, in_seconds
 from neurove_core.adaptation.truth import Asked, Truth
 from neurove_core.estimator import Estimator
 from neurove_core.evaluation.evaluate import Estimates, estimate_recording
@@ -120,8 +120,8 @@ def prepare(
     notes = (
         f"{seen.name}: truth: {truth.about}",
         about_clock,
-        f"held out: {told(pieces.held, start_us)}; learned from: {told(pieces.training, start_us)}; validated on: "
-        f"{told(pieces.validation, start_us)}; at least 1 s between them is not used",
+        f"held out: {in_seconds(pieces.held, start_us)}; learned from: {in_seconds(pieces.training, start_us)}; "
+        f"validated on: {in_seconds(pieces.validation, start_us)}; at least 1 s between them is not used",
     )
     return Prepared(source, seen, camera.height_m, truth, pieces, before, notes)
 

@@ -1,1 +1,1 @@
-"""A gyroscope beside the events: angular velocity, its bias, rest, and the check of one against the other."""
+"""A gyroscope in addition to the events: angular velocity, its bias, rest, and the check of one against the other."""

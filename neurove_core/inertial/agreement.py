@@ -39,7 +39,7 @@ UNLIKE: Final = 0.3
 """Below this, events that were refined do not follow the gyroscope."""
 
 OFFSET_SIGMA_US: Final = 5_000
-"""An offset with a larger standard deviation is not told."""
+"""An offset with a larger standard deviation is not reported."""
 
 LATE_US: Final = 30_000
 """A larger time offset disagrees: the gyroscope would spoil the estimate."""
@@ -65,7 +65,7 @@ class Track(NamedTuple):
 class Agreement(NamedTuple):
     """What the comparison says."""
 
-    offset_us: float | None = None  # by which the gyroscope's times are late; None if it cannot be told
+    offset_us: float | None = None  # by which the gyroscope's times are late; None if it is unclear
     correlation: float | None = None  # of both at this offset; None without a turn to compare
     why: str = ""  # in which way they disagree; empty if they do not
 
@@ -117,24 +117,26 @@ def judge(track: Track) -> Agreement:
     excited = gyro[middle].std(0) > EXCITED_RAD_S
     if not excited.any():
         return Agreement()
-    told = excited & (events.std(0) > 0.2 * gyro[middle].std(0))  # axes to which the events are not blind
-    joint = np.array([_correlation(events[:, told], one[:, told]) for one in gyro])
+    visible = excited & (events.std(0) > 0.2 * gyro[middle].std(0))  # axes to which the events are not blind
+    joint = np.array([_correlation(events[:, visible], one[:, visible]) for one in gyro])
     best = int(np.argmax(joint))
-    offset_us = _peak_us(joint, lags, best, events[:, told].size / _CORRELATED)
+    offset_us = _peak_us(joint, lags, best, events[:, visible].size / _CORRELATED)
     if offset_us is not None and abs(offset_us) > LATE_US:
         late = f"{abs(offset_us) / 1e3:.0f} ms {'late' if offset_us > 0 else 'early'}"
         return Agreement(offset_us, float(joint[best]), f"the times of the gyroscope are {late}")
     at = gyro[best if offset_us is not None else middle]
     matrix = np.array([[_correlation(events[:, [i]], at[:, [j]]) for j in range(3)] for i in range(3)])
-    return Agreement(offset_us, float(joint[best]), _wrong(matrix, told, excited, joint[best], refined=refined))
+    return Agreement(offset_us, float(joint[best]), _wrong(matrix, visible, excited, joint[best], refined=refined))
 
 
-def _wrong(matrix: Array, told: NDArray[np.bool_], excited: NDArray[np.bool_], joint: float, *, refined: bool) -> str:
+def _wrong(
+    matrix: Array, visible: NDArray[np.bool_], excited: NDArray[np.bool_], joint: float, *, refined: bool
+) -> str:
     """Why the axes do not match.
 
     Args:
         matrix: (3, 3) correlation of each axis of the events with each axis of the gyroscope.
-        told: (3,) axes that turn, and to which the events are not blind.
+        visible: (3,) axes that turn, and to which the events are not blind.
         excited: (3,) axes of the gyroscope that turn.
         joint: correlation over all of them.
         refined: whether the events were refined.
@@ -145,10 +147,10 @@ def _wrong(matrix: Array, told: NDArray[np.bool_], excited: NDArray[np.bool_], j
         if swapped and all(abs(matrix[i, order[i]]) > CLEAR and abs(diagonal[i]) < UNLIKE for i in swapped):
             pairs = ", ".join(f"{'xyz'[order[i]]} of the gyroscope is {'xyz'[i]} of the camera" for i in swapped)
             return f"axes are exchanged: {pairs}"
-    reversed_axes = [axis for axis, r, tells in zip("xyz", diagonal, told, strict=True) if tells and r < WRONG]
+    reversed_axes = [axis for axis, r, tells in zip("xyz", diagonal, visible, strict=True) if tells and r < WRONG]
     if reversed_axes:
         return f"the gyroscope turns the other way about {' and '.join(reversed_axes)}"
-    if refined and told.any() and joint < UNLIKE:
+    if refined and visible.any() and joint < UNLIKE:
         return f"the events do not turn as the gyroscope does (correlation {joint:.2f})"
     return ""
 
