@@ -26,7 +26,7 @@ def free_endpoint():
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
-def wait_until(condition, timeout_s=30.0):
+def wait_until(condition, timeout_s=120.0):
     deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline:
         if condition():
@@ -47,7 +47,7 @@ class Process:
             env=os.environ | environment,
         )
 
-    def end(self, number=signal.SIGTERM, timeout_s=20.0):
+    def end(self, number=signal.SIGTERM, timeout_s=60.0):
         """Send a signal; return exit code, output and errors."""
         if self.child.poll() is None:
             self.child.send_signal(number)
@@ -69,7 +69,7 @@ def running(*arguments, **environment):
             raise
 
 
-def neurove(*arguments, timeout_s=60.0):
+def neurove(*arguments, timeout_s=180.0):
     """Run a command to its end."""
     return subprocess.run(
         [sys.executable, "-m", "neurove_service.cli", *arguments],
@@ -80,7 +80,7 @@ def neurove(*arguments, timeout_s=60.0):
     )
 
 
-def client(endpoint, patience_s=20):
+def client(endpoint, patience_s=60):
     return open_transport("client", connect=(endpoint,), patience_s=patience_s)
 
 

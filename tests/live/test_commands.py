@@ -25,7 +25,7 @@ def node(tmp_path_factory):
 
 
 def test_drive_watch_health_models_and_activate_work_together(node, run):
-    with running("drive", "pattern://", "--connect", node, "--stream", "cam1", "--wait", "20") as driver:
+    with running("drive", "pattern://", "--connect", node, "--stream", "cam1", "--wait", "90") as driver:
         watched = run("watch", "--connect", node, "--json", "--count", "5")
         lines = [json.loads(line) for line in watched.out.splitlines()]
         assert len(lines) == 5
@@ -145,7 +145,7 @@ def test_a_demo_whose_model_cannot_be_loaded_prints_the_reason(tmp_path):
 
 def test_ctrl_c_ends_the_demo_and_all_its_processes_in_order():
     demo = Process("demo", "pattern://", "--seconds", "60", "--json")
-    wait_until(lambda: len(children(demo.child.pid)) == 2, timeout_s=90)  # the service and the driver
+    wait_until(lambda: len(children(demo.child.pid)) == 2, timeout_s=180)  # the service and the driver
     started = children(demo.child.pid)
     code, out, errors = demo.end(signal.SIGINT)
     assert (code, errors) == (0, "")
@@ -172,7 +172,7 @@ def running_as(command, parent):
 
 def test_killing_the_demo_leaves_no_process_behind():
     demo = Process("demo", "pattern://", "--seconds", "60", "--json")
-    wait_until(lambda: len(children(demo.child.pid)) == 2, timeout_s=90)
+    wait_until(lambda: len(children(demo.child.pid)) == 2, timeout_s=180)
     started = children(demo.child.pid)
     demo.end(signal.SIGKILL)
     wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in started))
@@ -190,7 +190,7 @@ def test_a_service_that_waits_for_a_router_ends_in_order_on_sigterm():
 @pytest.mark.parametrize(("victim", "words"), [("serve", "the service ended"), ("drive", "the driver ended")])
 def test_a_demo_that_loses_one_of_its_processes_says_which(victim, words):
     demo = Process("demo", "pattern://", "--seconds", "60", "--json")
-    wait_until(lambda: len(running_as(victim, demo.child.pid)) == len(children(demo.child.pid)) - 1 == 1, timeout_s=90)
+    wait_until(lambda: len(running_as(victim, demo.child.pid)) == len(children(demo.child.pid)) - 1 == 1, timeout_s=180)
     os.kill(*running_as(victim, demo.child.pid), signal.SIGKILL)
     out, errors = demo.child.communicate(timeout=60)
     assert (demo.child.returncode, out) == (1, "")

@@ -22,7 +22,7 @@ def test_a_service_and_its_streams_are_checked(run):
         node = checks_of(out)["node n1"]
         assert (node["level"], "model default" in node["state"]) == ("ok", True)
         heard = Heard(transport, config)
-        with running("drive", "pattern://", "--connect", endpoint, "--wait", "20"):
+        with running("drive", "pattern://", "--connect", endpoint, "--wait", "90"):
             wait_until(lambda: heard.of("cam0"))
             code, out, _ = run("doctor", "--connect", endpoint, "--json")
             checks = checks_of(out)
@@ -33,7 +33,7 @@ def test_a_service_and_its_streams_are_checked(run):
             }
             assert {name: checks[name]["level"] for name in expected} == expected
             assert code == (1 if "bad" in expected.values() else 0)
-        with running("drive", "sim://wall?seed=1", "--stream", "cam1", "--connect", endpoint, "--wait", "20"):
+        with running("drive", "sim://wall?seed=1", "--stream", "cam1", "--connect", endpoint, "--wait", "90"):
             wait_until(lambda: heard.of("cam1"))
             known = checks_of(run("doctor", "--connect", endpoint, "--json").out)["stream cam1: height"]
             assert (known["state"], known["level"]) == ("known", "ok")

@@ -35,7 +35,7 @@ def test_the_driver_and_the_consumer_of_the_page_exchange_estimates_with_a_servi
         finally:
             consumer.terminate()
             with contextlib.suppress(subprocess.TimeoutExpired):
-                consumer.wait(10)
+                consumer.wait(60)
     lines = [line for line in heard.read_text().splitlines() if line.startswith("cam0 ")]
     assert [int(line.split()[1]) for line in lines[:15]] == list(range(15))
     assert all("Twist(vx=" in line for line in lines)

@@ -36,7 +36,7 @@ def test_a_node_that_leaves_gives_its_name_free(sessions):
     held = sessions[0].token(KEYS.instance("edge", "a"))
     second = Namesakes(sessions[1], KEYS, "edge")
     threading.Timer(1.0, held).start()
-    second.join(stop, allowed=False, leave_s=20)
+    second.join(stop, allowed=False, leave_s=60)
     assert second.count == 0
 
 

@@ -23,7 +23,7 @@ def files(tmp_path_factory):
     bundle.save(
         bundle.untrained(1, name="one"), folder / "one.safetensors"
     )  # with the windows and the grid of the default model
-    for seed, name in ((2, "two"), (3, "three")):
+    for seed, name in ((2, "two"), (3, "three"), (4, "four")):
         bundle.save(bundle.untrained(seed, CONFIG, name), folder / f"{name}.safetensors")
     (folder / "foreign.safetensors").write_text("hello, I am not a model")
     (folder / "empty.safetensors").touch()
@@ -86,9 +86,9 @@ def test_an_operator_pushes_activates_and_rolls_back_without_a_gap_in_the_estima
 def test_a_push_that_is_forced_gives_its_reason_to_the_node(node, files, run):
     _, config, _ = node
     at = ("--connect", config.connect[0])
-    alone = run("push", str(files / "two.safetensors"), *at, "--force", "trial on the bench")
+    alone = run("push", str(files / "four.safetensors"), *at, "--force", "trial on the bench")
     assert (alone.code, "give --activate too" in alone.err, alone.err.count("\n")) == (2, True, 1)
-    forced = run("push", str(files / "two.safetensors"), *at, "--activate", "--force", "trial on the bench")
+    forced = run("push", str(files / "four.safetensors"), *at, "--activate", "--force", "trial on the bench")
     assert (forced.code, "forced (trial on the bench): no difference from default" in forced.out) == (0, True)
     assert run("rollback", *at).code == 0
 
@@ -143,7 +143,7 @@ class Gate:
     def __call__(self, request):
         self._left -= 1
         if self._left < 0:
-            self.shut.wait(30)
+            self.shut.wait(60)
             raise NeuroVEError("gone")
         return self._chunk(request)
 
@@ -195,7 +195,7 @@ def test_every_reply_arrives_when_it_is_sent_and_queries_beyond_the_bound_are_re
 
     def handle(request, report):
         report(b"began")
-        assert go_on.wait(30)
+        assert go_on.wait(60)
         return request
 
     listening.answer_streaming("t/work", handle, at_once=2)
@@ -214,7 +214,7 @@ def test_a_caller_that_leaves_stops_neither_the_work_nor_the_next_caller(pair):
     go_on, done = threading.Event(), threading.Event()
 
     def handle(request, report):
-        assert go_on.wait(30)
+        assert go_on.wait(60)
         report(b"nobody receives this")
         done.set()
         return request
@@ -222,7 +222,7 @@ def test_a_caller_that_leaves_stops_neither_the_work_nor_the_next_caller(pair):
     listening.answer_streaming("t/work", handle, at_once=1)
     assert list(asking.ask_streaming("t/work", b"first", 0.1)) == []  # the timeout is over
     go_on.set()
-    assert done.wait(30)
+    assert done.wait(60)
     wait_until(lambda: answers(asking))
 
 

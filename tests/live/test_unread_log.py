@@ -22,7 +22,7 @@ def test_a_service_whose_log_has_no_reader_answers_and_ends():
             wait_until(lambda: ask.health(transport, config)[0].refused_streams == 199)
             assert ask.health(transport, config)[0].ready
         child.terminate()
-        assert child.wait(30) == 0
+        assert child.wait(60) == 0
     finally:
         child.kill()
         child.wait()

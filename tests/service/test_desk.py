@@ -34,7 +34,7 @@ def test_a_closed_desk_ends_its_thread_and_takes_nothing():
     thread = threading.Thread(target=lambda: served.extend(desk))
     thread.start()
     desk.close()
-    thread.join(20)
+    thread.join(60)
     assert not thread.is_alive()
     assert not desk.offer(1)
     assert served == []

@@ -62,7 +62,7 @@ class Live:
         self._thread.join()
 
 
-def wait_until(condition, timeout_s=20.0):
+def wait_until(condition, timeout_s=60.0):
     for _ in range(int(timeout_s / 0.01)):
         if condition():
             return

@@ -53,7 +53,7 @@ def test_a_rollback_after_probation_primes_the_old_model(slots):
     stream = Stream("cam0", slot)
     feed(stream, packets[:50])
     slot.activate("two")
-    assert slot.await_probation(10)
+    assert slot.await_probation(60)
     feed(stream, packets[50:100])
     assert stream.lanes.standby is None
     wait_until(lambda: kept == ["two"])

@@ -67,11 +67,11 @@ def test_a_change_during_another_change_is_a_conflict(slot):
 
     def first_step(_):
         began.set()
-        assert go_on.wait(30)
+        assert go_on.wait(60)
 
     winner = threading.Thread(target=slot.activate, args=("two",), kwargs={"on_progress": first_step})
     winner.start()
-    assert began.wait(30)
+    assert began.wait(60)
     with pytest.raises(Conflict, match="another model change is in progress"):
         slot.activate("untrained")
     with pytest.raises(Conflict):

@@ -191,7 +191,7 @@ def test_two_pushes_of_one_bundle_at_once_transfer_it_once(tmp_path, data):
     steps = [[], []]
 
     def slow(digest, request):
-        assert gate.wait(30)
+        assert gate.wait(60)
         return source(data)(digest, request)
 
     def push(number):

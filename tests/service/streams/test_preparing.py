@@ -22,7 +22,7 @@ def test_a_newer_camera_replaces_the_one_that_waits():
 
     def build(camera):
         built.append(camera.fx)
-        assert go.wait(20)
+        assert go.wait(60)
         return camera.fx
 
     def finished():
@@ -35,7 +35,7 @@ def test_a_newer_camera_replaces_the_one_that_waits():
     for fx in (41.0, 42.0, 43.0):
         tables.start(CAMERA.model_copy(update={"fx": fx}))
     go.set()
-    assert done.wait(20)
+    assert done.wait(60)
     assert built == [900, 43]
     assert tables.take() == Prepared(CAMERA.model_copy(update={"fx": 43.0}), None)
     assert tables.take() is None
@@ -49,10 +49,10 @@ def test_an_error_of_a_build_is_a_result_and_a_fault_is_counted():
 
     tables = Preparing(build, done.release, guard)
     tables.start(CAMERA)
-    assert done.acquire(timeout=20)
+    assert done.acquire(timeout=60)
     assert tables.take() == Prepared(CAMERA, refused)
     tables.start(CAMERA.model_copy(update={"fx": 41.0}))
-    assert done.acquire(timeout=20)
+    assert done.acquire(timeout=60)
     prepared = tables.take()
     assert (prepared.camera.fx, prepared.error.code) == (41.0, "internal")
     assert guard.counts == {"look-up table": 1}
@@ -64,7 +64,7 @@ def worker(slot):
     worker = StreamWorker(Stream("cam0", slot), lambda: outlet, Inbox(60, 1 << 26), PacketLimits())
     yield worker
     worker.stop()
-    worker.join(5)
+    worker.join(60)
 
 
 def test_packets_are_processed_while_the_table_of_a_large_sensor_is_built(worker):

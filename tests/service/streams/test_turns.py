@@ -19,7 +19,7 @@ def test_turns_are_given_in_the_order_in_which_they_were_asked_for():
             wait_until(lambda: turns.waiting == len(threads))
         assert order == []
     for thread in threads:
-        thread.join(5)
+        thread.join(60)
     assert order == list(range(5))
 
 
@@ -39,7 +39,7 @@ def test_no_more_workers_than_allowed_have_their_turn_at_once():
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join(20)
+        thread.join(60)
     assert counts["now"] == 0
     assert 1 <= counts["most"] <= 2
 
