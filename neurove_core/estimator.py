@@ -357,9 +357,12 @@ def _over_ground(
     known = estimate.twists.mean(axis=0), np.sqrt(np.diagonal(estimate.covariance)[3:])
     answer = ground.refine(events, estimate.start_us, estimate.end_us, state.camera, *known, state.ground)
     state = state._replace(ground=answer.state)
-    if answer.outcome != "accepted" or answer.motion is None:
+    if answer.outcome not in ("accepted", "turning") or answer.motion is None:
         return estimate, state
     twists, covariance = np.tile(answer.motion.twist, (len(estimate.twists), 1)), answer.motion.covariance
+    if answer.outcome == "turning":
+        rate = Rate(answer.motion.twist[3:], covariance[3:, 3:])
+        twists, covariance = _with_rate(estimate.twists, estimate.covariance, rate)
     uncertain = estimator.is_uncertain(twists, covariance)
     return estimate._replace(twists=twists, covariance=covariance, source="refined", uncertain=uncertain), state
 
