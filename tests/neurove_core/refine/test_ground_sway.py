@@ -12,13 +12,15 @@ UP = np.array([0.0, math.cos(PITCH), math.sin(PITCH)])
 AHEAD = np.array([0.0, -math.sin(PITCH), math.cos(PITCH)])
 
 
-def filtered(pitching: NDArray[np.float64], rolling: NDArray[np.float64]) -> NDArray[np.float64]:
+def filtered(
+    pitching: NDArray[np.float64], rolling: NDArray[np.float64], speed_m_s: float = 8.0
+) -> NDArray[np.float64]:
     """Rates about the axes of the ground (N, 3): pitch, yaw, roll, of a camera that yaws at 0.4 rad/s."""
     sway, out = Sway(), []
     for pitch, roll in zip(pitching, rolling, strict=True):
         w = np.array([pitch, 0, 0]) + 0.4 * UP + roll * AHEAD
-        twist, sway = swayed(np.concatenate([[0.1, 0.2, 3.0], w]), PITCH, sway)
-        np.testing.assert_array_equal(twist[:3], [0.1, 0.2, 3.0])
+        twist, sway = swayed(np.concatenate([[0.1, 0.2, speed_m_s], w]), PITCH, sway)
+        np.testing.assert_array_equal(twist[:3], [0.1, 0.2, speed_m_s])
         out.append([twist[3], twist[3:] @ UP, twist[3:] @ AHEAD])
     return np.array(out)
 
@@ -45,3 +47,9 @@ def test_noise_alone_is_drawn_to_zero() -> None:
     noisy = NOISE_RAD_S / 2 * rng.normal(size=(2, 200))
     found = filtered(*noisy)[100:, [0, 2]]
     assert np.abs(found).max() < NOISE_RAD_S / 4
+
+
+def test_the_rates_of_a_slow_camera_stay() -> None:
+    found = filtered(np.full(30, 0.1), np.full(30, -0.1), speed_m_s=0.0)
+    np.testing.assert_allclose(found[:, 0], 0.1, atol=0.01)
+    np.testing.assert_allclose(found[:, 2], -0.1, atol=0.01)
