@@ -128,6 +128,11 @@ class Transport:
     ) -> None:
         self.close()
 
+    @property
+    def session(self) -> zenoh.Session:
+        """Zenoh's session, for the module that speaks to ROS 2; this object closes it."""
+        return self._session
+
     def close(self) -> None:
         """Undeclare everything and close the session; a second call does nothing."""
         if _OPEN.pop(id(self), None) is None:
@@ -370,6 +375,7 @@ def open_transport(
     patience_s: float = 0.0,
     stop: threading.Event | None = None,
     guard: Guard | None = None,
+    timestamps: bool = False,
 ) -> Transport:
     """Open a session.
 
@@ -381,12 +387,13 @@ def open_transport(
         patience_s: how long a client retries while no process listens [s].
         stop: ends the retries early.
         guard: counts internal errors of what is called for a message or a query.
+        timestamps: whether messages carry the time of publishing, as ROS 2 expects.
 
     Raises:
         Unreachable: no process listened for that time.
         EndpointError: the session cannot be opened, and a retry cannot help.
     """
-    config = _session_config(mode, listen, connect, config_file)
+    config = _session_config(mode, listen, connect, config_file, timestamps)
     stop = stop or threading.Event()
     deadline = time.monotonic() + patience_s
     waiting = False
@@ -407,7 +414,7 @@ def open_transport(
 
 
 def _session_config(
-    mode: str, listen: tuple[str, ...], connect: tuple[str, ...], config_file: Path | None
+    mode: str, listen: tuple[str, ...], connect: tuple[str, ...], config_file: Path | None, timestamps: bool
 ) -> zenoh.Config:
     try:
         config = zenoh.Config.from_file(str(config_file)) if config_file else zenoh.Config()
@@ -416,7 +423,7 @@ def _session_config(
             config.insert_json5("listen/endpoints", json.dumps(listen))
         if connect or not config_file:
             config.insert_json5("connect/endpoints", json.dumps(connect))
-        for key, value in _SETTINGS.items():
+        for key, value in (_SETTINGS | ({"timestamping/enabled": True} if timestamps else {})).items():
             config.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
         where = f"zenoh_config={config_file}" if config_file else _where(listen, connect)
