@@ -12,6 +12,7 @@ EXTRAS: Final[dict[str, tuple[str, ...]]] = {
     "experiments": ("matplotlib", "scipy"),
     "bench": ("dv_processing", "faery", "loguru", "snntorch", "tonic"),
     "carla": ("carla",),
+    "metrics": ("prometheus_client",),
     "ros2": ("xxhash",),
 }
 """Modules that an extra installs itself; some extras also include others, see `_DEPENDS` and pyproject.toml."""
