@@ -9,6 +9,7 @@ import array
 import json
 import sys
 import time
+from pathlib import Path
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
@@ -21,8 +22,7 @@ DEADLINE_S = 120.0
 
 
 def main():
-    with open(sys.argv[1]) as file:
-        plan = json.load(file)
+    plan = json.loads(Path(sys.argv[1]).read_text())
     rclpy.init(args=[])
     node = rclpy.create_node("driver", namespace="event_camera")
     received, calibrated, deadline = [], [], time.monotonic() + DEADLINE_S
