@@ -40,7 +40,8 @@ MAY_IMPORT = {
     "neurove_core.io": "files extras figures geometry",
     "neurove_core.io.formats": "compiled files extras geometry io",
     "neurove_core.sim": "compiled config figures geometry io io.formats",
-    "neurove_core.sources": "io io.formats sim",
+    "neurove_core.live": "extras io io.formats",
+    "neurove_core.sources": "io io.formats live sim",
     "neurove_core.evaluation": "compiled figures geometry networks models estimator inertial aided io",
     "neurove_core.training": (
         "config files extras figures geometry ingest networks "
@@ -78,7 +79,8 @@ MAY_IMPORT = {
         "core:config core:files core:ingest core:networks core:models core:estimator core:self_test logs guard streams"
     ),
     "neurove_service.clients": (
-        "core:config core:geometry core:ingest core:io core:io.formats core:bench logs config transport clock_offset"
+        "core:config core:geometry core:ingest core:io core:io.formats core:live core:bench "
+        "logs config transport clock_offset"
     ),
     "neurove_service.node": (
         "core:files core:geometry core:models logs guard lifecycle latency config transport streams models"

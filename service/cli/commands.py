@@ -21,7 +21,8 @@ class Command(NamedTuple):
 COMMANDS = (
     Command("demo", "Run driver, service and consumer on any source, then print a summary.", "running", "serve"),
     Command("serve", "Run the service until SIGINT or SIGTERM.", "running", "serve"),
-    Command("drive", "Publish a recording or a synthetic source as event packets.", "running", "recordings"),
+    Command("drive", "Publish a recording, a synthetic source or a camera as event packets.", "running", "recordings"),
+    Command("cameras", "List the event cameras at this machine, and say what is missing.", "cameras"),
     Command("watch", "Show live estimates of all streams.", "asking"),
     Command("health", "Show the health of every node.", "asking"),
     Command("doctor", "Check connection, streams, compiled kernels, processor and installed extras.", "doctor"),

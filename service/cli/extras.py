@@ -12,6 +12,7 @@ EXTRAS: Final[dict[str, tuple[str, ...]]] = {
     "experiments": ("matplotlib", "scipy"),
     "bench": ("dv_processing", "faery", "loguru", "snntorch", "tonic"),
     "carla": ("carla",),
+    "camera": ("dv_processing", "neuromorphic_drivers"),
 }
 """Modules that an extra installs itself; some extras also include others, see `_DEPENDS` and pyproject.toml."""
 
@@ -20,6 +21,7 @@ _DEPENDS: Final[dict[str, tuple[str, ...]]] = {
     "experiments": ("serve", "recordings"),
     "bench": ("serve",),
     "carla": ("recordings",),
+    "camera": ("recordings",),
 }
 
 
