@@ -23,6 +23,9 @@ COMMANDS = (
     Command("serve", "Run the service until SIGINT or SIGTERM.", "running", "serve"),
     Command("drive", "Publish a recording, a synthetic source or a camera as event packets.", "running", "recordings"),
     Command("cameras", "List the event cameras at this machine, and say what is missing.", "cameras"),
+    Command(
+        "ros2", "Bridge the event cameras of a ROS 2 robot to the service, and its estimates back.", "ros2", "ros2"
+    ),
     Command("watch", "Show live estimates of all streams.", "asking"),
     Command("health", "Show the health of every node.", "asking"),
     Command("doctor", "Check connection, streams, compiled kernels, processor and installed extras.", "doctor"),

@@ -164,7 +164,7 @@ def _report(args: argparse.Namespace, label: str, source: Any, sent: Any) -> int
         about = f"{source.name} ({source.sensor})"
         late = f", up to {sent.behind_s:.1f} s behind real time" if sent.behind_s > BEHIND_S else ""
         inertial = f" and {sent.samples:,} IMU samples" if sent.samples else ""
-        lost = f", events lost at {sent.gaps:,} places" if sent.gaps else ""
+        lost = f", {sent.gaps:,} gap{'s' if sent.gaps > 1 else ''} where events were lost" if sent.gaps else ""
         print(f"{label}: {sent.packets:,} packets, {sent.events:,} events{inertial} of {about}{late}{lost}")
     if sent.broken:
         print(f"neurove: {broken}", file=sys.stderr)

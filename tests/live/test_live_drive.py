@@ -151,7 +151,7 @@ def test_a_camera_that_overflows_and_is_unplugged_leaves_a_gap_counts_and_an_exi
         wait_until(lambda: heard.events.n == 5000)
         wait_until(lambda: heard.cameras)
     assert code == 1
-    assert f"5,000 events of Prophesee EVK4 {SERIAL} (1280x720), events lost at 1 places" in out
+    assert f"5,000 events of Prophesee EVK4 {SERIAL} (1280x720), 1 gap where events were lost" in out
     assert "the camera stopped: " in err
     assert "events: 5 lost in transmission" in err
     assert "Traceback" not in err
