@@ -78,13 +78,15 @@ MAY_IMPORT = {
     "neurove_service.models": (
         "core:config core:files core:ingest core:networks core:models core:estimator core:self_test logs guard streams"
     ),
+    "neurove_service.metrics": "logs guard",
     "neurove_service.clients": (
-        "core:config core:geometry core:ingest core:io core:io.formats core:live core:bench "
-        "logs config transport clock_offset"
+        "core:config core:geometry core:ingest core:io core:io.formats core:live core:bench logs guard config transport "
+        "clock_offset metrics"
     ),
     "neurove_service.ros2": "core:extras core:geometry core:io core:io.formats clock_offset guard logs transport",
     "neurove_service.node": (
-        "core:files core:geometry core:models logs guard lifecycle latency config transport streams models"
+        "core:files core:geometry core:models logs guard lifecycle latency endpoints config transport streams models "
+        "metrics"
     ),
     "neurove_service": "",
     "neurove_service.cli": "*",

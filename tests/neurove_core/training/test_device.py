@@ -1,4 +1,4 @@
-"""Training on another device than the CPU: torch's device `meta` has no values and refuses a tensor left on the CPU."""
+"""Training on another device than the CPU: the device `meta` of torch has no values, and refuses tensors on the CPU."""
 
 import pytest
 import torch
