@@ -25,6 +25,12 @@ COMMANDS = (
     Command("watch", "Show live estimates of all streams.", "asking"),
     Command("health", "Show the health of every node.", "asking"),
     Command("doctor", "Check connection, streams, compiled kernels, processor and installed extras.", "doctor"),
+    Command(
+        "warm-up",
+        "Compile ahead what serve, demo, drive and simulate run, and say where it is kept.",
+        "warming",
+        "serve",
+    ),
     Command("models", "List the models of every node.", "asking"),
     Command("push", "Send a bundle to a running node.", "changing"),
     Command("activate", "Change the model of a running node.", "changing"),
@@ -73,5 +79,5 @@ def build_parser(chosen: Container[str]) -> Parser:
     for name, about, module, _ in COMMANDS:
         one = commands.add_parser(name, help=about, description=about)
         if name in chosen:
-            getattr(importlib.import_module(f"neurove_service.cli.{module}"), f"add_{name}")(one)
+            getattr(importlib.import_module(f"neurove_service.cli.{module}"), f"add_{name.replace('-', '_')}")(one)
     return parser
