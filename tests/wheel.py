@@ -21,7 +21,10 @@ BASE = {
     "shtab",
     "structlog",
 }
-EXTRAS = {"serve", "recordings", "train", "experiments", "carla", "bench", "all", "dev"}
+EXTRAS = {
+    "serve", "recordings", "train", "experiments", "carla", "ros2", "camera", "page", "metrics", "foxglove", "docs",
+    "bench", "all", "dev",
+}  # fmt: skip
 HEAVY = {"torch", "zenoh", "numba"}
 LIGHT_IMPORT = f"import sys, neurove_protocol; print(sorted({HEAVY} & set(sys.modules)))"
 BESIDE_OTHERS = (

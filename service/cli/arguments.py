@@ -3,6 +3,7 @@
 import argparse
 import math
 import os
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ from neurove_service import logs
 from neurove_service.config import ClientConfig, ServiceConfig, load
 
 if TYPE_CHECKING:
+    from neurove_core.geometry.mounting import Mounting
     from neurove_core.io import Recording
 
 MAX_SECONDS: Final = 1e9
@@ -232,6 +234,35 @@ def refuse_existing(what: str, field: str, path: Path, source: str | None, *, fo
 def add_force(parser: argparse.ArgumentParser, name: str) -> None:
     """Add --force, which lets a command replace the file that it writes."""
     parser.add_argument("--force", action="store_true", help=f"replace {name} if it exists")
+
+
+def mounting_of(what: str, path: Path) -> "Mounting":
+    """The pose of a camera in the base of its robot, from a text file of numbers; see `Mounting.from_numbers`.
+
+    Args:
+        what: the command.
+        path: the file of --extrinsics.
+
+    Raises:
+        InvalidField: it has no such numbers.
+    """
+    from neurove_core.geometry.mounting import Mounting
+
+    return Mounting.from_numbers(str(path), _numbers_in(what, path))
+
+
+def _numbers_in(what: str, path: Path) -> list[float]:
+    """All numbers of a text file, without names before a colon and comments: a matrix as text, YAML or JSON."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError:
+        raise InvalidField(what, "--extrinsics", str(path), "is not a text file") from None
+    lines = [re.sub(r'"?[A-Za-z_]\w*"?\s*[:=]', " ", line.partition("#")[0]) for line in text.splitlines()]
+    words = re.split(r"[\s,;\[\]{}()]+", " ".join(lines))
+    try:
+        return [float(word) for word in words if word and word != "-"]
+    except ValueError as error:
+        raise InvalidField(what, "--extrinsics", str(path), f"expected numbers: {error}") from None
 
 
 def check_folder(what: str, field: str, path: Path) -> None:

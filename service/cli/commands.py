@@ -22,6 +22,9 @@ COMMANDS = (
     Command("demo", "Run driver, service and consumer on any source, then print a summary.", "running", "serve"),
     Command("serve", "Run the service until SIGINT or SIGTERM.", "running", "serve"),
     Command("drive", "Publish a recording or a synthetic source as event packets.", "running", "recordings"),
+    Command(
+        "ros2", "Bridge the event cameras of a ROS 2 robot to the service, and its estimates back.", "ros2", "ros2"
+    ),
     Command("watch", "Show live estimates of all streams.", "asking"),
     Command("health", "Show the health of every node.", "asking"),
     Command("doctor", "Check connection, streams, compiled kernels, processor and installed extras.", "doctor"),
@@ -31,6 +34,7 @@ COMMANDS = (
         "warming",
         "serve",
     ),
+    Command("metrics", "Show the metrics of every node for Prometheus, on one address.", "metering", "metrics"),
     Command("models", "List the models of every node.", "asking"),
     Command("push", "Send a bundle to a running node.", "changing"),
     Command("activate", "Change the model of a running node.", "changing"),

@@ -12,6 +12,8 @@ EXTRAS: Final[dict[str, tuple[str, ...]]] = {
     "experiments": ("matplotlib", "scipy"),
     "bench": ("dv_processing", "faery", "loguru", "snntorch", "tonic"),
     "carla": ("carla",),
+    "metrics": ("prometheus_client",),
+    "ros2": ("xxhash",),
 }
 """Modules that an extra installs itself; some extras also include others, see `_DEPENDS` and pyproject.toml."""
 
@@ -20,6 +22,7 @@ _DEPENDS: Final[dict[str, tuple[str, ...]]] = {
     "experiments": ("serve", "recordings"),
     "bench": ("serve",),
     "carla": ("recordings",),
+    "ros2": ("recordings",),
 }
 
 

@@ -1,8 +1,8 @@
 """Streams that do harm: `python -m tests.long.hostile`; two minutes, not part of `make test`.
 
-A node serves one camera of 50 windows/s. In addition it gets, one after the other: malformed packets at full speed, packets
-on streams with long names, and sensors of 4096x4096 pixels with a distorted lens. The run prints what the camera's
-estimates, the supervisor's pings, the log and the memory of the node show for each.
+A node serves one camera of 50 windows/s. In addition it gets, one after the other: malformed packets at full speed,
+packets on streams with long names, and sensors of 4096x4096 pixels with a distorted lens. The run prints what the
+camera's estimates, the supervisor's pings, the log and the memory of the node show for each.
 """
 
 import argparse

@@ -48,6 +48,7 @@ def on_base_install(*arguments):
         (("reproduce", "firing"), "experiments"),
         (("bench", "window"), "bench"),
         (("info", "a.aedat4"), "recordings"),
+        (("metrics", "--connect", NOWHERE, "--wait", "0"), "metrics"),
     ],
 )
 def test_a_command_that_lacks_an_extra_names_it(tmp_path, monkeypatch, arguments, extra):
