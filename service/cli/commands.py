@@ -43,7 +43,10 @@ COMMANDS = (
     Command("record", "Record the packets that drivers publish, until Ctrl-C.", "recordings", "recordings"),
     Command("info", "Show what a recording holds: sensor, counts, rates, IMU and truth.", "recordings", "recordings"),
     Command(
-        "convert", "Convert a recording to a packet log (.mcap) or to DSEC's layout (.h5).", "recordings", "recordings"
+        "convert",
+        "Convert a recording to a packet log or a ROS 2 bag (.mcap), or to DSEC's layout (.h5).",
+        "recordings",
+        "recordings",
     ),
     Command("simulate", "Record a simulated event camera with its exact motion.", "recordings", "recordings"),
     Command(
