@@ -48,8 +48,8 @@ def warm_up(args: argparse.Namespace) -> int:
             )
         )
         return 0
-    done = f"compiled {found.compiled} functions" if found.compiled else "nothing to compile"
-    print(f"{done}, {found.loaded} were in the cache, {took_s:.1f} s")
+    said = f"compiled {found.compiled} functions" if found.compiled else "nothing to compile"
+    print(f"{said}, {found.loaded} were in the cache, {took_s:.1f} s")
     print(f"cache: {', '.join(map(str, caches)) or 'none: set NUMBA_CACHE_DIR to a folder that can be written'}")
     return 0
 
