@@ -29,6 +29,12 @@ COMMANDS = (
     Command("watch", "Show live estimates of all streams.", "asking"),
     Command("health", "Show the health of every node.", "asking"),
     Command("doctor", "Check connection, streams, compiled kernels, processor and installed extras.", "doctor"),
+    Command(
+        "warm-up",
+        "Compile ahead what serve, demo, drive and simulate run, and say where it is kept.",
+        "warming",
+        "serve",
+    ),
     Command("metrics", "Show the metrics of every node for Prometheus, on one address.", "metering", "metrics"),
     Command("models", "List the models of every node.", "asking"),
     Command("push", "Send a bundle to a running node.", "changing"),
@@ -81,5 +87,5 @@ def build_parser(chosen: Container[str]) -> Parser:
     for name, about, module, _ in COMMANDS:
         one = commands.add_parser(name, help=about, description=about)
         if name in chosen:
-            getattr(importlib.import_module(f"neurove_service.cli.{module}"), f"add_{name}")(one)
+            getattr(importlib.import_module(f"neurove_service.cli.{module}"), f"add_{name.replace('-', '_')}")(one)
     return parser
