@@ -80,8 +80,8 @@ MAY_IMPORT = {
     ),
     "neurove_service.metrics": "logs guard",
     "neurove_service.clients": (
-        "core:config core:geometry core:ingest core:io core:io.formats core:live core:bench logs guard config transport "
-        "clock_offset metrics"
+        "core:config core:geometry core:ingest core:io core:io.formats core:live core:bench logs guard config "
+        "transport clock_offset metrics"
     ),
     "neurove_service.ros2": "core:extras core:geometry core:io core:io.formats clock_offset guard logs transport",
     "neurove_service.node": (
