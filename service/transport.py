@@ -164,11 +164,11 @@ class Transport:
         block = zenoh.CongestionControl.BLOCK
         self.session.put(key, payload, encoding=zenoh.Encoding(schema), congestion_control=block)
 
-    def subscribe(self, key: str, on_sample: OnSample) -> None:
-        """Receive every message of a key expression until the session is closed."""
-        self.subscribe_timed(key, lambda name, payload, received_ns, _: on_sample(name, payload, received_ns))
+    def subscribe(self, key: str, on_sample: OnSample) -> Callable[[], None]:
+        """Receive every message of a key expression until the result is called or the session is closed."""
+        return self.subscribe_timed(key, lambda name, payload, received_ns, _: on_sample(name, payload, received_ns))
 
-    def subscribe_timed(self, key: str, on_sample: OnTimedSample) -> None:
+    def subscribe_timed(self, key: str, on_sample: OnTimedSample) -> Callable[[], None]:
         """As subscribe, with the time of sending, if the driver attaches it [us]."""
 
         def receive(sample: zenoh.Sample) -> None:
@@ -178,7 +178,14 @@ class Transport:
             except Exception as error:  # noqa: BLE001  # one message must not end the subscription
                 self._guard.caught("message", error)
 
-        self._kept.append(self.session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
+        subscriber = self.session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False))
+        self._kept.append(subscriber)
+
+        def undeclare() -> None:
+            self._kept.remove(subscriber)
+            subscriber.undeclare()  # type: ignore[no-untyped-call]  # gap in Zenoh's stubs
+
+        return undeclare
 
     def answer(self, key: str, handle: Callable[[bytes], bytes], schema: str = CONTROL_SCHEMA) -> None:
         """Answer the queries of a key on a separate thread; an error of `handle` goes to the caller.
