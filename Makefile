@@ -12,10 +12,10 @@ PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 
 .PHONY: run test format picture clean
 
-run: $(VENV)/installed
+run: $(VENV)/warm
 	@$(BIN)/neurove demo
 
-test: $(VENV)/installed $(VENV)/packages
+test: $(VENV)/warm $(VENV)/packages
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	MYPYPATH=$(VENV)/packages $(BIN)/mypy
@@ -58,4 +58,9 @@ else
 	@$(PIP) install -c constraints.txt -e '.[dev]'
 endif
 	@$(PIP) check
+	@touch $@
+
+# Compiled ahead, so that a run or a test does not wait for it. Without changes this takes some seconds.
+$(VENV)/warm: $(VENV)/installed $(shell find neurove_core -name '*.py')
+	@$(BIN)/neurove warm-up
 	@touch $@

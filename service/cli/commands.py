@@ -28,6 +28,12 @@ COMMANDS = (
     Command("watch", "Show live estimates of all streams.", "asking"),
     Command("health", "Show the health of every node.", "asking"),
     Command("doctor", "Check connection, streams, compiled kernels, processor and installed extras.", "doctor"),
+    Command(
+        "warm-up",
+        "Compile ahead what serve, demo, drive and simulate run, and say where it is kept.",
+        "warming",
+        "serve",
+    ),
     Command("metrics", "Show the metrics of every node for Prometheus, on one address.", "metering", "metrics"),
     Command("models", "List the models of every node.", "asking"),
     Command("push", "Send a bundle to a running node.", "changing"),
@@ -37,7 +43,10 @@ COMMANDS = (
     Command("record", "Record the packets that drivers publish, until Ctrl-C.", "recordings", "recordings"),
     Command("info", "Show what a recording holds: sensor, counts, rates, IMU and truth.", "recordings", "recordings"),
     Command(
-        "convert", "Convert a recording to a packet log (.mcap) or to DSEC's layout (.h5).", "recordings", "recordings"
+        "convert",
+        "Convert a recording to a packet log or a ROS 2 bag (.mcap), or to DSEC's layout (.h5).",
+        "recordings",
+        "recordings",
     ),
     Command("simulate", "Record a simulated event camera with its exact motion.", "recordings", "recordings"),
     Command(
@@ -77,5 +86,5 @@ def build_parser(chosen: Container[str]) -> Parser:
     for name, about, module, _ in COMMANDS:
         one = commands.add_parser(name, help=about, description=about)
         if name in chosen:
-            getattr(importlib.import_module(f"neurove_service.cli.{module}"), f"add_{name}")(one)
+            getattr(importlib.import_module(f"neurove_service.cli.{module}"), f"add_{name.replace('-', '_')}")(one)
     return parser
