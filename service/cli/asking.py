@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import importlib
 import json
 import sys
 import threading
@@ -31,7 +32,7 @@ def watch(args: argparse.Namespace) -> int:
     from neurove_service.clients import ask
 
     if args.foxglove is not None:
-        import foxglove as _  # a missing extra is reported before the wait for a service
+        importlib.import_module("foxglove")  # a missing extra is named before the wait for a service
 
     stop = stop_on_signals()
     config = client_config(args)
