@@ -21,7 +21,8 @@ class Command(NamedTuple):
 COMMANDS = (
     Command("demo", "Run driver, service and consumer on any source, then print a summary.", "running", "serve"),
     Command("serve", "Run the service until SIGINT or SIGTERM.", "running", "serve"),
-    Command("drive", "Publish a recording or a synthetic source as event packets.", "running", "recordings"),
+    Command("drive", "Publish a recording, a synthetic source or a camera as event packets.", "running", "recordings"),
+    Command("cameras", "List the event cameras at this machine, and say what is missing.", "cameras"),
     Command(
         "ros2", "Bridge the event cameras of a ROS 2 robot to the service, and its estimates back.", "ros2", "ros2"
     ),

@@ -12,6 +12,7 @@ EXTRAS: Final[dict[str, tuple[str, ...]]] = {
     "experiments": ("matplotlib", "scipy"),
     "bench": ("dv_processing", "faery", "loguru", "snntorch", "tonic"),
     "carla": ("carla",),
+    "camera": ("dv_processing", "neuromorphic_drivers"),
     "metrics": ("prometheus_client",),
     "foxglove": ("foxglove",),
     "ros2": ("xxhash",),
@@ -23,6 +24,7 @@ _DEPENDS: Final[dict[str, tuple[str, ...]]] = {
     "experiments": ("serve", "recordings"),
     "bench": ("serve",),
     "carla": ("recordings",),
+    "camera": ("recordings",),
     "ros2": ("recordings",),
 }
 
