@@ -178,14 +178,7 @@ class Transport:
             except Exception as error:  # noqa: BLE001  # one message must not end the subscription
                 self._guard.caught("message", error)
 
-        subscriber = self.session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False))
-        self._kept.append(subscriber)
-
-        def undeclare() -> None:
-            self._kept.remove(subscriber)
-            subscriber.undeclare()  # type: ignore[no-untyped-call]  # gap in Zenoh's stubs
-
-        return undeclare
+        return self._keep(self.session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
 
     def answer(self, key: str, handle: Callable[[bytes], bytes], schema: str = CONTROL_SCHEMA) -> None:
         """Answer the queries of a key on a separate thread; an error of `handle` goes to the caller.
@@ -289,12 +282,15 @@ class Transport:
 
     def token(self, key: str) -> Callable[[], None]:
         """Declare a liveliness token; call the result to undeclare it."""
-        token = self.session.liveliness().declare_token(key)
-        self._kept.append(token)
+        return self._keep(self.session.liveliness().declare_token(key))
+
+    def _keep(self, declared: Any) -> Callable[[], None]:
+        """Keep what was declared until the result undeclares it."""
+        self._kept.append(declared)
 
         def undeclare() -> None:
-            self._kept.remove(token)
-            token.undeclare()  # type: ignore[no-untyped-call]  # gap in Zenoh's stubs
+            self._kept.remove(declared)
+            declared.undeclare()
 
         return undeclare
 
