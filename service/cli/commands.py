@@ -28,7 +28,7 @@ COMMANDS = (
     ),
     Command("watch", "Show live estimates of all streams.", "asking"),
     Command("health", "Show the health of every node.", "asking"),
-    Command("doctor", "Check connection, streams, compiled kernels, processor and installed extras.", "doctor"),
+    Command("doctor", "Check connection, streams, compiled kernels, processor, cameras and extras.", "doctor"),
     Command(
         "warm-up",
         "Compile ahead what serve, demo, drive and simulate run, and say where it is kept.",

@@ -212,17 +212,17 @@ def demo(args: argparse.Namespace) -> int:
     """Run driver, service and consumer on any source, then print a summary."""
     from neurove_core.io.calibration import with_lens
     from neurove_core.sim.truth import truth_of
-    from neurove_core.sources import open_source
+    from neurove_core.sources import is_live, open_source
     from neurove_service.cli.console import console
     from neurove_service.cli.demo import run
 
     stop = stop_on_signals()
     logs.configure("warning")
-    opened = open_source(args.source, args.sensor, args.topic, args.time_unit)
-    recording = with_lens(opened, args.calibration, args.height)
+    # the driver opens a live source: a camera can be opened once
+    opened = None if is_live(args.source) else open_source(args.source, args.sensor, args.topic, args.time_unit)
+    endless = opened is None or with_lens(opened, args.calibration, args.height).endless
     if args.screenshot:
         refuse_existing("demo", "--screenshot", args.screenshot, args.source, force=args.force)
-    endless = recording.endless
     shown = console(stderr=args.json)
     duration_s = args.seconds
     if duration_s is None:
@@ -234,7 +234,9 @@ def demo(args: argparse.Namespace) -> int:
         stop=stop,
         console=shown,
         screenshot=args.screenshot,
-        truth=None if args.loop else truth_of(opened),  # a repeated source has other times than its truth
+        truth=None
+        if args.loop or opened is None
+        else truth_of(opened),  # a repeated source has other times than its truth
     )
     print(json.dumps(summary) if args.json else _summary_text(summary))
     return EXIT_FAILURE if summary["broken"] else 0

@@ -223,6 +223,24 @@ def test_info_of_a_live_source_says_how_to_record_it(run):
     assert "`neurove drive` publishes it, and `neurove record` writes what is published to a file" in err
 
 
+def test_a_demo_of_a_stream_has_estimates(ports):
+    url = f"dv://127.0.0.1:{ports[0]}"
+    with dv_writer(ports[0]) as played:
+        command = [sys.executable, "-m", "neurove_service.cli", "demo", url, "--seconds", "3", "--json"]
+        demo = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        tell(played, "clients 1")
+        t0_us = 1_000_000
+        while demo.poll() is None:  # the driver discards what arrives before the service subscribes
+            tell(played, f"events 20071 2000 {t0_us}")
+            t0_us += 20_000
+        out, err = demo.communicate(timeout=120)
+    assert demo.returncode == 0, err
+    summary = json.loads(out)
+    assert summary["sensor"] == {"width": 346, "height": 260}
+    assert summary["estimates"] > 0
+    assert summary["events_sent"] > 0
+
+
 def cameras(*words):
     """`neurove cameras` with a made-up EVK4 plugged in."""
     command = [sys.executable, "-m", "tests.live.fake_camera", "0", "cameras", *words]

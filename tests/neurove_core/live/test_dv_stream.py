@@ -11,6 +11,7 @@ import pytest
 
 from neurove_core.io.errors import UnknownSource
 from neurove_core.io.faults import Reason
+from neurove_core.live import dv_stream
 from neurove_core.live.dv_stream import open_stream
 from neurove_core.live.source import LiveEnded, NoCamera
 from neurove_core.sources import is_live, open_live, open_source, supported
@@ -242,7 +243,8 @@ def test_what_is_no_dv_stream_is_refused_in_words(parts, close, why):
     assert refused.value.exit_code == 1
 
 
-def test_a_server_that_is_silent_is_refused_in_bounded_time():
+def test_a_server_that_is_silent_is_refused_in_bounded_time(monkeypatch):
+    monkeypatch.setattr(dv_stream, "OPEN_S", 0.3)
     with serving() as url, pytest.raises(NoCamera, match="it sends no header"):
         open_stream(url)
 
