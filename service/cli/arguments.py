@@ -13,6 +13,7 @@ from neurove_protocol import Sensor
 from neurove_protocol.errors import InvalidField, NeuroVEError
 from neurove_service import logs
 from neurove_service.config import ClientConfig, ServiceConfig, load
+from neurove_service.endpoints import check_address
 
 if TYPE_CHECKING:
     from neurove_core.geometry.mounting import Mounting
@@ -122,6 +123,14 @@ def client_config(args: argparse.Namespace) -> ClientConfig:
 def flags(args: argparse.Namespace, kind: type[ServiceConfig] | type[ClientConfig]) -> dict[str, Any]:
     """The settings that the command line gives; None for each that it does not give."""
     return {name: getattr(args, name, None) for name in kind.model_fields}
+
+
+def address(text: str) -> str:
+    """An address to listen on, HOST:PORT."""
+    try:
+        return check_address(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def count(text: str) -> int:

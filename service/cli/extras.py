@@ -14,6 +14,7 @@ EXTRAS: Final[dict[str, tuple[str, ...]]] = {
     "carla": ("carla",),
     "camera": ("dv_processing", "neuromorphic_drivers"),
     "metrics": ("prometheus_client",),
+    "foxglove": ("foxglove",),
     "ros2": ("xxhash",),
 }
 """Modules that an extra installs itself; some extras also include others, see `_DEPENDS` and pyproject.toml."""

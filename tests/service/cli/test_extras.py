@@ -13,7 +13,7 @@ from neurove_service.cli.commands import COMMANDS
 from neurove_service.cli.extras import EXTRAS, missing_extra
 
 ROOT = Path(__file__).parents[3]
-MODULE_OF = {"ruamel.yaml": "ruamel", "pillow": "PIL"}
+MODULE_OF = {"ruamel.yaml": "ruamel", "pillow": "PIL", "foxglove-sdk": "foxglove"}
 NOWHERE = "tcp/127.0.0.1:9"  # the discard port: nothing listens there
 
 BASE_INSTALL = f"""
@@ -48,6 +48,7 @@ def on_base_install(*arguments):
         (("reproduce", "firing"), "experiments"),
         (("bench", "window"), "bench"),
         (("info", "a.aedat4"), "recordings"),
+        (("watch", "--foxglove", "--connect", NOWHERE, "--wait", "0"), "foxglove"),
         (("drive", "camera://"), "camera"),
         (("drive", "camera://evk4"), "camera"),
         (("drive", "camera://davis240"), "camera"),
