@@ -10,7 +10,7 @@ JOBS ?= 2
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 
-.PHONY: run test ros2 format picture clean
+.PHONY: run test ros2 format picture docs clean
 
 run: $(VENV)/warm
 	@$(BIN)/neurove demo
@@ -29,6 +29,9 @@ ros2: .venv-ros2/ready  # for the tests with real nodes of ROS 2; without it the
 
 picture: $(VENV)/installed  # the picture in README, of a simulated street with its truth
 	@$(BIN)/neurove demo "sim://street?seed=7&seconds=8" --force --screenshot service/pictures/demo.svg
+
+docs: $(VENV)/installed  # the documentation site in build/docs/site; a broken link is an error
+	@$(BIN)/python deploy/docs/build.py build/docs
 
 format: $(VENV)/installed
 	$(BIN)/ruff format .

@@ -5,6 +5,7 @@ releases one. It prints `ready`, then does each line that it reads from stdin:
 
     clients N         wait until N readers are connected
     events SEED N T0  send N events from T0 us on, 10 us apart, in batches of 1,000
+    events SEED N T0 PER_MS  the same with PER_MS events in each ms, in batches of 10 ms, all made before the first
     imu N T0          send N samples from T0 us on, 1 ms apart
     end               end without a farewell
 """
@@ -24,14 +25,13 @@ from neurove_protocol import Events, Sensor
 
 DV_SENSOR = Sensor(346, 260)
 BATCH = 1000
-STEP_US = 10
 
 
-def dv_events(seed: int, n: int, t0_us: int) -> Events:
+def dv_events(seed: int, n: int, t0_us: int, per_ms: int = 100) -> Events:
     """The events that a writer sends."""
     rng = np.random.default_rng(seed)
     x, y, p = (rng.integers(0, bound, n) for bound in (DV_SENSOR.width, DV_SENSOR.height, 2))
-    return Events.from_columns(t0_us + STEP_US * np.arange(n), x, y, p)
+    return Events.from_columns(t0_us + 1000 * np.arange(n) // per_ms, x, y, p)
 
 
 def store_of(events: Events) -> Any:
@@ -115,8 +115,10 @@ def main() -> None:
                 threading.Event().wait(0.005)
         elif word == "events":
             events = dv_events(*given)
-            for first in range(0, events.n, BATCH):
-                writers[0].writeEvents(store_of(events.span(first, min(first + BATCH, events.n))))
+            batch = 10 * (given[3] if given[3:] else BATCH // 10)
+            spans = [events.span(first, min(first + batch, events.n)) for first in range(0, events.n, batch)]
+            for store in [store_of(one) for one in spans]:
+                writers[0].writeEvents(store)
         elif word == "imu":
             samples = dv.IMUPacket.ImuVector([sample(i, given[1] + 1000 * i) for i in range(given[0])])
             writers[1].writeImu(samples)

@@ -31,6 +31,7 @@ def script(n: int):
         pause.wait(0.005)
         yield TIMEOUT
     for i, part in enumerate(camera_events(n)):
+        pause.wait(0.02)  # by contract, a link may drop packets of a burst
         yield Step(part, [0] if i == 5 else None, dropped=5 if i >= 5 else 0)
 
 
