@@ -22,6 +22,12 @@ PROGRESS_SCHEMA = "application/msgpack;neurove.progress.1"
 CHUNK_SCHEMA = "application/octet-stream"
 """Zenoh Encoding of a chunk: bytes of a bundle."""
 
+LATENCY_BOUNDS_MS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0)
+"""Upper bounds of the buckets of a LatencyHistogram [ms], inclusive; the last bucket has none."""
+
+MAX_FLAGS = 64
+"""Cap of the flags that a StreamStatus counts."""
+
 MAX_CHUNK_BYTES = 1 << 20
 MAX_SIGNATURE_BYTES = 1 << 16
 MAX_REQUEST_BYTES = 1 << 17
@@ -133,6 +139,16 @@ class Latency(Part):
     p99: float
 
 
+class LatencyHistogram(Part):
+    """Latencies of all estimates since the stream began. Unlike percentiles, histograms of several streams add up."""
+
+    counts: Annotated[
+        tuple[Count, ...],
+        Field(strict=False, min_length=len(LATENCY_BOUNDS_MS) + 1, max_length=len(LATENCY_BOUNDS_MS) + 1),
+    ]  # estimates by bucket, not cumulative
+    sum_ms: Annotated[float, Field(ge=0)]  # sum of the latencies [ms]
+
+
 class ImuStatus(Part):
     """The inertial unit of a stream, as far as its packets reach the node."""
 
@@ -178,6 +194,9 @@ class StreamStatus(Message):
     refusal: str = ""  # why the newest packet or CameraInfo was refused
     unrefined_windows: Count = 0  # answered by the network alone, because the stream was behind; no loss
     imu: ImuStatus | None = None  # None for a stream without an inertial unit
+    latency_histogram: LatencyHistogram | None = None  # None from an older node
+    flag_counts: Annotated[dict[str, Count], Field(max_length=MAX_FLAGS)] = Field(default_factory=dict)  # estimates
+    sigma: Annotated[tuple[float, ...], Field(strict=False, min_length=6, max_length=6)] | None = None  # of the newest
 
 
 class ModelInfo(Part):

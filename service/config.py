@@ -32,7 +32,7 @@ from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.events import MAX_PACKET_BYTES, PacketLimits
 from neurove_protocol.fields import WrongField
 from neurove_protocol.keys import DEFAULT_PREFIX, Keys, check_name
-from neurove_service.endpoints import check_endpoint
+from neurove_service.endpoints import check_address, check_endpoint
 
 log = logging.getLogger(__name__)
 
@@ -198,6 +198,11 @@ class ServiceConfig(_Settings):
     )
     uncertain_rad_s: float | None = Field(
         None, gt=0, description="The same for the angular sigma; without it the model's bound, or 0.1 [rad/s]."
+    )
+
+    metrics: Annotated[str, AfterValidator(check_address)] | None = Field(
+        None,
+        description="HOST:PORT for /metrics (Prometheus), /live, /ready and /health; none: no server. Extra metrics.",
     )
 
     @model_validator(mode="before")

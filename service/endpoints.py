@@ -1,5 +1,6 @@
 """Endpoints of Zenoh, checked before Zenoh sees them, so that an error says in our words what is wrong."""
 
+import ipaddress
 import re
 from typing import Final
 
@@ -42,3 +43,48 @@ def _wrong_protocol(text: str) -> str:
         meant = f"{protocol if protocol in PROTOCOLS else 'tcp'}/{address}"
         return f"{text!r} is no endpoint: did you mean {meant!r}?"
     return f"{text!r} is no endpoint: give PROTOCOL/HOST:PORT {_EXAMPLE}; the protocols are {', '.join(PROTOCOLS)}"
+
+
+LOOPBACK: Final = "127.0.0.1"
+
+
+def check_address(text: str) -> str:
+    """An address to listen on, HOST:PORT; a port without a host means this machine only.
+
+    Raises:
+        ValueError: it has another form.
+
+    >>> check_address("9464"), check_address("0.0.0.0:9464"), check_address("[::1]:0")
+    ('127.0.0.1:9464', '0.0.0.0:9464', '[::1]:0')
+    """
+    address = f"{LOOPBACK}:{text.removeprefix(':')}" if text.removeprefix(":").isdecimal() else text
+    found = _HOST_PORT.fullmatch(address)
+    if not found:
+        raise ValueError(f"{text!r} is no address: give HOST:PORT, such as {LOOPBACK}:9464")
+    if int(found[1]) > 65535:
+        raise ValueError(f"{text!r}: port {found[1]}: a port is at most 65535")
+    return address
+
+
+def split_address(address: str) -> tuple[str, int]:
+    """Host and port of a checked address.
+
+    >>> split_address("[::1]:9464")
+    ('::1', 9464)
+    """
+    host, _, port = address.rpartition(":")
+    return host.strip("[]"), int(port)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine reaches a host.
+
+    >>> is_loopback("localhost"), is_loopback("::1"), is_loopback("0.0.0.0")
+    (True, True, False)
+    """
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:  # another name
+        return False

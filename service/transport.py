@@ -110,12 +110,12 @@ class Transport:
     """One Zenoh session. Use it in a `with` block or close it; one that is left open is closed when the process ends.
 
     Args:
-        session: opened.
+        session: opened; the module that speaks to ROS 2 uses it too.
         guard: counts internal errors of what is called for a message or a query.
     """
 
     def __init__(self, session: zenoh.Session, guard: Guard | None = None) -> None:
-        self._session, self._guard = session, guard or Guard()
+        self.session, self._guard = session, guard or Guard()
         self._answering: list[tuple[Any, Desk[zenoh.Query], threading.Thread]] = []
         self._kept: list[Any] = []  # Zenoh undeclares what is garbage collected
         _OPEN[id(self)] = self
@@ -137,7 +137,7 @@ class Transport:
             desk.close()
             thread.join(timeout=1)
         try:
-            self._session.close()  # type: ignore[no-untyped-call]  # gap in Zenoh's stubs
+            self.session.close()  # type: ignore[no-untyped-call]  # gap in Zenoh's stubs
         except zenoh.ZError as error:  # a link that cannot deliver what waits
             log.warning("the session did not close in order", why=_reason(error))
 
@@ -150,7 +150,7 @@ class Transport:
             urgent: for estimates: sent before ordinary data and never batched.
         """
         priority = zenoh.Priority.DATA_HIGH if urgent else zenoh.Priority.DATA
-        declared = self._session.declare_publisher(
+        declared = self.session.declare_publisher(
             key,
             encoding=zenoh.Encoding(schema),
             congestion_control=zenoh.CongestionControl.DROP,
@@ -162,13 +162,13 @@ class Transport:
     def put(self, key: str, payload: bytes, schema: str) -> None:
         """Publish one message that must not be dropped on a congested link, such as a CameraInfo."""
         block = zenoh.CongestionControl.BLOCK
-        self._session.put(key, payload, encoding=zenoh.Encoding(schema), congestion_control=block)
+        self.session.put(key, payload, encoding=zenoh.Encoding(schema), congestion_control=block)
 
-    def subscribe(self, key: str, on_sample: OnSample) -> None:
-        """Receive every message of a key expression until the session is closed."""
-        self.subscribe_timed(key, lambda name, payload, received_ns, _: on_sample(name, payload, received_ns))
+    def subscribe(self, key: str, on_sample: OnSample) -> Callable[[], None]:
+        """Receive every message of a key expression until the result is called or the session is closed."""
+        return self.subscribe_timed(key, lambda name, payload, received_ns, _: on_sample(name, payload, received_ns))
 
-    def subscribe_timed(self, key: str, on_sample: OnTimedSample) -> None:
+    def subscribe_timed(self, key: str, on_sample: OnTimedSample) -> Callable[[], None]:
         """As subscribe, with the time of sending, if the driver attaches it [us]."""
 
         def receive(sample: zenoh.Sample) -> None:
@@ -178,7 +178,7 @@ class Transport:
             except Exception as error:  # noqa: BLE001  # one message must not end the subscription
                 self._guard.caught("message", error)
 
-        self._kept.append(self._session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
+        return _keep(self._kept, self.session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
 
     def answer(self, key: str, handle: Callable[[bytes], bytes], schema: str = CONTROL_SCHEMA) -> None:
         """Answer the queries of a key on a separate thread; an error of `handle` goes to the caller.
@@ -249,7 +249,7 @@ class Transport:
                 with self._guard.at("query", key=key):
                     work(query)
 
-        queryable = self._session.declare_queryable(key, zenoh.handlers.Callback(receive, indirect=False))
+        queryable = self.session.declare_queryable(key, zenoh.handlers.Callback(receive, indirect=False))
         thread = threading.Thread(target=serve, name=f"answer {key}", daemon=True)
         thread.start()
         self._answering.append((queryable, desk, thread))
@@ -270,7 +270,7 @@ class Transport:
             PeerError: a peer refused; it has the code and the reason of the peer.
         """
         priority = zenoh.Priority.DATA_LOW if bulk else zenoh.Priority.DATA
-        return list(_query(self._session, key, request, timeout_s, priority, zenoh.ConsolidationMode.AUTO))
+        return list(_query(self.session, key, request, timeout_s, priority, zenoh.ConsolidationMode.AUTO))
 
     def ask_streaming(self, key: str, request: bytes, timeout_s: float) -> Iterator[Reply]:
         """Query one node and yield every reply as it arrives; replies with PROGRESS_SCHEMA precede the last one.
@@ -278,18 +278,11 @@ class Transport:
         Raises:
             PeerError: as ask.
         """
-        return _query(self._session, key, request, timeout_s, zenoh.Priority.DATA, zenoh.ConsolidationMode.NONE)
+        return _query(self.session, key, request, timeout_s, zenoh.Priority.DATA, zenoh.ConsolidationMode.NONE)
 
     def token(self, key: str) -> Callable[[], None]:
         """Declare a liveliness token; call the result to undeclare it."""
-        token = self._session.liveliness().declare_token(key)
-        self._kept.append(token)
-
-        def undeclare() -> None:
-            self._kept.remove(token)
-            token.undeclare()  # type: ignore[no-untyped-call]  # gap in Zenoh's stubs
-
-        return undeclare
+        return _keep(self._kept, self.session.liveliness().declare_token(key))
 
     def watch_tokens(self, key: str, on_token: Callable[[str, bool], None]) -> None:
         """Call `on_token` with a token's key and whether it is present, for present tokens and at each change."""
@@ -299,12 +292,23 @@ class Transport:
                 on_token(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
         handler = zenoh.handlers.Callback(receive, indirect=False)
-        self._kept.append(self._session.liveliness().declare_subscriber(key, handler, history=True))
+        self._kept.append(self.session.liveliness().declare_subscriber(key, handler, history=True))
 
     def tokens(self, key: str, timeout_s: float) -> list[str]:
         """The present liveliness tokens of a key expression."""
-        replies = self._session.liveliness().get(key, timeout=timeout_s)
+        replies = self.session.liveliness().get(key, timeout=timeout_s)
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+
+
+def _keep(kept: list[Any], declared: Any) -> Callable[[], None]:
+    """Keep what was declared until the result undeclares it."""
+    kept.append(declared)
+
+    def undeclare() -> None:
+        kept.remove(declared)
+        declared.undeclare()
+
+    return undeclare
 
 
 def _sent_us(attachment: zenoh.ZBytes | None) -> int | None:
@@ -370,6 +374,7 @@ def open_transport(
     patience_s: float = 0.0,
     stop: threading.Event | None = None,
     guard: Guard | None = None,
+    timestamps: bool = False,
 ) -> Transport:
     """Open a session.
 
@@ -381,12 +386,13 @@ def open_transport(
         patience_s: how long a client retries while no process listens [s].
         stop: ends the retries early.
         guard: counts internal errors of what is called for a message or a query.
+        timestamps: whether messages carry the time of publishing, as ROS 2 expects.
 
     Raises:
         Unreachable: no process listened for that time.
         EndpointError: the session cannot be opened, and a retry cannot help.
     """
-    config = _session_config(mode, listen, connect, config_file)
+    config = _session_config(mode, listen, connect, config_file, timestamps)
     stop = stop or threading.Event()
     deadline = time.monotonic() + patience_s
     waiting = False
@@ -407,7 +413,7 @@ def open_transport(
 
 
 def _session_config(
-    mode: str, listen: tuple[str, ...], connect: tuple[str, ...], config_file: Path | None
+    mode: str, listen: tuple[str, ...], connect: tuple[str, ...], config_file: Path | None, timestamps: bool
 ) -> zenoh.Config:
     try:
         config = zenoh.Config.from_file(str(config_file)) if config_file else zenoh.Config()
@@ -416,7 +422,7 @@ def _session_config(
             config.insert_json5("listen/endpoints", json.dumps(listen))
         if connect or not config_file:
             config.insert_json5("connect/endpoints", json.dumps(connect))
-        for key, value in _SETTINGS.items():
+        for key, value in (_SETTINGS | ({"timestamping/enabled": True} if timestamps else {})).items():
             config.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
         where = f"zenoh_config={config_file}" if config_file else _where(listen, connect)

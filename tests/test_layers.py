@@ -40,7 +40,8 @@ MAY_IMPORT = {
     "neurove_core.io": "files extras figures geometry",
     "neurove_core.io.formats": "compiled files extras geometry io",
     "neurove_core.sim": "compiled config figures geometry io io.formats",
-    "neurove_core.sources": "io io.formats sim",
+    "neurove_core.live": "extras io io.formats",
+    "neurove_core.sources": "io io.formats live sim",
     "neurove_core.evaluation": "compiled figures geometry networks models estimator inertial aided io",
     "neurove_core.training": (
         "config files extras figures geometry ingest networks "
@@ -77,11 +78,15 @@ MAY_IMPORT = {
     "neurove_service.models": (
         "core:config core:files core:ingest core:networks core:models core:estimator core:self_test logs guard streams"
     ),
+    "neurove_service.metrics": "logs guard",
     "neurove_service.clients": (
-        "core:config core:geometry core:ingest core:io core:io.formats core:bench logs config transport clock_offset"
+        "core:config core:geometry core:ingest core:io core:io.formats core:live core:bench logs guard config "
+        "transport clock_offset metrics"
     ),
+    "neurove_service.ros2": "core:extras core:geometry core:io core:io.formats clock_offset guard logs transport",
     "neurove_service.node": (
-        "core:files core:geometry core:models logs guard lifecycle latency config transport streams models"
+        "core:files core:geometry core:models logs guard lifecycle latency endpoints config transport streams models "
+        "metrics"
     ),
     "neurove_service": "",
     "neurove_service.cli": "*",
@@ -154,8 +159,8 @@ def why_not(path: Path, found: Import) -> str | None:
         if found.name.split(".")[0] not in OF_PROTOCOL:
             return "protocol imports the standard library, numpy, msgpack and pydantic alone"
         return None
-    if found.of("zenoh") and path.as_posix() != "service/transport.py":
-        return "zenoh is imported in service/transport.py alone"
+    if found.of("zenoh") and path.as_posix() not in ("service/transport.py", "service/ros2/zenoh_link.py"):
+        return "zenoh is imported in service/transport.py and service/ros2/zenoh_link.py alone"
     if not found.of(*FOLDERS.values()):
         return None
     room, other = room_of(dotted(path)), room_of(found.name)

@@ -91,6 +91,16 @@ class Mounting(NamedTuple):
             base.t, np.concatenate([(v + np.cross(w, self.position_m)) @ self.rotation, w @ self.rotation], 1)
         )
 
+    @property
+    def adjoint(self) -> Array:
+        """Matrix J (6, 6) from a twist of the camera to that of the base; J C J^T turns its covariance C.
+
+        v_b = R v_c + p x (R w_c), w_b = R w_c: the inverse of `of_base`.
+        """
+        x, y, z = self.position_m
+        cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        return np.block([[self.rotation, cross @ self.rotation], [np.zeros((3, 3)), self.rotation]])
+
     def of_forward_speed(self, t: NDArray[np.int64], speed_m_s: Array) -> Twists:
         """The twists of a camera of which only the forward speed of the robot is known: vz, and nan elsewhere.
 

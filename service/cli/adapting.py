@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -10,7 +9,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from neurove_protocol.errors import InvalidField
-from neurove_service.cli.arguments import add_lens_flags, check_folder, command, count, numbers, sensor_size
+from neurove_service.cli.arguments import (
+    add_lens_flags,
+    check_folder,
+    command,
+    count,
+    mounting_of,
+    numbers,
+    sensor_size,
+)
 from neurove_service.cli.bars import event_count, progress
 
 if TYPE_CHECKING:
@@ -93,25 +100,11 @@ def _mounting(args: argparse.Namespace) -> "Mounting | None":
             raise InvalidField(
                 "adapt", "--extrinsics", str(args.extrinsics), "give it or --mount and --position, not both"
             )
-        return Mounting.from_numbers(str(args.extrinsics), _numbers_in(args.extrinsics))
+        return mounting_of("adapt", args.extrinsics)
     if args.mount is None and args.position is None:
         return None
     roll, pitch, yaw = args.mount or (0.0, 0.0, 0.0)
     return Mounting.from_angles(roll, pitch, yaw, args.position or (0.0, 0.0, 0.0))
-
-
-def _numbers_in(path: Path) -> list[float]:
-    """All numbers of a text file, without names before a colon and comments: a matrix as text, YAML or JSON."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError:
-        raise InvalidField("adapt", "--extrinsics", str(path), "is not a text file") from None
-    lines = [re.sub(r'"?[A-Za-z_]\w*"?\s*[:=]', " ", line.partition("#")[0]) for line in text.splitlines()]
-    words = re.split(r"[\s,;\[\]{}()]+", " ".join(lines))
-    try:
-        return [float(word) for word in words if word and word != "-"]
-    except ValueError as error:
-        raise InvalidField("adapt", "--extrinsics", str(path), f"expected numbers: {error}") from None
 
 
 def _table(report: dict[str, Any]) -> Iterator[str]:

@@ -28,6 +28,7 @@ ALL = (
     "sine",
     "wire",
     "processes",
+    "metrics",
     "narrow",
 )
 
@@ -65,6 +66,7 @@ def bench(args: argparse.Namespace) -> int:
 
 def _rows(name: str, args: argparse.Namespace, missing: list[str]) -> Iterator["Row"]:
     from neurove_core.bench import ingest, processes, refinement, simulate, sine, window
+    from neurove_service.cli import bench_metrics
     from neurove_service.clients import bench_wire
 
     options = {"quick": args.quick, "with_peers": args.peers}
@@ -80,6 +82,7 @@ def _rows(name: str, args: argparse.Namespace, missing: list[str]) -> Iterator["
         "sine": lambda: sine.compare(_rounds(args, 9)),
         "wire": lambda: bench_wire.wire(_rounds(args, 15), quick=args.quick),
         "processes": lambda: processes.processes(_rounds(args, 7), quick=args.quick),
+        "metrics": lambda: bench_metrics.metrics(_rounds(args, 11), quick=args.quick),
         "narrow": lambda: _narrow(args, missing),
     }
     yield from run[name]()

@@ -2,6 +2,7 @@
 
 import threading
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from neurove_core.geometry.tables import TABLES
 from neurove_core.models.bounds import Bounds
@@ -31,6 +32,9 @@ from neurove_service.streams.comparison import TrialLimits
 from neurove_service.streams.history import RingSize
 from neurove_service.streams.registry import StreamRegistry, StreamSettings
 from neurove_service.transport import EndpointError, Report, Transport, open_transport
+
+if TYPE_CHECKING:
+    from neurove_service.node.monitor import Monitor
 
 log = logs.get(__name__)
 
@@ -62,6 +66,15 @@ def _stream_settings(config: ServiceConfig) -> StreamSettings:
     )
 
 
+def _monitor(config: ServiceConfig, guard: Guard) -> "Monitor | None":
+    """The HTTP server for metrics and probes, if the settings ask for it; it starts before the model is loaded."""
+    if config.metrics is None:
+        return None
+    from neurove_service.node.monitor import Monitor
+
+    return Monitor(config.node, config.metrics, guard)
+
+
 class Service:
     """A node: serves every stream whose packets it receives.
 
@@ -72,6 +85,7 @@ class Service:
     Raises:
         ConfigError: a configured folder is no folder, or cannot be read.
         BadModel, UnknownModel: the configured model cannot be loaded.
+        AddressError: the address for metrics cannot be used.
     """
 
     def __init__(self, config: ServiceConfig, stop: threading.Event) -> None:
@@ -79,6 +93,7 @@ class Service:
         check_folders(config)
         TABLES.max_bytes = config.tables_mib << 20
         self._guard = Guard()
+        self._monitor = _monitor(config, self._guard)
         self._keys = config.keys
         self._active_file = ActiveFile(config.state_folder)
         self._store = ModelStore(
@@ -110,6 +125,13 @@ class Service:
             EndpointError: an endpoint is in use or wrong.
         """
         try:
+            self._run()
+        finally:
+            if self._monitor is not None:
+                self._monitor.close()
+
+    def _run(self) -> None:
+        try:
             opened = self._open()
         except EndpointError:
             if self._stop.is_set():  # stopped while it waited for a router
@@ -128,9 +150,11 @@ class Service:
             watch = Watch(
                 self._config.node, registry, self._guard, self._config.expect_streams, lambda: namesakes.count
             )
-            self._declare(transport, registry, watch)
+            handlers = self._declare(transport, registry, watch)
             self._log_ready()
             housekeeping = self._housekeeping(transport, registry, watch)
+            if self._monitor is not None:
+                self._monitor.attach(handlers.report, registry.stuck, lambda: housekeeping.beat_s)
             Watchdog(lambda: housekeeping.beat_s, self._guard).start(self._stop)
             try:
                 housekeeping.run(self._stop)
@@ -153,7 +177,7 @@ class Service:
             guard=self._guard,
         )
 
-    def _declare(self, transport: Transport, registry: StreamRegistry, watch: Watch) -> None:
+    def _declare(self, transport: Transport, registry: StreamRegistry, watch: Watch) -> Handlers:
         """Declare everything: first what receives packets, last the token that says that the node is ready."""
         keys, node = self._keys, self._config.node
         handlers = Handlers(
@@ -180,6 +204,7 @@ class Service:
         ):
             transport.answer_streaming(key, handle, after=memory.release_memory)
         transport.token(keys.alive(node))
+        return handlers
 
     def _push_handler(self, handlers: Handlers, transport: Transport) -> Callable[[bytes, Report], bytes]:
         """Answers pushes by pulling the bundle from the client that pushes it."""

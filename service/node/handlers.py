@@ -72,11 +72,15 @@ class Handlers:
     def health(self, request: bytes) -> bytes:
         """Health of this node and its streams."""
         HealthRequest.decode(request)
+        return self.report().encode()
+
+    def report(self) -> HealthReply:
+        """Health of this node and its streams; any thread may ask."""
         streams = self._streams()
         condition = self._condition()
         ok, why = node_verdict(streams, (*self._slot.faults, *condition.reasons()))
         active = self._slot.active
-        reply = HealthReply(
+        return HealthReply(
             node=self._node,
             ok=ok,
             why=why,
@@ -94,7 +98,6 @@ class Handlers:
             change=self._slot.last_change,
             rollbacks=self._slot.rollbacks,
         )
-        return reply.encode()
 
     def models(self, request: bytes) -> bytes:
         """The models of this node."""

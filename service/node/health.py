@@ -13,7 +13,7 @@ def stream_status(node: str, stream: Stream, now_ns: int | None = None) -> Strea
     now_ns = time.monotonic_ns() if now_ns is None else now_ns
     verdict, why = stream.verdicts.at(now_ns)
     latencies = list(stream.activity.latencies_ms)
-    counters, sensor = stream.counters, stream.sensor
+    counters, sensor, newest = stream.counters, stream.sensor, stream.activity.newest
     return StreamStatus(
         node=node,
         stream=stream.name,
@@ -37,6 +37,9 @@ def stream_status(node: str, stream: Stream, now_ns: int | None = None) -> Strea
         refusal=stream.activity.refusal,
         unrefined_windows=counters.unrefined_windows,
         imu=stream.inertial.status(),
+        latency_histogram=stream.activity.latency_histogram(),
+        flag_counts={name: count for name, count in stream.activity.flag_counts.items() if count},
+        sigma=newest.sigma if newest is not None else None,
     )
 
 

@@ -1,11 +1,12 @@
 """Activity of one stream: counters, times of the newest packet, estimate and loss, and latencies."""
 
+from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from neurove_protocol import Flag, TwistEstimate
-from neurove_protocol.control import Losses
+from neurove_protocol.control import LATENCY_BOUNDS_MS, LatencyHistogram, Losses
 
 IDLE_NS = 1_000_000_000
 """A stream is idle after this time without a packet."""
@@ -60,6 +61,10 @@ class Activity:
     def __init__(self, now_ns: Callable[[], int]) -> None:
         self.counters = Counters()
         self.latencies_ms: deque[float] = deque(maxlen=_LATENCIES)
+        self.flag_counts = {flag.value: 0 for flag in Flag}  # estimates by flag
+        self.newest: TwistEstimate | None = None  # the estimate that was published last
+        self._buckets = [0] * (len(LATENCY_BOUNDS_MS) + 1)
+        self._latency_sum_ms = 0.0
         self.last_packet_ns = self.last_estimate_ns = self.flow_began_ns = now_ns()
         self.last_loss_ns: int | None = None
         self.arrived_ns = 0  # when the newest packet arrived, which may still wait; written by Zenoh's thread
@@ -80,6 +85,19 @@ class Activity:
     def newest_packet_ns(self) -> int:
         """When the newest packet arrived, processed or not."""
         return max(self.last_packet_ns, self.arrived_ns)
+
+    def count(self, estimate: TwistEstimate) -> None:
+        """Count the latency and the flags of an estimate that was recorded, for metrics."""
+        latency_ms = self.latencies_ms[-1]
+        self._buckets[bisect_left(LATENCY_BOUNDS_MS, latency_ms)] += 1
+        self._latency_sum_ms += latency_ms
+        for flag in estimate.flags:
+            self.flag_counts[flag] += 1
+        self.newest = estimate
+
+    def latency_histogram(self) -> LatencyHistogram:
+        """Latencies of all estimates."""
+        return LatencyHistogram(counts=tuple(self._buckets), sum_ms=max(0.0, self._latency_sum_ms))
 
     def heard(self, received_ns: int) -> None:
         """Record when a packet arrived."""
@@ -112,7 +130,12 @@ class Activity:
         self.reset_ns.append(self._now_ns())
 
     def published(self, estimate: TwistEstimate) -> None:
-        """Record the latency of an estimate."""
+        """Record and count an estimate that was published."""
+        self.record(estimate)
+        self.count(estimate)
+
+    def record(self, estimate: TwistEstimate) -> None:
+        """Record the latency of an estimate and its time, for the verdict."""
         self.latencies_ms.append(estimate.trace.latency_ms)
         self.last_estimate_ns = estimate.trace.published_ns
         if Flag.FROZEN in estimate.flags:

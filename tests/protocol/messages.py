@@ -109,6 +109,9 @@ STATUS: Fields = {
         "disagrees": True,
         "problem": "the gyroscope turns the other way about y",
     },
+    "latency_histogram": {"counts": [0, 1, 70, 7, 1, 0, 0, 0, 0, 0, 0], "sum_ms": 280.5},
+    "flag_counts": {"gap": 2, "settling": 20},
+    "sigma": [0.25, 0.25, 0.5, 0.125, 0.0625, 0.125],
 }
 EXAMPLES: dict[str, Fields] = {
     "EventPacket": {
@@ -353,6 +356,12 @@ statuses = st.fixed_dictionaries(
         "latency_ms": st.none() | st.fixed_dictionaries(dict.fromkeys(("p50", "p95", "p99"), floats)),
         "last_packet_age_s": floats,
         "imu": st.none() | inertial_units,
+        "latency_histogram": st.none()
+        | st.fixed_dictionaries(
+            {"counts": st.lists(counts, min_size=11, max_size=11), "sum_ms": st.floats(0, 1e12, allow_nan=False)}
+        ),
+        "flag_counts": st.dictionaries(sentences, counts, max_size=3),
+        "sigma": st.none() | st.lists(floats, min_size=6, max_size=6),
         **{name: counts for name, value in STATUS.items() if type(value) is int and name != "v"},
     }
 )

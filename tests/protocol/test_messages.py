@@ -46,7 +46,7 @@ NULLABLE = {
     *(
         (kind, name)
         for kind in ("StreamStatus", "HealthReply")
-        for name in ("latency_ms", "imu", "bias_rad_s", "offset_ms")
+        for name in ("latency_ms", "imu", "bias_rad_s", "offset_ms", "latency_histogram", "sigma")
     ),
     ("ModelsReply", "previous"),
     ("PushRequest", "signature"),
@@ -54,7 +54,7 @@ NULLABLE = {
     ("ActivateRequest", "force"),
     ("RollbackRequest", "expect"),
 }
-FREE_MAPS = ("details", "unreadable", "figures", "partial", "internal_errors")
+FREE_MAPS = ("details", "unreadable", "figures", "partial", "internal_errors", "flag_counts")
 DEFAULTED = {"release", "figures", "signature"}  # of a ModelInfo
 DEFAULTED |= {
     "recovered_packets",
@@ -63,6 +63,9 @@ DEFAULTED |= {
     "refusal",
     "unrefined_windows",
     "imu",
+    "latency_histogram",
+    "flag_counts",
+    "sigma",
 }  # of a StreamStatus
 OUT_OF_BOUND: dict[str, dict[str, tuple[Any, ...]]] = {
     "EventPacket": {
@@ -121,6 +124,11 @@ OUT_OF_BOUND: dict[str, dict[str, tuple[Any, ...]]] = {
         **{f"lost.{name}": (-1, 1 << 63) for name in Losses.model_fields},
         "imu.samples": (-1, 1 << 63),
         "imu.bias_rad_s": ([], [0.0] * 2, [0.0] * 4),
+        "latency_histogram.counts": ([], [0] * 10, [0] * 12),
+        "latency_histogram.counts.3": (-1, 1 << 63),
+        "latency_histogram.sum_ms": (-1.0,),
+        "flag_counts": ({f"flag{i}": 1 for i in range(65)},),
+        "sigma": ([], [0.0] * 5, [0.0] * 7),
     },
     "HealthReply": {
         "node": ("*",),

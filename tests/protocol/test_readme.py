@@ -38,7 +38,7 @@ from neurove_protocol import (
     velocity,
 )
 from neurove_protocol.codec import PROTOCOL_VERSION
-from neurove_protocol.control import ImuStatus, Latency, Losses, ModelInfo, Verdict
+from neurove_protocol.control import LATENCY_BOUNDS_MS, ImuStatus, Latency, LatencyHistogram, Losses, ModelInfo, Verdict
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import DEFAULT_LIMITS, FORMATS, PacketLimits, decode_packet, encode_packet
 from neurove_protocol.imu import decode_imu, encode_imu
@@ -160,10 +160,11 @@ def test_the_table_of_a_message_has_its_fields_and_says_which_have_a_default(mod
         ("`host`", HostTime),
         ("`lost`", Losses),
         ("`latency_ms`", Latency),
+        ("`latency_histogram`", LatencyHistogram),
         ("`imu`", ImuStatus),
         ("ModelInfo", ModelInfo),
     ],
-    ids=["trace", "host", "lost", "latency", "imu", "model"],
+    ids=["trace", "host", "lost", "latency", "histogram", "imu", "model"],
 )
 def test_the_table_of_a_part_has_its_fields_and_says_which_have_a_default(heading: str, part: type[BaseModel]) -> None:
     assert_fields(table(f"field of {heading}"), part)
@@ -234,6 +235,11 @@ def test_the_caps_are_those_of_the_code() -> None:
 def test_the_page_gives_the_order_of_a_twist() -> None:
     assert f"{' '.join(AXES[:3])} [m/s] and {' '.join(AXES[3:])} [rad/s]" in section("### TwistEstimate")
     assert f"default `{TwistEstimate.model_fields['frame_id'].default}`" in section("### TwistEstimate")
+
+
+def test_the_page_gives_the_bounds_of_the_buckets() -> None:
+    said = " ".join(section("### StreamStatus").split())
+    assert ", ".join(f"{bound:g}" for bound in LATENCY_BOUNDS_MS) + " ms" in said
 
 
 def test_the_links_of_the_page_lead_to_its_sections() -> None:

@@ -77,6 +77,20 @@ def test_an_empty_variable_counts_as_unset(monkeypatch):
     assert set(origin.values()) == {"default"}
 
 
+@pytest.mark.parametrize(
+    ("given", "address"),
+    [("9464", "127.0.0.1:9464"), (":9464", "127.0.0.1:9464"), ("[::1]:0", "[::1]:0"), ("0.0.0.0:80", "0.0.0.0:80")],
+)
+def test_metrics_are_for_this_machine_unless_a_host_is_given(given, address):
+    assert load(ServiceConfig, {"metrics": given})[0].metrics == address
+
+
+@pytest.mark.parametrize("given", ["", "localhost", "a:b", "127.0.0.1:70000", "http://localhost:9464", "tcp/a:1"])
+def test_a_wrong_address_of_metrics_is_explained(given):
+    with pytest.raises(ConfigError, match="metrics=.*(HOST:PORT|at most 65535)"):
+        load(ServiceConfig, {"metrics": given})
+
+
 @pytest.mark.parametrize("field", ["models_dir", "state_dir", "zenoh_config", "trusted_keys"])
 def test_an_empty_path_is_refused_not_the_current_folder(field, tmp_path):
     with pytest.raises(ConfigError, match=f"{field}='' .from flag.: .*must not be empty"):

@@ -36,6 +36,12 @@ def test_packets_over_a_real_link_are_counted_as_numpy_counts_them(capsys):
     assert row["equal"]
 
 
+def test_windows_are_the_same_with_metrics(capsys):
+    assert main(["bench", "metrics", "--quick", "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)
+    assert (row["peer"], row["equal"]) == ("no metrics", True)
+
+
 def test_avx2_alone_gives_equal_answers(capsys):
     assert main(["bench", "narrow", "--quick", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)

@@ -227,12 +227,28 @@ def camera_info(data: bytes, *, cdr: bool) -> CameraInfo | None:
     fields = Fields(data, cdr=cdr)
     fields.header_ns()
     height, width = fields.numbers("I", 2)
-    model = fields.text().lower()
+    model = fields.text()
     count = int(fields.number("I"))
     if count > 64:
         raise BadMessage(f"{count} distortion coefficients; the limit is 64")
     distortion = fields.numbers("d", count)
-    fx, _, cx, _, fy, cy, *_ = fields.numbers("d", 9)
+    return lens(width, height, model, distortion, fields.numbers("d", 9))
+
+
+def lens(
+    width: int, height: int, model: str, distortion: tuple[float, ...], matrix: tuple[float, ...]
+) -> CameraInfo | None:
+    """The lens of a sensor_msgs/CameraInfo; None if it is not calibrated or its model is not supported.
+
+    Args:
+        width: of the image [px].
+        height: of the image [px].
+        model: `distortion_model`.
+        distortion: `d`.
+        matrix: `k`, 9 numbers.
+    """
+    fx, _, cx, _, fy, cy, *_ = matrix
+    model = model.lower()
     if model not in _LENSES or fx <= 0 or fy <= 0:  # all zeros: not calibrated
         return None
     try:
