@@ -378,7 +378,7 @@ def _over_ground(
     twists, covariance = np.tile(answer.motion.twist, (len(estimate.twists), 1)), answer.motion.covariance
     if answer.outcome == "turning":
         rate = Rate(answer.motion.twist[3:], covariance[3:, 3:])
-        twists, covariance = _with_rate(estimate.twists, estimate.covariance, rate)
+        twists, covariance = _with_rate(estimate.twists, estimate.covariance, rate, np.zeros(3))
     uncertain = estimator.is_uncertain(twists, covariance)
     return estimate._replace(twists=twists, covariance=covariance, source="refined", uncertain=uncertain), state
 
