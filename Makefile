@@ -13,6 +13,7 @@ PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 .PHONY: run test format picture clean
 
 run: $(VENV)/installed
+	@echo "with a live page for browsers: $(BIN)/neurove demo --page"
 	@$(BIN)/neurove demo
 
 test: $(VENV)/installed $(VENV)/packages
@@ -22,8 +23,9 @@ test: $(VENV)/installed $(VENV)/packages
 	$(BIN)/python tests/wheel.py
 	$(BIN)/pytest --numprocesses $(JOBS) --dist loadgroup --no-loadscope-reorder --cov --cov-report=term
 
-picture: $(VENV)/installed  # the picture in README, of a simulated street with its truth
+picture: $(VENV)/installed  # the pictures in README, of a simulated street; the page needs Chromium
 	@$(BIN)/neurove demo "sim://street?seed=7&seconds=8" --force --screenshot service/pictures/demo.svg
+	@$(BIN)/python -m tests.long.page_picture
 
 format: $(VENV)/installed
 	$(BIN)/ruff format .

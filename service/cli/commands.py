@@ -29,6 +29,7 @@ COMMANDS = (
     Command("health", "Show the health of every node.", "asking"),
     Command("doctor", "Check connection, streams, compiled kernels, processor and installed extras.", "doctor"),
     Command("metrics", "Show the metrics of every node for Prometheus, on one address.", "metering", "metrics"),
+    Command("page", "Show streams, nodes and models live in a browser.", "paging", "page"),
     Command("models", "List the models of every node.", "asking"),
     Command("push", "Send a bundle to a running node.", "changing"),
     Command("activate", "Change the model of a running node.", "changing"),

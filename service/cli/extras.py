@@ -13,6 +13,7 @@ EXTRAS: Final[dict[str, tuple[str, ...]]] = {
     "bench": ("dv_processing", "faery", "loguru", "snntorch", "tonic"),
     "carla": ("carla",),
     "metrics": ("prometheus_client",),
+    "page": ("PIL", "starlette", "uvicorn"),
     "ros2": ("xxhash",),
 }
 """Modules that an extra installs itself; some extras also include others, see `_DEPENDS` and pyproject.toml."""
