@@ -165,7 +165,7 @@ class Transport:
         self.session.put(key, payload, encoding=zenoh.Encoding(schema), congestion_control=block)
 
     def subscribe(self, key: str, on_sample: OnSample) -> Callable[[], None]:
-        """Receive every message of a key expression until the session is closed; call the result to end it earlier."""
+        """Receive every message of a key expression until the result is called or the session is closed."""
         return self.subscribe_timed(key, lambda name, payload, received_ns, _: on_sample(name, payload, received_ns))
 
     def subscribe_timed(self, key: str, on_sample: OnTimedSample) -> Callable[[], None]:
@@ -301,7 +301,7 @@ class Transport:
 
 
 def _keep(kept: list[Any], declared: Any) -> Callable[[], None]:
-    """Keep what was declared from the garbage collector; the result undeclares it."""
+    """Keep what was declared until the result undeclares it."""
     kept.append(declared)
 
     def undeclare() -> None:

@@ -12,8 +12,13 @@ EXTRAS: Final[dict[str, tuple[str, ...]]] = {
     "experiments": ("matplotlib", "scipy"),
     "bench": ("dv_processing", "faery", "loguru", "snntorch", "tonic"),
     "carla": ("carla",),
+    "camera": ("dv_processing", "neuromorphic_drivers"),
     "metrics": ("prometheus_client",),
+<<<<<<< HEAD
     "page": ("PIL", "starlette", "uvicorn"),
+=======
+    "foxglove": ("foxglove",),
+>>>>>>> main
     "ros2": ("xxhash",),
 }
 """Modules that an extra installs itself; some extras also include others, see `_DEPENDS` and pyproject.toml."""
@@ -23,6 +28,7 @@ _DEPENDS: Final[dict[str, tuple[str, ...]]] = {
     "experiments": ("serve", "recordings"),
     "bench": ("serve",),
     "carla": ("recordings",),
+    "camera": ("recordings",),
     "ros2": ("recordings",),
 }
 

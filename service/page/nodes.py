@@ -11,6 +11,7 @@ from neurove_service.page.streams import clipped
 SILENT_S: Final = 1.6
 """A node that has not answered for this time is shown as not answering [s]."""
 
+_SLACK_S: Final = 1.5  # a reply may have been on its way for so long
 MAX_HISTORY, MAX_MODELS = 40, 64
 
 
@@ -43,11 +44,12 @@ class NodeView:
     def on_health(self, reply: HealthReply) -> None:
         """Take an answer, and note what changed since the one before."""
         before, self.health = self.health, reply
+        elapsed_s = time.monotonic() - self.answered_at
         self.answered_at = time.monotonic()
         if before is None:
             what = "the page started; this model was active"
             self._note(reply.model, f"{what}; {reply.change}" if reply.change else what)
-        elif reply.uptime_s < before.uptime_s:
+        elif reply.uptime_s < before.uptime_s + elapsed_s - _SLACK_S:  # a new process, however long it has run
             self._note(reply.model, "the service started again")
         elif (reply.epoch, reply.model.digest) != (before.epoch, before.model.digest):
             self._note(reply.model, reply.change or "another model became active")

@@ -22,6 +22,7 @@ MAX_CONNECTIONS: Final = 8 * MAX_VIEWERS
 """Connections at once; a browser opens up to six."""
 
 _FORGET_S: Final = 0.5
+_SEND_BYTES: Final = 32 << 10  # that the kernel keeps for a connection: a viewer that does not read is found in seconds
 
 
 class _Server(uvicorn.Server):
@@ -41,6 +42,7 @@ def bound(host: str, port: int) -> socket.socket:
     listening = socket.socket(family, socket.SOCK_STREAM)
     try:
         listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BYTES)  # connections inherit it
         listening.bind((host, port))
         listening.listen(64)
     except OSError:

@@ -294,7 +294,7 @@ def test_a_killed_service_is_reported_and_recovers(models_dir, tab):
                 with client(endpoint) as transport:
                     wait_until(lambda: is_alive(transport, config))
                 until(tab, lambda: text_of(tab, "#stream-cam0 .verdict") not in ("no service", "stalled"), START_S)
-                assert "started again" in text_of(tab, ".history")
+                until(tab, lambda: "started again" in text_of(tab, ".history"))
                 page_process.child.send_signal(signal.SIGSTOP)
                 try:
                     until(tab, lambda: text_of(tab, "#live") == "connection lost")

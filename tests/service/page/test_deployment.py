@@ -97,7 +97,7 @@ def test_model_changes_are_a_history_with_reasons_newest_first():
     deployment.on_health([health()])
     deployment.on_health([health("two", 1, "activated by an operator")])
     deployment.on_health([health("one", 2, "rolled back: diverged")])
-    deployment.on_health([health("one", 0, uptime_s=1.0)])
+    deployment.on_health([health("one", 0, uptime_s=1.0)])  # 5 s before
     (node,) = deployment.news()["nodes"]
     assert [(one["model"], one["reason"]) for one in node["history"]] == [
         ("one", "the service started again"),
