@@ -14,11 +14,8 @@ EXTRAS: Final[dict[str, tuple[str, ...]]] = {
     "carla": ("carla",),
     "camera": ("dv_processing", "neuromorphic_drivers"),
     "metrics": ("prometheus_client",),
-<<<<<<< HEAD
     "page": ("PIL", "starlette", "uvicorn"),
-=======
     "foxglove": ("foxglove",),
->>>>>>> main
     "ros2": ("xxhash",),
 }
 """Modules that an extra installs itself; some extras also include others, see `_DEPENDS` and pyproject.toml."""

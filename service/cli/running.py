@@ -234,14 +234,10 @@ def demo(args: argparse.Namespace) -> int:
         stop=stop,
         console=shown,
         screenshot=args.screenshot,
-<<<<<<< HEAD
-        truth=None if args.loop else truth_of(opened),  # a repeated source has other times than its truth
-        page=["--open"] * args.open if args.page or args.open else None,
-=======
         truth=None
         if args.loop or opened is None
         else truth_of(opened),  # a repeated source has other times than its truth
->>>>>>> main
+        page=["--open"] * args.open if args.page or args.open else None,
     )
     print(json.dumps(summary) if args.json else _summary_text(summary))
     return EXIT_FAILURE if summary["broken"] else 0
