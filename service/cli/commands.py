@@ -64,6 +64,7 @@ COMMANDS = (
     Command("reproduce", "Repeat the experiments of the paper.", "experiments", "experiments"),
     Command("bench", "Measure the speed of this machine, as ratios within one run.", "bench", "bench"),
     Command("config", "Show the settings of the service.", "running"),
+    Command("install-units", "Write the systemd units of a plain machine, or show what would be written.", "units"),
     Command("completion", "Print a completion script for a shell.", "completion"),
 )
 
