@@ -1,6 +1,7 @@
-"""Pictures of the live page of a demo, by a real Chromium: `python -m tests.long.page_picture [--source S] [--all]`.
+"""Pictures of the live page of a demo, by a real Chromium: `python -m tests.long.page_picture`; --help has the options.
 
-Without --all: one picture, service/pictures/page.png, with at most 250 kB.
+Without --all: one picture, service/pictures/page.png, with at most 250 kB. A machine that cannot simulate in real time
+plays a recording of the simulator instead: `--source drive.mcap --loop`.
 """
 
 import argparse
@@ -34,25 +35,25 @@ def main() -> int:
     """Make the picture, or all of them in a folder."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--source", default="sim://street?seed=7")
-    parser.add_argument("--speed", default="1")
+    parser.add_argument("--loop", action="store_true", help="repeat the source")
     parser.add_argument("--all", type=Path, metavar="FOLDER", help="three widths, dark and light")
     args = parser.parse_args()
     command = [sys.executable, "-m", "neurove_service.cli", "demo", args.source, "--page", "--seconds", "3600"]
-    demo = subprocess.Popen([*command, "--speed", args.speed], stdout=subprocess.PIPE, text=True)
+    demo = subprocess.Popen([*command, *(["--loop"] if args.loop else [])], stdout=subprocess.PIPE, text=True)
     try:
         found = re.search(r"http://\S+/", demo.stdout.readline() if demo.stdout else "")
         if found is None:
             return 1
         with sync_playwright() as playwright:
             browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=list(ARGUMENTS))
-            looks = ALL if args.all else [(1280, 600, "dark")]
+            looks = ALL if args.all else [(1280, 640, "dark")]
             for width, height, scheme in looks:
                 context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
                 page = context.new_page()
                 page.goto(found[0])
                 _settled(page)
                 target = args.all / f"page-{width}-{scheme}.png" if args.all else FILE
-                _write(page.screenshot(full_page=bool(args.all)), target)
+                _write(page.screenshot(full_page=True), target)
                 context.close()
             browser.close()
     finally:
