@@ -19,6 +19,9 @@ from neurove_service.transport import Transport
 MAX_HZ: Final = 10.0
 """Most images of a stream in a second, whatever the number of viewers."""
 
+MAX_TOTAL_HZ: Final = 20.0
+"""Most images of all streams in a second; several streams share them."""
+
 SPAN_US: Final = 25_000
 """Time of the events in an image [us]."""
 
@@ -60,6 +63,20 @@ class Images:
         with self._lock:
             return sorted(self._watched)
 
+    def fresh(self, stream: str) -> bytes | None:
+        """The newest image, if it is too early for another one."""
+        now = time.monotonic()
+        with self._lock:
+            one = self._watched.get(stream)
+            if one is None or now - one.made_at >= self._period_s:
+                return None
+            one.asked_at = now
+            return one.png
+
+    @property
+    def _period_s(self) -> float:
+        return max(1 / MAX_HZ, len(self._watched) / MAX_TOTAL_HZ)
+
     def png(self, stream: str, transport: Transport) -> bytes | None:
         """The newest image; None before the first packet, or if too many streams are looked at. Runs on any thread."""
         now = time.monotonic()
@@ -71,7 +88,7 @@ class Images:
                 one = self._watched[stream] = self._watch(stream, transport, now)
             one.asked_at = now
         with one.lock:
-            if one.packets and now - one.made_at >= 1 / MAX_HZ:
+            if one.packets and now - one.made_at >= self._period_s:
                 one.made_at = now
                 one.png = _drawn(list(one.packets)) or one.png
             return one.png

@@ -5,6 +5,7 @@ import importlib.metadata
 import importlib.resources
 import json
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import PurePosixPath
 from typing import Any, Final
 
@@ -116,6 +117,7 @@ class Site:
         self._viewers, self._access = viewers, access
         self._files = static_files()
         self._changing = asyncio.Lock()
+        self._drawing = ThreadPoolExecutor(1, "page images")  # more threads cost memory and are not faster
         self._version = importlib.metadata.version("neurove")
 
     def app(self) -> ASGIApp:
@@ -142,7 +144,10 @@ class Site:
         stream, transport = request.path_params["stream"], self._feed.transport
         if transport is None or not is_name(stream) or not self._deployment.has_stream(stream):
             return PlainTextResponse("no such stream", 404)
-        png = await run_in_threadpool(self._images.png, stream, transport)
+        png = self._images.fresh(stream)
+        if png is None:
+            loop = asyncio.get_running_loop()
+            png = await loop.run_in_executor(self._drawing, self._images.png, stream, transport)
         return Response(status_code=204) if png is None else Response(png, media_type="image/png")
 
     async def _session(self, request: Request) -> Response:

@@ -2,6 +2,8 @@
 import { element } from "./format.js";
 
 const PERIOD_MS = 100;
+const SHARE_MS = 50; // several pictures on screen share 20 images per second
+const looking = new Set();
 const RETRY_MS = 700;
 
 export class Picture {
@@ -20,6 +22,8 @@ export class Picture {
     this.busy = false;
     this.observer = new IntersectionObserver(([entry]) => {
       this.seen = entry.isIntersecting;
+      if (this.seen) looking.add(this);
+      else looking.delete(this);
       this.next(0);
     });
     this.observer.observe(this.root);
@@ -42,7 +46,7 @@ export class Picture {
     };
     image.onload = () => {
       this.draw(image);
-      done(Math.max(0, PERIOD_MS - (performance.now() - started)));
+      done(Math.max(PERIOD_MS, SHARE_MS * looking.size) - (performance.now() - started));
     };
     image.onerror = () => done(RETRY_MS);
     this.number += 1;
@@ -61,6 +65,7 @@ export class Picture {
 
   close() {
     this.closed = true;
+    looking.delete(this);
     this.observer.disconnect();
     document.removeEventListener("visibilitychange", this.onVisible);
   }
