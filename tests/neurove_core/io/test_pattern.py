@@ -74,3 +74,8 @@ def test_the_pattern_supports_another_sensor():
 def test_a_seed_that_is_not_a_whole_number_is_refused(seed):
     with pytest.raises(InvalidField, match="seed="):
         open_source(f"pattern://?seed={seed}")
+
+
+def test_a_shift_that_rounds_to_a_whole_period_is_no_shift(monkeypatch):
+    monkeypatch.setattr("neurove_core.io.formats.pattern.shift_px", lambda _: (3.3e-16, 3.3e-16))  # in x, after 203 s
+    assert next(iter(open_source("pattern://").chunks())).n >= 0
