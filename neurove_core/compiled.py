@@ -5,7 +5,8 @@ import functools
 import logging
 import pickle
 from collections.abc import Callable
-from typing import Any, ParamSpec, TypeVar, cast
+from pathlib import Path
+from typing import Any, NamedTuple, ParamSpec, TypeVar, cast
 
 import numba
 
@@ -36,7 +37,32 @@ def compile_with(function: Callable[P, R], **how: Any) -> Callable[P, R]:
         dispatcher = numba.njit(nogil=True, **how)(function)
     else:
         _tolerate_io_errors(dispatcher)
+    _dispatchers.append(dispatcher)
     return cast("Callable[P, R]", dispatcher)
+
+
+class Work(NamedTuple):
+    """What this process has compiled so far, of all functions that `compile_with` made."""
+
+    compiled: int  # versions of functions, one for each set of argument types, that were compiled
+    loaded: int  # versions that were read from the cache
+    folders: tuple[Path, ...]  # where the cache lies; empty where there is none
+
+
+def work() -> Work:
+    """Count the compiled versions of all functions that were called or imported in this process."""
+    compiled = loaded = 0
+    folders = set()
+    for dispatcher in _dispatchers:
+        stats = dispatcher.stats
+        hits, misses = (sum(counts.values()) for counts in (stats.cache_hits, stats.cache_misses))
+        compiled, loaded = compiled + misses, loaded + hits
+        if stats.cache_path:
+            folders.add(Path(stats.cache_path))
+    return Work(compiled, loaded, tuple(sorted(folders)))
+
+
+_dispatchers: list[Any] = []
 
 
 def _tolerate_io_errors(dispatcher: Any) -> None:

@@ -21,13 +21,20 @@ class Command(NamedTuple):
 COMMANDS = (
     Command("demo", "Run driver, service and consumer on any source, then print a summary.", "running", "serve"),
     Command("serve", "Run the service until SIGINT or SIGTERM.", "running", "serve"),
-    Command("drive", "Publish a recording or a synthetic source as event packets.", "running", "recordings"),
+    Command("drive", "Publish a recording, a synthetic source or a camera as event packets.", "running", "recordings"),
+    Command("cameras", "List the event cameras at this machine, and say what is missing.", "cameras"),
     Command(
         "ros2", "Bridge the event cameras of a ROS 2 robot to the service, and its estimates back.", "ros2", "ros2"
     ),
     Command("watch", "Show live estimates of all streams.", "asking"),
     Command("health", "Show the health of every node.", "asking"),
-    Command("doctor", "Check connection, streams, compiled kernels, processor and installed extras.", "doctor"),
+    Command("doctor", "Check connection, streams, compiled kernels, processor, cameras and extras.", "doctor"),
+    Command(
+        "warm-up",
+        "Compile ahead what serve, demo, drive and simulate run, and say where it is kept.",
+        "warming",
+        "serve",
+    ),
     Command("metrics", "Show the metrics of every node for Prometheus, on one address.", "metering", "metrics"),
     Command("models", "List the models of every node.", "asking"),
     Command("push", "Send a bundle to a running node.", "changing"),
@@ -37,7 +44,10 @@ COMMANDS = (
     Command("record", "Record the packets that drivers publish, until Ctrl-C.", "recordings", "recordings"),
     Command("info", "Show what a recording holds: sensor, counts, rates, IMU and truth.", "recordings", "recordings"),
     Command(
-        "convert", "Convert a recording to a packet log (.mcap) or to DSEC's layout (.h5).", "recordings", "recordings"
+        "convert",
+        "Convert a recording to a packet log or a ROS 2 bag (.mcap), or to DSEC's layout (.h5).",
+        "recordings",
+        "recordings",
     ),
     Command("simulate", "Record a simulated event camera with its exact motion.", "recordings", "recordings"),
     Command(
@@ -53,6 +63,7 @@ COMMANDS = (
     Command("reproduce", "Repeat the experiments of the paper.", "experiments", "experiments"),
     Command("bench", "Measure the speed of this machine, as ratios within one run.", "bench", "bench"),
     Command("config", "Show the settings of the service.", "running"),
+    Command("install-units", "Write the systemd units of a plain machine, or show what would be written.", "units"),
     Command("completion", "Print a completion script for a shell.", "completion"),
 )
 
@@ -77,5 +88,5 @@ def build_parser(chosen: Container[str]) -> Parser:
     for name, about, module, _ in COMMANDS:
         one = commands.add_parser(name, help=about, description=about)
         if name in chosen:
-            getattr(importlib.import_module(f"neurove_service.cli.{module}"), f"add_{name}")(one)
+            getattr(importlib.import_module(f"neurove_service.cli.{module}"), f"add_{name.replace('-', '_')}")(one)
     return parser

@@ -9,7 +9,7 @@ import time
 import urllib.parse
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from neurove_protocol.errors import EXIT_FAILURE, InvalidField, NeuroVEError
 from neurove_protocol.keys import check_name
@@ -28,6 +28,9 @@ from neurove_service.cli.arguments import (
 from neurove_service.cli.bars import event_count
 from neurove_service.cli.waiting import Wait, add_wait
 from neurove_service.lifecycle import stop_on_signals
+
+if TYPE_CHECKING:
+    from neurove_core.io.formats.ros.types import TwistMessage
 
 Progress = Callable[[int], None]
 """Receives the number of events so far."""
@@ -111,25 +114,59 @@ def _write_dsec(recording: Any, path: Path, progress: Progress) -> tuple[str, ..
     return write_dsec(recording, path, progress).left_out
 
 
-WRITERS: Final[dict[str, Callable[[Any, Path, Progress], tuple[str, ...]]]] = {".mcap": _write_mcap, ".h5": _write_dsec}
-"""The writer for each suffix: (recording, path, progress) to the streams that the format cannot hold."""
+Writer = Callable[[Any, Path, Progress], tuple[str, ...]]
+"""Writes (recording, path, progress), and returns the streams that the format cannot hold."""
+
+WRITERS: Final[dict[str, Writer]] = {".mcap": _write_mcap, ".h5": _write_dsec}
+"""The writer for each suffix."""
+
+_STREAM: Final = "cam0"  # in a bag
 
 _ENDLESS_S: Final = 5.0  # that `info` reads of a source without end
 
 
 def convert(args: argparse.Namespace) -> int:
-    """Convert a recording to a packet log (.mcap) or to DSEC's layout (.h5)."""
+    """Convert a recording to a packet log or a ROS 2 bag (.mcap), or to DSEC's layout (.h5)."""
     from neurove_core.sources import open_source
 
     path: Path = args.out
     if path.suffix not in WRITERS:
         raise InvalidField("convert", "OUT", str(path), f"its name must end in {' or '.join(WRITERS)}")
+    if args.estimates is not None and args.layout != "ros2":
+        raise InvalidField("convert", "--estimates", str(args.estimates), "it needs --for ros2")
     recording = open_source(args.source, args.sensor, args.topic, args.time_unit)
     refuse_existing("convert", "OUT", path, args.source, force=args.force)
-    return _write(recording, path, as_json=args.json)
+    return _write(recording, path, as_json=args.json, write=_bag_writer(args) if args.layout == "ros2" else None)
 
 
-def _write(recording: Any, path: Path, *, as_json: bool) -> int:
+def _bag_writer(args: argparse.Namespace) -> Writer:
+    """The writer of a ROS 2 bag, with the estimates of a file if the user gives one."""
+    from neurove_core.io.formats.ros.bag_writer import write_bag
+
+    if args.out.suffix != ".mcap":
+        raise InvalidField("convert", "OUT", str(args.out), "its name must end in .mcap, for --for ros2")
+
+    def write(recording: Any, path: Path, progress: Progress) -> tuple[str, ...]:
+        velocities = () if args.estimates is None else _velocities(args.estimates)
+        return write_bag(recording, path, velocities=velocities, progress=progress)
+
+    return write
+
+
+def _velocities(path: Path) -> "Iterator[TwistMessage]":
+    """The estimates of a file of `neurove estimate`, as messages of ROS."""
+    from neurove_core.io.formats.estimate_files import read_estimates
+    from neurove_core.io.formats.ros.bag_writer import optical_frame
+    from neurove_service.ros2.velocity import Velocity
+
+    velocity = Velocity(_STREAM)
+    for estimate in read_estimates(path):
+        message = velocity.message(estimate, estimate.end_us * 1000, optical_frame(_STREAM))
+        if message is not None:
+            yield message
+
+
+def _write(recording: Any, path: Path, *, as_json: bool, write: "Writer | None" = None) -> int:
     counted = {"events": 0}
     with event_count(recording.name) as show:
 
@@ -137,10 +174,12 @@ def _write(recording: Any, path: Path, *, as_json: bool) -> int:
             counted["events"] = events
             show(events)
 
-        left_out = WRITERS[path.suffix](recording, path, progress)
+        left_out = (write or WRITERS[path.suffix])(recording, path, progress)
     if left_out:
+        holds_not = "a ROS 2 bag cannot hold them" if write else f"{path.suffix} cannot hold them, .mcap can"
         print(
-            f"neurove: {path} lacks {', '.join(left_out)}: {path.suffix} cannot hold them, .mcap can", file=sys.stderr
+            f"neurove: {path} lacks {', '.join(left_out)}: {holds_not}",
+            file=sys.stderr,
         )
     tell_faults(recording)
     size = path.stat().st_size
@@ -232,6 +271,10 @@ def add_convert(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "out", type=Path, metavar="OUT", help="file to write, ending in .mcap (packet log) or .h5 (DSEC)"
     )
+    about = "ros2: a bag for ROS 2, PlotJuggler and Foxglove (.mcap), with events, camera_info, imu, truth and velocity"
+    parser.add_argument("--for", dest="layout", choices=("ros2",), help=about)
+    about = "with --for ros2: file of `neurove estimate` (.mcap), whose estimates become the velocity"
+    parser.add_argument("--estimates", type=Path, metavar="FILE", help=about)
     add_recording_flags(parser)
     add_force(parser, "OUT")
 

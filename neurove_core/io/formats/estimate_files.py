@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 
 from neurove_core.files import atomic_path
 from neurove_core.geometry import rotations
+from neurove_core.io.formats.containers.mcap import McapFile
+from neurove_core.io.formats.packet_log.layout import PROFILE
 from neurove_core.io.formats.packet_log.writer import PacketWriter
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.velocity import AXES, TwistEstimate
@@ -122,6 +124,23 @@ def _mcap(path: Path) -> Iterator[Add]:
             writer.add(estimate.stream, "velocity", estimate.encode(), estimate.end_us * 1000)
 
         yield add
+
+
+def read_estimates(path: Path) -> Iterator[TwistEstimate]:
+    """The estimates of an .mcap file that this module wrote, in recorded order.
+
+    Raises:
+        UnknownSource: it is no MCAP file. InvalidField: it has no estimates. NeuroVEError: one of them is not valid.
+    """
+    try:
+        file = McapFile.open(path)
+    except OSError as error:
+        raise InvalidField("estimates", "FILE", str(path), error.strerror or str(error)) from None
+    topics = [channel.topic for channel in file.channels.values() if channel.topic.endswith("/velocity")]
+    if not topics or file.profile != PROFILE:
+        raise InvalidField("estimates", "FILE", str(path), "a file of `neurove estimate` ending in .mcap is expected")
+    for record in file.records(topics):
+        yield TwistEstimate.decode(record.data)
 
 
 WRITERS: Final[dict[str, Callable[[Path], AbstractContextManager[Add]]]] = {".csv": _csv, ".tum": _tum, ".mcap": _mcap}

@@ -1,16 +1,13 @@
 """Writer of NeuroVE recordings: packets as published, or any recording split into packets."""
 
-import contextlib
-import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any
 
 import numpy as np
 
-from neurove_core.extras import MissingExtra
 from neurove_core.io.checked import truth
+from neurove_core.io.formats.containers.mcap_writer import ChannelKind, McapWriter
 from neurove_core.io.formats.packet_log import layout
 from neurove_core.io.packets import slices
 from neurove_core.io.recording import Recording
@@ -20,59 +17,19 @@ from neurove_protocol.events import EventPacket, encode_packet
 from neurove_protocol.imu import MAX_SAMPLES, Imu, ImuPacket, encode_imu
 from neurove_protocol.keys import check_name
 
-CHUNK_BYTES: Final = 1 << 20
-"""Size of one compressed chunk [bytes]; at most this much is lost if the machine fails."""
-
-PART: Final = ".part"
-"""Suffix of the file name until the file is complete."""
-
 Progress = Callable[[int, int], None]
 """Called with the number of events written so far and the sensor time reached [us]."""
 
 
-class PacketWriter:
-    """Writes one recording atomically: the file gets its name when it is closed, complete.
-
-    Use it in a `with` block: an error in the block removes the partial file. Memory holds one chunk, and about 100
-    bytes of index for each chunk written.
+class PacketWriter(McapWriter):
+    """Writes one recording atomically; see `McapWriter` for its life, memory and errors.
 
     Args:
         path: the file, with suffix .mcap; an existing file of this name is replaced.
-
-    Raises:
-        InvalidField: the file cannot be written; also raised while writing. MissingExtra: mcap is not installed.
     """
 
     def __init__(self, path: Path) -> None:
-        try:
-            from mcap.writer import CompressionType, Writer
-        except ModuleNotFoundError:
-            raise MissingExtra("mcap", "recordings") from None
-        if path.suffix != ".mcap":
-            raise InvalidField("recording", "FILE", str(path), "its name must end in .mcap")
-        self.path, self._part = path, path.with_name(path.name + PART)
-        with self._os_errors_as_invalid():
-            try:
-                self._file = self._part.open("xb")
-            except FileExistsError:
-                why = "an incomplete recording, or one that is being written, has this name: rename or remove it"
-                raise InvalidField("recording", "FILE", str(self._part), why) from None
-        self._writer: Any = Writer(self._file, CHUNK_BYTES, CompressionType.ZSTD)
-        self._writer.start(layout.PROFILE, "neurove")
-        self._channels: dict[str, int] = {}
-        self._schemas: dict[str, int] = {}
-        self._count: dict[int, int] = {}
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is None:
-            self.close()
-        else:
-            self.abandon()
+        super().__init__(path, layout.PROFILE)
 
     def write(self, stream: str, payload: bytes, received_ns: int) -> None:
         """Add an event packet, as published.
@@ -105,57 +62,12 @@ class PacketWriter:
             payload: bytes of the message; they are not checked.
             log_ns: log time [ns]; a negative time is stored as 0.
         """
-        with self._os_errors_as_invalid():
-            topic = f"{check_name('stream', stream)}/{kind}"
-            if topic not in self._channels:
-                self._channels[topic] = self._registered(topic, kind)
-            channel = self._channels[topic]
-            number = self._count[channel] = self._count.get(channel, 0) + 1
-            log_ns = max(0, log_ns)
-            self._writer.add_message(channel, log_ns, payload, log_ns, number & 0xFFFFFFFF)
-
-    def _registered(self, topic: str, kind: str) -> int:
-        name, encoding = layout.schema_of(kind)
-        if name not in self._schemas:
-            self._schemas[name] = self._writer.register_schema(name, "", b"")
-        return int(self._writer.register_channel(topic, encoding, self._schemas[name]))
+        topic = f"{check_name('stream', stream)}/{kind}"
+        self.message(topic, ChannelKind(*layout.schema_of(kind)), payload, log_ns)
 
     def about(self, **entries: object) -> None:
         """Add a metadata record that describes the recording; values are stored as text."""
-        with self._os_errors_as_invalid():
-            self._writer.add_metadata(layout.PROFILE, {name: str(value) for name, value in entries.items()})
-
-    @property
-    def bytes_written(self) -> int:
-        """Current size of the file [bytes]."""
-        return self._file.tell()
-
-    def close(self) -> None:
-        """Complete the file and rename it to its final name."""
-        try:
-            with self._os_errors_as_invalid():
-                self._writer.finish()
-                self._file.flush()
-                os.fsync(self._file.fileno())
-                self._file.close()
-                self._part.replace(self.path)
-        except BaseException:
-            self.abandon()
-            raise
-
-    def abandon(self) -> None:
-        """Close and remove the incomplete file."""
-        with contextlib.suppress(OSError):
-            self._file.close()
-        self._part.unlink(missing_ok=True)
-
-    @contextlib.contextmanager
-    def _os_errors_as_invalid(self) -> Iterator[None]:
-        """Raise InvalidField instead of OSError in the block."""
-        try:
-            yield
-        except OSError as error:
-            raise InvalidField("recording", "FILE", str(self.path), error.strerror or str(error)) from None
+        self.metadata(layout.PROFILE, entries)
 
 
 def write_mcap(recording: Recording, path: Path, stream: str = "cam0", progress: Progress | None = None) -> int:

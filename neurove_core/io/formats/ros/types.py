@@ -239,13 +239,18 @@ _KINDS: Final = {table[0]: kind for kind, table in _TABLE.items()}
 Message = EventsMessage | TwistMessage | ImuMessage | CameraMessage | DiagnosticsMessage | PoseMessage
 
 
+def type_of(message: Message) -> str:
+    """The type of a message, such as sensor_msgs/msg/Imu."""
+    return _KINDS[type(message)]
+
+
 def encode(message: Message) -> bytes:
     """The CDR of a message.
 
     Raises:
         InvalidField: a field is out of its bound.
     """
-    return cdr.encode(_TABLE, _KINDS[type(message)], message)
+    return cdr.encode(_TABLE, type_of(message), message)
 
 
 def decode(kind: str, data: bytes) -> Any:
