@@ -49,7 +49,7 @@ def test_the_default_model_estimates_what_it_did(source: str) -> None:
     found, before = estimates(source), BEFORE[source]
     assert [one.start_us for one in found] == before["start_us"]
     assert [one.events for one in found] == before["events"]
-    assert flags(found) == before["flags"]
+    assert flags(found) == [row[:4] for row in before["flags"]]
     scale = models.find("default").scale.double().numpy()
     # a spike that depends on the last bit of a sum may differ on another CPU: the tolerance of a golden test
     off = np.abs(np.stack([one.twists for one in found]) - np.array(before["twists"])) / scale
