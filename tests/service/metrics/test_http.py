@@ -12,7 +12,7 @@ import pytest
 from neurove_service.guard import Guard
 from neurove_service.metrics.http import MAX_CONNECTIONS, MAX_REQUEST_BYTES, AddressError, HttpServer, Response
 
-LARGE = b"x" * (64 << 20)
+LARGE = b"x" * (16 << 20)
 
 
 def respond(path):
@@ -28,7 +28,7 @@ def guard():
 
 @pytest.fixture
 def server(guard):
-    server = HttpServer("127.0.0.1", 0, respond, guard)
+    server = HttpServer("127.0.0.1", 0, respond, guard, deadline_s=120)
     yield server
     server.close()
 
