@@ -370,8 +370,9 @@ def _over_ground(
         return estimate, state  # nothing says that the camera looks at level ground
     events = ground.events_of(state.view, window.sample, window.start_us)
     sigma = np.sqrt(np.diagonal(estimate.covariance)[3:]) if sigma_rad_s is None else sigma_rad_s
-    known = estimate.twists.mean(axis=0), sigma
-    answer = ground.refine(events, estimate.start_us, estimate.end_us, state.camera, *known, state.ground)
+    known = estimate.twists.mean(axis=0), sigma, state.ground
+    measured = estimate.covariance[3:, 3:] if estimate.source == "refined" else None
+    answer = ground.refine(events, estimate.start_us, estimate.end_us, state.camera, *known, measured)
     state = state._replace(ground=answer.state)
     if answer.outcome not in ("accepted", "turning") or answer.motion is None:
         return estimate, state

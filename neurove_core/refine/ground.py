@@ -77,6 +77,9 @@ with 1000 events and .5 to .66 with EVENTS, that of a street at 0.3 m/s from 1 m
 MAX_SIGMAS: Final = 5.0
 """Greatest distance from what was known before."""
 
+MAX_RATE_SIGMAS: Final = 1.0
+"""Greatest distance from an angular velocity that the events of the window gave without the ground."""
+
 _FAR_ASIDE: Final = 0.4  # greatest |x/z| of far events
 _FAR_UP: Final = 0.4  # the same for -y/z
 _FAR_WEIGHT: Final = 0.5  # of a far event; that of one on the ground is its height / depth
@@ -169,6 +172,7 @@ def refine(
     twist: Array,
     sigma_rad_s: Array,
     state: GroundState,
+    measured: Array | None = None,
 ) -> Answer:
     """The motion over the ground in the last SPAN_US before the end of a window.
 
@@ -180,6 +184,7 @@ def refine(
         twist: (6,) the estimate so far [m/s, rad/s], mean of the window.
         sigma_rad_s: (3,) sigma of its angular part.
         state: of the stream; `GroundState()` at first.
+        measured: (3, 3) covariance of the angular part of `twist`, if the refinement by rotation gave it.
 
     Returns:
         an answer is accepted unless
@@ -188,7 +193,8 @@ def refine(
         - there are fewer than LEAST_EVENTS on the ground and fewer far ones ("few events");
         - the ground has few events, as one of one colour: only the angular velocity is known ("turning");
         - its events do not belong together ("noise"), as those of a stationary camera;
-        - it is more than MAX_SIGMAS from what was known before ("contradicted").
+        - it is more than MAX_SIGMAS from what was known before, or its angular velocity more than MAX_RATE_SIGMAS from
+          the measured one ("contradicted"), as that of a camera whose height changes.
     """
     recent = state.recent if state.end_us in (None, start_us) else ()
     window_us = end_us - start_us
@@ -214,7 +220,7 @@ def refine(
     found, unknowns, pitch_sigma = _searched(seen, (begin_us + end_us) // 2, camera, twist, sigma_rad_s, state)
     if found.structure < MIN_STRUCTURE[0] + MIN_STRUCTURE[1] * (found.events / EVENTS) ** 2:
         return Answer("noise", found, state._replace(last=None))
-    if found.distance > MAX_SIGMAS:
+    if found.distance > MAX_SIGMAS or _distance(found, twist, measured) > MAX_RATE_SIGMAS:
         return Answer("contradicted", found, state._replace(last=None))
     if near < max(LEAST_EVENTS, LEAST_SHARE * far):
         twist, sway = swayed(found.twist, state.pitch, state.sway)
@@ -226,6 +232,14 @@ def refine(
         last=unknowns[:6], pitch=pitch, pitch_sigma=pitch_sigma, walls=(float(walls[0]), float(walls[1])), sway=sway
     )
     return Answer("accepted", found._replace(twist=twist), state)
+
+
+def _distance(found: GroundMotion, twist: Array, measured: Array | None) -> float:
+    """Distance of the angular velocity from the measured one [sigma]; 0 without one."""
+    if measured is None:
+        return 0.0
+    apart = found.twist[3:] - twist[3:]
+    return math.sqrt(apart @ np.linalg.solve(found.covariance[3:, 3:] + measured, apart))
 
 
 def _windows(span_us: int, window_us: int) -> int:

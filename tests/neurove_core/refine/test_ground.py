@@ -172,6 +172,19 @@ def test_an_answer_is_accepted_exactly_where_it_is_not_too_far_from_what_is_know
         assert (found.outcome == "accepted", found.motion.distance < MAX_SIGMAS) == (accepted, accepted)
 
 
+def test_an_angular_velocity_that_other_events_contradict_is_not_accepted() -> None:
+    truth, measured, outcomes = ahead(2.0), np.eye(3) * 0.02**2, []
+    for pitching in (0.0, 0.12):
+        known, state = truth + np.array([0, 0, 0, pitching, 0, 0]), GroundState()
+        for number in range(5):
+            start_us = number * WINDOW_US
+            events = seen(truth, start_us)
+            found = refine(events, start_us, start_us + WINDOW_US, camera(), known, SIGMA_RAD_S, state, measured)
+            state = found.state
+        outcomes.append(found.outcome)
+    assert outcomes == ["accepted", "contradicted"]
+
+
 def test_a_gap_discards_older_events_and_the_same_windows_give_the_same_answer() -> None:
     truth = ahead(1.0)
     first = refine(seen(truth, 0), 0, WINDOW_US, camera(), truth, SIGMA_RAD_S, GroundState())
