@@ -31,8 +31,9 @@ settings.register_profile("ci", max_examples=50, deadline=None, derandomize=True
 settings.load_profile("ci" if os.environ.get("CI") else "dev")
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def logging_as_before():
+    """Whatever a command in this process configures, the next test begins with the logging of pytest."""
     root = logging.getLogger()
     handlers, level = root.handlers[:], root.level
     yield
