@@ -71,7 +71,7 @@ def same_origin(origin: str | None, host: str) -> bool:
 
 
 def _same(given: str, token: str) -> bool:
-    return hmac.compare_digest(given.encode(), token.encode())
+    return hmac.compare_digest(given.encode(errors="replace"), token.encode())
 
 
 def _without_port(host: str) -> str:

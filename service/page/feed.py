@@ -10,6 +10,7 @@ from neurove_protocol.errors import NeuroVEError
 from neurove_service import logs
 from neurove_service.clients import ask
 from neurove_service.config import ClientConfig
+from neurove_service.guard import Guard
 from neurove_service.page.deployment import Deployment
 from neurove_service.transport import Transport
 
@@ -27,13 +28,14 @@ class Feed:
         config: endpoints and prefix.
         deployment: receives everything.
         stop: ends the feed.
+        guard: counts internal errors.
 
     Raises:
         EndpointError: an endpoint or the configuration is wrong.
     """
 
-    def __init__(self, config: ClientConfig, deployment: Deployment, stop: threading.Event) -> None:
-        self._config, self._deployment, self._stop = config, deployment, stop
+    def __init__(self, config: ClientConfig, deployment: Deployment, stop: threading.Event, guard: Guard) -> None:
+        self._config, self._deployment, self._stop, self._guard = config, deployment, stop, guard
         self.transport: Transport | None = None
         with contextlib.suppress(ask.NoService):
             self._take(ask.connect(config, patience_s=0))
@@ -106,10 +108,11 @@ class Feed:
 
     def _poll(self, query: Callable[[Transport], None]) -> bool:
         """Run a query; whether it was answered. A deployment that does not answer is shown as such."""
-        try:
-            if self.transport is not None:
-                query(self.transport)
-                return True
-        except NeuroVEError as error:
-            log.debug("query refused", why=error.message)
+        with self._guard.at("page query"):
+            try:
+                if self.transport is not None:
+                    query(self.transport)
+                    return True
+            except NeuroVEError as error:
+                log.debug("query refused", why=error.message)
         return False

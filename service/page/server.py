@@ -11,6 +11,7 @@ import uvicorn
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from neurove_service.config import ClientConfig
+from neurove_service.guard import Guard
 from neurove_service.page.access import Access
 from neurove_service.page.deployment import Deployment
 from neurove_service.page.feed import Feed
@@ -63,10 +64,10 @@ def serve(config: ClientConfig, listening: socket.socket, access: Access, stop: 
     Raises:
         EndpointError: an endpoint or the configuration is wrong.
     """
-    deployment = Deployment()
-    feed = Feed(config, deployment, stop)
+    deployment, guard = Deployment(), Guard()
+    feed = Feed(config, deployment, stop, guard)
     try:
-        asyncio.run(_serve(deployment, feed, Images(config.keys.events), listening, access, stop))
+        asyncio.run(_serve(deployment, feed, Images(config.keys.events), listening, access, stop, guard))
     finally:
         stop.set()
         feed.close()
@@ -79,9 +80,10 @@ async def _serve(
     listening: socket.socket,
     access: Access,
     stop: threading.Event,
+    guard: Guard,
 ) -> None:
     connections: dict[Any, asyncio.Transport] = {}
-    viewers = Viewers(deployment, stop, _aborting(connections))
+    viewers = Viewers(deployment, stop, _aborting(connections), guard)
     settings = uvicorn.Config(
         Site(deployment, feed, images, viewers, access).app(),
         http=_protocol(connections),
@@ -96,17 +98,18 @@ async def _serve(
     )
     server = _Server(settings)
     answering = asyncio.create_task(server.serve(sockets=[listening]))
-    forgetting = asyncio.create_task(_forget(images))
+    forgetting = asyncio.create_task(_forget(images, guard))
     await viewers.run()
     server.should_exit = True
     forgetting.cancel()
     await answering
 
 
-async def _forget(images: Images) -> None:
+async def _forget(images: Images, guard: Guard) -> None:
     while True:
         await asyncio.sleep(_FORGET_S)
-        await asyncio.to_thread(images.forget)
+        with guard.at("page images"):
+            await asyncio.to_thread(images.forget)
 
 
 def _aborting(connections: dict[Any, asyncio.Transport]) -> Callable[[Any], None]:

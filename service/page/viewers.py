@@ -9,6 +9,7 @@ from typing import Any, Final
 from starlette.types import Receive, Scope, Send
 
 from neurove_service import logs
+from neurove_service.guard import Guard
 from neurove_service.page.deployment import Deployment
 
 log = logs.get(__name__)
@@ -37,10 +38,11 @@ class Viewers:
         about: constant facts for the first message of a viewer, from its role.
         stop: ends the loop and the answers.
         abort: closes a connection.
+        guard: counts internal errors.
     """
 
-    def __init__(self, deployment: Deployment, stop: threading.Event, abort: Abort) -> None:
-        self._deployment, self._stop, self._abort = deployment, stop, abort
+    def __init__(self, deployment: Deployment, stop: threading.Event, abort: Abort, guard: Guard) -> None:
+        self._deployment, self._stop, self._abort, self._guard = deployment, stop, abort, guard
         self._viewers: set[_Viewer] = set()
 
     @property
@@ -53,7 +55,8 @@ class Viewers:
         while not self._stop.is_set():
             await asyncio.sleep(TICK_S)
             if self._viewers:
-                self._send(message("news", self._deployment.news()))
+                with self._guard.at("page news"):
+                    self._send(message("news", self._deployment.news()))
         for viewer in list(self._viewers):
             self._drop(viewer)
 

@@ -20,7 +20,7 @@ from neurove_protocol.control import STATUS_SCHEMA
 from neurove_protocol.velocity import SCHEMA
 from neurove_service.clients import ask
 from neurove_service.config import ClientConfig
-from tests.live.conftest import START_S, Process, client, free_endpoint, is_alive, running, service, wait_until
+from tests.live.conftest import START_S, Heard, Process, client, free_endpoint, is_alive, running, service, wait_until
 from tests.service.page.test_deployment import estimate, status
 
 pytestmark = pytest.mark.live
@@ -305,6 +305,17 @@ def test_a_killed_service_is_reported_and_recovers(models_dir, tab):
                 until(tab, lambda: not text_of(tab, "#banner"))
     finally:
         first.end(signal.SIGKILL)
+
+
+@pytest.mark.parametrize("number", [signal.SIGSTOP, signal.SIGKILL])
+def test_estimates_go_on_while_a_page_is_stopped_or_killed(node, number):
+    _, transport, config = node
+    heard = Heard(transport, config)
+    with opened(config.connect[0]) as (page, process), urllib.request.urlopen(page.url + "feed", timeout=60):
+        process.child.send_signal(number)
+        before = heard.of("cam0")[-1:]
+        wait_until(lambda: len(heard.of("cam0")) > len(before) + 60)  # three seconds
+        process.child.kill()
 
 
 def test_the_demo_opens_a_page_and_ends_it():

@@ -63,3 +63,8 @@ def test_another_origin_is_refused(origin):
 def test_the_own_origin_is_accepted():
     assert same_origin("http://localhost:7480", "localhost:7480")
     assert same_origin("https://rover.lan", "rover.lan")  # behind a proxy with TLS
+
+
+def test_a_token_that_is_no_text_is_wrong_as_any_other():
+    made, _ = access(operator=True)
+    assert made.redeem("\ud800") is None
