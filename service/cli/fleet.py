@@ -104,8 +104,8 @@ def _print(rows: list[dict[str, Any]]) -> None:
     from neurove_service.cli.console import console
     from neurove_service.cli.views import fleet_table
 
-    wide = {} if sys.stdout.isatty() else {"width": _PIPED_WIDTH}
-    console(**wide).print(fleet_table(rows, datetime.now(UTC)))
+    width = None if sys.stdout.isatty() else _PIPED_WIDTH
+    console(width=width).print(fleet_table(rows, datetime.now(UTC)))
     silent = [row for row in rows if not row["answered"]]
     bad = sum(row["ok"] is False for row in rows)
     counts = f"{len(rows)} nodes: {len(rows) - len(silent) - bad} ok, {bad} not ok, {len(silent)} do not answer"
