@@ -226,20 +226,16 @@ class Estimator:
         about = window.start_us, self.config.window.duration_us, window.sample, state.view, estimate.twists.mean(axis=0)
         found = refine(Given(*about, estimate.covariance, estimate.low_activity, state.filter, height_m))
         if found.outcome == "accepted":
-            twists, covariance = _with_rate(estimate.twists, estimate.covariance, found.rate, found.change_rad_s)
-            estimate = estimate._replace(twists=twists, covariance=covariance, source="refined")
-        state = state._replace(filter=found.filter)
-        answer, state = _over_ground(window, estimate, state, found.sigma_rad_s)
-        joint = answer.covariance
-        if joint is not None and answer is estimate:
-            joint = _with_errors(answer.twists, joint, found, height_m)
-        uncertain = joint is not None and self.is_uncertain(answer.twists, joint)
-        return answer._replace(covariance=joint, uncertain=uncertain), state
+            estimate = _turned(estimate, found)
+        answer, state = _over_ground(window, estimate, state._replace(filter=found.filter), found.sigma_rad_s)
+        if answer is estimate:
+            answer = _with_errors(estimate, found, height_m)
+        return answer._replace(uncertain=self.is_uncertain(answer.twists, answer.covariance)), state
 
-    def is_uncertain(self, twists: NDArray[np.float64], covariance: NDArray[np.float64]) -> bool:
+    def is_uncertain(self, twists: NDArray[np.float64], covariance: NDArray[np.float64] | None) -> bool:
         """Whether sigma exceeds the bounds, see `Uncertainty.is_uncertain`; False for a model without uncertainty."""
         unsure = self.bundle.uncertainty
-        return unsure is not None and unsure.is_uncertain(twists, covariance, self._bounds)
+        return unsure is not None and covariance is not None and unsure.is_uncertain(twists, covariance, self._bounds)
 
     def has_same_windows(self, other: "Estimator") -> bool:
         """Whether both models use the same windows and canonical camera, so that one can use the other's windows."""
@@ -263,19 +259,17 @@ class Estimator:
         wanted, longer = jobs(window.counts, stream.state.longer, self.network, self.config)
         runs = self._runner.run([job.counts for job in wanted], [job.state for job in wanted]) if wanted else []
         longer = followed(longer, [(job, state) for job, (_, state) in zip(wanted, runs, strict=True)], self.config)
-        longer = watched(longer, answer.twists, self.config)
-        stream.state = stream.state._replace(longer=longer)
+        stream.state = stream.state._replace(longer=watched(longer, answer.twists, self.config))
         answers = [answer]
         for job, (twists, state) in zip(wanted, runs, strict=True):
             answers.append(Answer(slowed(twists * self._scale + self._offset, job.scale), state, job.scale))
-        return chosen(answers, longer, self.config.scale_bounds)
+        return chosen(answers, stream.state.longer, self.config.scale_bounds)
 
     def _reset_after_gap(self, stream: _Progress, window: Window) -> None:
         """Reset the network state where a window does not follow the one before it."""
         if stream.state.end_us not in (None, window.start_us) and not window.bridged:
-            stream.state = stream.state._replace(
-                network=self.network.initial_state(), age=0, recent=(), longer=Longer()
-            )
+            fresh = self.network.initial_state()
+            stream.state = stream.state._replace(network=fresh, age=0, recent=(), longer=Longer())
 
     def _take(self, stream: _Progress, window: Window, twists: NDArray[np.float64], network: State) -> None:
         answer = self._chosen(stream, window, Answer(twists, network))
@@ -318,7 +312,7 @@ class Estimator:
             low_activity=window.events - window.outside < before.low_activity_below,
             saturated=bool(window.counts.max() == 255),
             covariance=covariance,
-            uncertain=covariance is not None and self.is_uncertain(twists, covariance),
+            uncertain=self.is_uncertain(twists, covariance),
         )
 
 
@@ -355,15 +349,23 @@ def _is_finite(estimator: Estimator, state: StreamState) -> bool:
     return True
 
 
-def _with_errors(
-    twists: NDArray[np.float64], covariance: NDArray[np.float64], found: RotationFound, height_m: float
-) -> NDArray[np.float64]:
-    """Covariance (6, 6) of an estimate without the ground, with the terms of `refine.errors`."""
-    covariance = covariance.copy()
+def _turned(estimate: WindowEstimate, found: RotationFound) -> WindowEstimate:
+    """The estimate with the angular part of the refinement by rotation."""
+    if estimate.covariance is None:
+        return estimate
+    twists, covariance = _with_rate(estimate.twists, estimate.covariance, found.rate, found.change_rad_s)
+    return estimate._replace(twists=twists, covariance=covariance, source="refined")
+
+
+def _with_errors(estimate: WindowEstimate, found: RotationFound, height_m: float) -> WindowEstimate:
+    """An estimate without the ground, whose covariance has the terms of `refine.errors`."""
+    if estimate.covariance is None:
+        return estimate
+    covariance = estimate.covariance.copy()
     if found.errors is not None:
         covariance[3:, 3:] = (found.errors + found.errors.T) / 2
-    rate_rad_s = float(np.linalg.norm(twists.mean(axis=0)[3:]))
-    return errors.of_unknown_depth(covariance, found.shift, rate_rad_s, height_m)
+    rate_rad_s = float(np.linalg.norm(estimate.twists.mean(axis=0)[3:]))
+    return estimate._replace(covariance=errors.of_unknown_depth(covariance, found.shift, rate_rad_s, height_m))
 
 
 def _over_ground(
