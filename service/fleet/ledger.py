@@ -124,6 +124,15 @@ class Ledger:
         """The nodes that failed, also those that were reverted."""
         return [one for one in self.targets.values() if one.failed]
 
+    @property
+    def too_many(self) -> str:
+        """Why the rollout must stop, if more nodes failed than may; else empty."""
+        failed = self.failed
+        if len(failed) <= self.max_failed:
+            return ""
+        newest = ", ".join(f"{one.node} {one.fault}" for one in failed[-3:])
+        return f"{len(failed)} failed, at most {self.max_failed} may: {newest}"
+
     def of(self, *states: State) -> list[Target]:
         """The nodes in these states, in order."""
         return [one for one in self.targets.values() if one.state in states]

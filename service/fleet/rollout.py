@@ -6,7 +6,7 @@ which is a function of these events, is the only state that outlives a process.
 
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final, NamedTuple
 
 from neurove_protocol.control import HealthReply
@@ -14,7 +14,7 @@ from neurove_service.config import ClientConfig
 from neurove_service.fleet import plan, roster
 from neurove_service.fleet.changing import Changer, Crew
 from neurove_service.fleet.journal import Event, Journal
-from neurove_service.fleet.ledger import Ledger, Target
+from neurove_service.fleet.ledger import Ledger, Target, Terms
 from neurove_service.fleet.roster import Roster
 from neurove_service.fleet.soak import Soak
 from neurove_service.fleet.summary import Summary, summary_of
@@ -39,6 +39,25 @@ class Turn(NamedTuple):
     fine: int
     failed: int
     pending: int
+
+
+def turn_of(ledger: Ledger, soaks: Mapping[str, Soak], changing: int) -> Turn:
+    """Where a rollout is.
+
+    Args:
+        ledger: of the rollout.
+        soaks: by node.
+        changing: number of nodes that change now.
+    """
+    now_s, soaking = time.monotonic(), ledger.of("active")
+    left_s = max((soaks[one.node].left_s(now_s) for one in soaking if one.node in soaks), default=0.0)
+    counts = len(ledger.of("fine")), len(ledger.failed), len(ledger.of("pending"))
+    return Turn(ledger.step, changing, len(soaking), left_s, *counts)
+
+
+def soak_of(terms: Terms, began_s: float) -> Soak:
+    """The soak of a node that became active at a time of the monotonic clock [s]."""
+    return Soak(terms.digest, began_s, terms.soak_s, terms.grace_s, terms.patience_s)
 
 
 class Rollout:
@@ -109,11 +128,11 @@ class Rollout:
             self._judge(found, time.monotonic())
             if self._terms.on_failure != "stop":
                 self._undo(found, self.ledger.of("failed"))
-            if why := self._why_stop():
+            if why := self.ledger.too_many:
                 return self._end_step(why)
             counted = len(self.ledger.targets) - len(self.ledger.of("pending", "skipped"))
             tried |= self._begin(found, size - counted)
-            self._on_turn(self._turn())
+            self._on_turn(turn_of(self.ledger, self._soaks, len(self._crew.running)))
             left = self._interrupted() or (size > counted and self.ledger.of("pending"))
             waits = left and time.monotonic() < give_up_s
             if not (self._crew.running or self.ledger.of("active") or waits):
@@ -127,13 +146,6 @@ class Rollout:
             self._take_outcomes()
         self._emit("stop", why=why)
         return False
-
-    def _turn(self) -> Turn:
-        now_s, soaking = time.monotonic(), self.ledger.of("active")
-        left_s = max((self._soaks[one.node].left_s(now_s) for one in soaking if one.node in self._soaks), default=0.0)
-        fine, pending = len(self.ledger.of("fine")), len(self.ledger.of("pending"))
-        failed = len(self.ledger.failed)
-        return Turn(self.ledger.step, len(self._crew.running), len(soaking), left_s, fine, failed, pending)
 
     def _interrupted(self) -> list[Target]:
         """The nodes whose change was sent by a process that was killed."""
@@ -173,7 +185,7 @@ class Rollout:
         for target, outcome in self._crew.outcomes():
             now_s = time.monotonic()
             if outcome.result == "active":
-                self._soaks[target.node] = self._soak(now_s)
+                self._soaks[target.node] = soak_of(self._terms, now_s)
                 self._emit("active", node=target.node, why=outcome.why, soak_s=self._terms.soak_s)
             elif outcome.result == "failed":
                 self._emit("failed", node=target.node, why=outcome.why)
@@ -181,16 +193,12 @@ class Rollout:
                 self._retry_at_s[target.node] = now_s + _RETRY_S
                 self._emit("offline", node=target.node, why=outcome.why)
 
-    def _soak(self, began_s: float) -> Soak:
-        terms = self._terms
-        return Soak(terms.digest, began_s, terms.soak_s, terms.grace_s, terms.patience_s)
-
     def _judge(self, found: Roster, now_s: float) -> None:
         """Apply the answers to the nodes that have the bundle; only an answer makes a node fine."""
         for target in self.ledger.of("active", "fine"):
             was_fine, reply = target.state == "fine", found.replies.get(target.node)
             if target.node not in self._soaks:  # of a resumed rollout: a soak that was interrupted begins again
-                self._soaks[target.node] = self._soak(now_s - self._terms.soak_s * was_fine)
+                self._soaks[target.node] = soak_of(self._terms, now_s - self._terms.soak_s * was_fine)
             soak = self._soaks[target.node]
             if reply is None and was_fine:
                 continue
@@ -200,14 +208,6 @@ class Rollout:
                 self._emit("failed", node=target.node, why=finding.why)
             elif finding.result == "fine" and not was_fine:
                 self._emit("fine", node=target.node)
-
-    def _why_stop(self) -> str:
-        failed, most = self.ledger.failed, self.ledger.max_failed
-        if len(failed) <= most:
-            return ""
-        return (
-            f"{len(failed)} failed, at most {most} may: {', '.join(f'{one.node} {one.fault}' for one in failed[-3:])}"
-        )
 
     def _proven(self, number: int, tried: set[str]) -> bool:
         """Whether the nodes of a step show that the next step may begin; if all of them failed, the rollout stops."""
