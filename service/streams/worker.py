@@ -16,6 +16,7 @@ from neurove_protocol.velocity import TwistEstimate
 from neurove_service import logs
 from neurove_service.guard import Guard
 from neurove_service.streams.cameras import Cameras
+from neurove_service.streams.duty import Alone, Duty
 from neurove_service.streams.intake import Arrival
 from neurove_service.streams.overload import Overload, newest_whole_window
 from neurove_service.streams.runs import MAX_RUN, SMALL_BYTES
@@ -71,6 +72,7 @@ class Inbox:
         self._imu: deque[Sample] = deque()
         self._imu_bytes = self._imu_dropped = 0
         self._bytes = self._dropped = 0
+        self._woken = False
         self._changed = threading.Condition()
 
     def put_camera(self, sample: Sample) -> bool:
@@ -115,15 +117,17 @@ class Inbox:
             return samples, dropped
 
     def wake(self) -> None:
-        """Let a waiting `take` return."""
+        """Let a waiting `take_all`, or else the next one, return at once."""
         with self._changed:
+            self._woken = True
             self._changed.notify_all()
 
     def take_all(self, timeout_s: float) -> tuple[deque[Sample], int]:
         """All samples, oldest first, or none after the timeout; and how many were dropped since the last call."""
         with self._changed:
-            if not self._samples and not self._cameras:
+            if not self._samples and not self._cameras and not self._woken:
                 self._changed.wait(timeout_s)
+            self._woken = False
             dropped, self._dropped = self._dropped, 0
             samples, self._samples = self._samples, deque()
             for before, camera in reversed(self._cameras):
@@ -151,6 +155,7 @@ class StreamWorker:
         limits: limits of packets.
         slots: limit how many workers of the node work at once.
         guard: counts internal errors.
+        open_duty: given what wakes this worker.
     """
 
     def __init__(
@@ -161,8 +166,9 @@ class StreamWorker:
         limits: PacketLimits,
         slots: Slots | None = None,
         guard: Guard | None = None,
+        open_duty: Callable[[Callable[[], None]], Duty] = lambda _: Alone(),
     ) -> None:
-        self.stream = stream
+        self.stream, self.duty = stream, open_duty(inbox.wake)
         self.beat_ns = time.monotonic_ns()
         self._inbox = inbox
         self._open_outlet, self._limits = open_outlet, limits
@@ -218,6 +224,7 @@ class StreamWorker:
             self._stopping.wait(_REST_S)
         with self._guard.at("end of a stream", stream=self.stream.name):
             outlet.close()
+        self.duty.close()
 
     def _opened(self) -> Outlet | None:
         """The outlet; after a failure it is opened again until the worker stops."""
@@ -231,11 +238,12 @@ class StreamWorker:
     def _turn(self, outlet: Outlet) -> None:
         """Process the oldest samples, or else a step of the standby model."""
         self._cameras.turn()
+        self._put(self.duty.turn(self.stream), outlet)
         if not self._pending:
             if time.monotonic_ns() - self._taken_ns < _SOON_NS:
                 self._stopping.wait(_GATHER_S)
             pause_s = max(0.0, self._pause_until - time.monotonic())
-            self._take(pause_s if self.stream.lanes.has_backlog else _IDLE_BEAT_S)
+            self._take(self.duty.wait_s(pause_s if self.stream.lanes.has_backlog else _IDLE_BEAT_S))
         if self._pending:
             with self._slots.serving:
                 self._work_next(outlet)
@@ -337,7 +345,15 @@ class StreamWorker:
             log.warning("packet refused", stream=self.stream.name, why=error.message, total=total)
 
     def _publish(self, estimate: TwistEstimate, outlet: Outlet) -> None:
-        trace = estimate.trace.model_copy(update={"published_ns": time.monotonic_ns()})
-        stamped = estimate.model_copy(update={"trace": trace})
-        outlet.publish(stamped.encode())
-        self.stream.activity.published(stamped)
+        done = _published_now(estimate)
+        self._put(self.duty.answer(done), outlet)
+        self.stream.activity.published(done)
+
+    def _put(self, estimates: list[TwistEstimate], outlet: Outlet) -> None:
+        for one in estimates:
+            outlet.publish(_published_now(one).encode())
+
+
+def _published_now(estimate: TwistEstimate) -> TwistEstimate:
+    trace = estimate.trace.model_copy(update={"published_ns": time.monotonic_ns()})
+    return estimate.model_copy(update={"trace": trace})
