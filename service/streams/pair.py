@@ -124,10 +124,8 @@ class Pair:
     def state(self, digest: str, timeout_s: float) -> StateReply | None:
         """The state of the stream for a follower; None if this node has no such state, or is stuck."""
         found = self._sync.ask(digest, timeout_s, self._wake)
-        if found is None:
-            return None
-        node, stream = self._tenure.node, self._stream
-        return StateReply(node=node, stream=stream, digest=digest, end_us=found.end_us, data=found.data)
+        about = {"node": self._tenure.node, "stream": self._stream, "digest": digest}
+        return None if found is None else StateReply.model_validate(about | found._asdict())
 
     def status(self) -> StandbyStatus:
         """For the status of the stream."""

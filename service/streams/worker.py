@@ -169,17 +169,14 @@ class StreamWorker:
         open_duty: Callable[[Callable[[], None]], Duty] = lambda _: Alone(),
     ) -> None:
         self.stream, self.duty = stream, open_duty(inbox.wake)
-        self.beat_ns = time.monotonic_ns()
-        self._inbox = inbox
+        self._inbox, self.beat_ns = inbox, time.monotonic_ns()
         self._open_outlet, self._limits = open_outlet, limits
-        self._slots = slots or Slots()
-        self._guard = guard or Guard()
+        self._slots, self._guard = slots or Slots(), guard or Guard()
         self._pause_until = 0.0  # a time, not a duration: packets that arrive in a pause must not extend it
         self._pending: deque[Sample] = deque()  # taken out of the queue, not yet processed
         self._cameras = Cameras(stream, inbox.wake, self._guard)
         self._taken_ns = 0  # when the queue was last emptied
-        self._overload = Overload(inbox.max_age_s)
-        self._stopping = threading.Event()
+        self._overload, self._stopping = Overload(inbox.max_age_s), threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"stream {stream.name}", daemon=True)
         self._thread.start()
 
@@ -238,7 +235,7 @@ class StreamWorker:
     def _turn(self, outlet: Outlet) -> None:
         """Process the oldest samples, or else a step of the standby model."""
         self._cameras.turn()
-        self._put(self.duty.turn(self.stream), outlet)
+        _put(self.duty.turn(self.stream), outlet)
         if not self._pending:
             if time.monotonic_ns() - self._taken_ns < _SOON_NS:
                 self._stopping.wait(_GATHER_S)
@@ -346,12 +343,13 @@ class StreamWorker:
 
     def _publish(self, estimate: TwistEstimate, outlet: Outlet) -> None:
         done = _published_now(estimate)
-        self._put(self.duty.answer(done), outlet)
+        _put(self.duty.answer(done), outlet)
         self.stream.activity.published(done)
 
-    def _put(self, estimates: list[TwistEstimate], outlet: Outlet) -> None:
-        for one in estimates:
-            outlet.publish(_published_now(one).encode())
+
+def _put(estimates: list[TwistEstimate], outlet: Outlet) -> None:
+    for one in estimates:
+        outlet.publish(_published_now(one).encode())
 
 
 def _published_now(estimate: TwistEstimate) -> TwistEstimate:

@@ -3,8 +3,10 @@
 import pytest
 
 from neurove_core.models import bundle
+from neurove_service.clients import ask
+from neurove_service.config import ClientConfig
 from tests.live.conftest import client, neurove, wait_until
-from tests.live.fellows import Consumer, Driver, check, duty, fellows, follows, small_model
+from tests.live.fellows import Consumer, Driver, check, drain, duty, fellows, follows, small_model
 
 STREAM = "cam0"
 
@@ -42,10 +44,7 @@ def test_kills_drains_and_a_hanging_node_leave_no_trace_in_the_estimates(router,
 
         for _ in range(2):
             hand_over(lambda name: nodes[name].kill(), lambda name: nodes[name].start())
-        hand_over(
-            lambda name: neurove("drain", "--connect", router, "--node", name),
-            lambda name: neurove("drain", "--resume", "--connect", router, "--node", name),
-        )
+        hand_over(lambda name: drain(transport, name), lambda name: drain(transport, name, resume=True))
         hand_over(lambda name: nodes[name].hang(), lambda name: nodes[name].wake())
         some_windows_later()
         driver.pause()
@@ -55,7 +54,8 @@ def test_kills_drains_and_a_hanging_node_leave_no_trace_in_the_estimates(router,
 
         driver.go_on()  # both nodes follow one activation, and become equal again
         some_windows_later()
-        assert neurove("activate", second_model.stem, "--all", "--connect", router).returncode == 0
+        for name in both:
+            ask.activate(transport, ClientConfig(connect=(router,)), second_model.stem, name)
         digest = bundle.load(second_model).digest
         wait_until(
             lambda: (
