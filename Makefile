@@ -10,7 +10,7 @@ JOBS ?= 2
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 
-.PHONY: run test format picture clean
+.PHONY: run test ros2 format picture docs clean
 
 run: $(VENV)/warm
 	@$(BIN)/neurove demo
@@ -22,15 +22,23 @@ test: $(VENV)/warm $(VENV)/packages
 	$(BIN)/python tests/wheel.py
 	$(BIN)/pytest --numprocesses $(JOBS) --dist loadgroup --no-loadscope-reorder --cov --cov-report=term
 
+ros2: .venv-ros2/ready  # for the tests with real nodes of ROS 2; without it they are skipped
+
+.venv-ros2/ready: tests/ros2/install.sh tests/ros2/make_messages.py tests/ros2/requirements.txt
+	@sh tests/ros2/install.sh $(PYTHON) .venv-ros2
+
 picture: $(VENV)/installed  # the picture in README, of a simulated street with its truth
 	@$(BIN)/neurove demo "sim://street?seed=7&seconds=8" --force --screenshot service/pictures/demo.svg
+
+docs: $(VENV)/installed  # the documentation site in build/docs/site; a broken link is an error
+	@$(BIN)/python deploy/docs/build.py build/docs
 
 format: $(VENV)/installed
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info .coverage* .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) .venv-ros2* build dist *.egg-info .coverage* .mypy_cache .pytest_cache .ruff_cache .hypothesis
 
 $(VENV)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \

@@ -1,7 +1,8 @@
-"""Sources: a file, a folder or a URL to a Recording. One table of formats; other packages add theirs by entry points.
+"""Sources: a file, a folder or a URL to a Recording or a LiveSource. One table; other packages add to it.
 
 A format is a module of `FORMATS` with a `FORMAT`, or an entry point of the group `neurove.recordings` whose object is a
-`neurove_core.io.Format`. Help, errors and README list the sources from this table.
+`neurove_core.io.Format`. A live source is a module of `LIVE`, or such an entry point whose object is a `LiveFormat`.
+Help, errors and README list the sources from this table.
 """
 
 import functools
@@ -19,6 +20,7 @@ from neurove_core.io.format import Format, UrlFormat
 from neurove_core.io.recording import Recording
 from neurove_core.io.spool import HEAD_BYTES, Plain, compression_of, discard, is_text, piped, plain_file
 from neurove_core.io.units import with_unit
+from neurove_core.live.source import LiveFormat, LiveSource
 from neurove_protocol.events import Sensor
 
 log = logging.getLogger(__name__)
@@ -47,12 +49,21 @@ FORMATS: Final = (
 URLS: Final = {"sim": "neurove_core.sim.source", "pattern": "neurove_core.io.formats.pattern"}
 """Modules of the sources that a URL names, by scheme."""
 
+LIVE: Final = {"dv": "neurove_core.live.dv_stream", "camera": "neurove_core.live.camera"}
+"""Modules of the live sources, by the scheme of their URL."""
+
 _SUFFIXES: Final = ((rb"PK\x03\x04.{26}[^\0]{0,255}\.npy", ".npz"), (rb"PK\x03\x04", ".zip"))
 """Suffix that the content of a pipe asks for, where the format looks at the suffix."""
+
+_LIVE_ONLY: Final = (
+    "it is a live source, and this command needs a recording: `neurove drive` publishes it, and `neurove record` "
+    "writes what is published to a file"
+)
 
 
 class _Table(NamedTuple):
     formats: tuple[Format, ...]
+    live: dict[str, LiveFormat]  # of other packages, by scheme
     failed: tuple[str, ...]  # entry points that could not be loaded, with the reason
 
 
@@ -78,6 +89,8 @@ def open_source(
     """
     scheme, separator, _ = source.partition("://")
     if separator:
+        if is_live(source):
+            raise UnknownSource(source, _LIVE_ONLY)
         if scheme not in URLS:
             raise UnknownSource(source, f"unknown scheme {scheme}://", _known())
         return with_unit(_url_format(scheme).open(source, sensor, topic), time_unit)
@@ -90,11 +103,37 @@ def open_source(
         raise UnknownSource(source, f"{error.strerror or error}{where}") from None
 
 
+def is_live(source: str) -> bool:
+    """Whether a source is a camera or a network stream, for `open_live`."""
+    scheme, separator, _ = source.partition("://")
+    return bool(separator) and scheme not in URLS and (scheme in LIVE or scheme in _table().live)
+
+
+def open_live(source: str, sensor: Sensor | None = None) -> LiveSource:
+    """Open a live source.
+
+    Args:
+        source: such as `camera://`, `camera://evk4?serial=...` or `dv://HOST:PORT`; see `supported`.
+        sensor: size of the pixel array, for a source that does not say it.
+
+    Raises:
+        UnknownSource: it is no live source, or its URL has unknown parts.
+        InvalidField: a value in the URL is out of bounds.
+        NoCamera: no such camera or stream can be opened.
+        MissingExtra: a library that reads this camera is not installed.
+    """
+    scheme = source.partition("://")[0]
+    if not is_live(source):
+        raise UnknownSource(source, f"it is no live source: {', '.join(f'{one}://' for one in LIVE)}")
+    return _live_format(scheme).open(source, sensor)
+
+
 def supported() -> tuple[str, ...]:
-    """One line for each source that `open_source` opens."""
+    """One line for each source that `open_source` or `open_live` opens."""
     table = _table()
     urls = (_url_format(scheme).about for scheme in URLS)
-    return (*dict.fromkeys(one.about for one in table.formats), *urls, *table.failed)
+    live = (_live_format(scheme).about for scheme in (*LIVE, *table.live))
+    return (*dict.fromkeys(one.about for one in table.formats), *urls, *live, *table.failed)
 
 
 def _known() -> tuple[str, ...]:
@@ -180,19 +219,29 @@ def _url_format(scheme: str) -> UrlFormat:
     return cast("UrlFormat", importlib.import_module(URLS[scheme]).FORMAT)
 
 
+def _live_format(scheme: str) -> LiveFormat:
+    if scheme in LIVE:
+        return cast("LiveFormat", importlib.import_module(LIVE[scheme]).FORMAT)
+    return _table().live[scheme]
+
+
 @functools.cache
 def _table() -> _Table:
     """All formats, those of this package first; an entry point that fails costs itself."""
     formats = [cast("Format", importlib.import_module(name).FORMAT) for name in FORMATS]
+    live: dict[str, LiveFormat] = {}
     failed = []
     for entry in importlib.metadata.entry_points(group=GROUP):
         try:
             found = entry.load()
-            if not isinstance(found, Format):
+            if isinstance(found, LiveFormat):
+                live[found.scheme] = found
+            elif isinstance(found, Format):
+                formats.append(found)
+            else:
                 raise TypeError(f"it is a {type(found).__name__}, not a neurove_core.io.Format")
-            formats.append(found)
         except Exception as error:  # noqa: BLE001  # code of another package may fail in any way
             why = f"{entry.value} of the entry points {GROUP} is not loaded: {type(error).__name__}: {error}"
             log.warning("recording format not loaded: entry_point=%s why=%s", entry.value, error)
             failed.append(why)
-    return _Table(tuple(formats), tuple(failed))
+    return _Table(tuple(formats), live, tuple(failed))

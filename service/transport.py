@@ -164,11 +164,11 @@ class Transport:
         block = zenoh.CongestionControl.BLOCK
         self.session.put(key, payload, encoding=zenoh.Encoding(schema), congestion_control=block)
 
-    def subscribe(self, key: str, on_sample: OnSample) -> None:
-        """Receive every message of a key expression until the session is closed."""
-        self.subscribe_timed(key, lambda name, payload, received_ns, _: on_sample(name, payload, received_ns))
+    def subscribe(self, key: str, on_sample: OnSample) -> Callable[[], None]:
+        """Receive every message of a key expression until the result is called or the session is closed."""
+        return self.subscribe_timed(key, lambda name, payload, received_ns, _: on_sample(name, payload, received_ns))
 
-    def subscribe_timed(self, key: str, on_sample: OnTimedSample) -> None:
+    def subscribe_timed(self, key: str, on_sample: OnTimedSample) -> Callable[[], None]:
         """As subscribe, with the time of sending, if the driver attaches it [us]."""
 
         def receive(sample: zenoh.Sample) -> None:
@@ -178,7 +178,7 @@ class Transport:
             except Exception as error:  # noqa: BLE001  # one message must not end the subscription
                 self._guard.caught("message", error)
 
-        self._kept.append(self.session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
+        return _keep(self._kept, self.session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
 
     def answer(self, key: str, handle: Callable[[bytes], bytes], schema: str = CONTROL_SCHEMA) -> None:
         """Answer the queries of a key on a separate thread; an error of `handle` goes to the caller.
@@ -282,14 +282,7 @@ class Transport:
 
     def token(self, key: str) -> Callable[[], None]:
         """Declare a liveliness token; call the result to undeclare it."""
-        token = self.session.liveliness().declare_token(key)
-        self._kept.append(token)
-
-        def undeclare() -> None:
-            self._kept.remove(token)
-            token.undeclare()  # type: ignore[no-untyped-call]  # gap in Zenoh's stubs
-
-        return undeclare
+        return _keep(self._kept, self.session.liveliness().declare_token(key))
 
     def watch_tokens(self, key: str, on_token: Callable[[str, bool], None]) -> None:
         """Call `on_token` with a token's key and whether it is present, for present tokens and at each change."""
@@ -305,6 +298,17 @@ class Transport:
         """The present liveliness tokens of a key expression."""
         replies = self.session.liveliness().get(key, timeout=timeout_s)
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+
+
+def _keep(kept: list[Any], declared: Any) -> Callable[[], None]:
+    """Keep what was declared until the result undeclares it."""
+    kept.append(declared)
+
+    def undeclare() -> None:
+        kept.remove(declared)
+        declared.undeclare()
+
+    return undeclare
 
 
 def _sent_us(attachment: zenoh.ZBytes | None) -> int | None:

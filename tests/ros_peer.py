@@ -107,7 +107,7 @@ class RosNode:
         publish.matching = lambda: getattr(publisher.matching_status, "matching", publisher.matching_status)
         return publish
 
-    def subscribe(self, topic, type_, qos=RELIABLE):
+    def subscribe(self, topic, type_, qos=RELIABLE, on_message=lambda: None):
         """Returns a list that grows: (message, attachment) of every sample of this type and hash."""
         self._token("MS", topic, type_, qos)
         received = []
@@ -115,6 +115,7 @@ class RosNode:
         def receive(sample):
             attachment = sample.attachment.to_bytes()
             received.append((parsed(sample.payload.to_bytes(), type_), attachment))
+            on_message()
 
         key = f"0{topic}/{dds(type_)}/{self._hash_of(type_)}"
         handler = zenoh.handlers.Callback(receive, indirect=False)

@@ -40,7 +40,8 @@ MAY_IMPORT = {
     "neurove_core.io": "files extras figures geometry",
     "neurove_core.io.formats": "compiled files extras geometry io",
     "neurove_core.sim": "compiled config figures geometry io io.formats",
-    "neurove_core.sources": "io io.formats sim",
+    "neurove_core.live": "extras io io.formats",
+    "neurove_core.sources": "io io.formats live sim",
     "neurove_core.evaluation": "compiled figures geometry networks models estimator inertial aided io",
     "neurove_core.training": (
         "config files extras figures geometry ingest networks "
@@ -79,8 +80,8 @@ MAY_IMPORT = {
     ),
     "neurove_service.metrics": "logs guard",
     "neurove_service.clients": (
-        "core:config core:geometry core:ingest core:io core:io.formats core:bench logs guard config transport "
-        "clock_offset metrics"
+        "core:config core:geometry core:ingest core:io core:io.formats core:live core:bench logs guard config "
+        "transport clock_offset metrics"
     ),
     "neurove_service.ros2": "core:extras core:geometry core:io core:io.formats clock_offset guard logs transport",
     "neurove_service.node": (

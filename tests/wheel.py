@@ -37,7 +37,9 @@ def check_names(wheel: Path) -> None:
     """The wheel installs only names that are ours, with type marks, models and training configurations."""
     names = zipfile.ZipFile(wheel).namelist()
     top = {name.partition("/")[0] for name in names}
-    assert {name for name in top if not name.endswith(".dist-info")} == PACKAGES, top
+    assert {name for name in top if not name.endswith((".dist-info", ".data"))} == PACKAGES, top
+    shipped = {name.partition(".data/data/share/neurove/")[2] for name in names if ".data/" in name}
+    assert shipped == {"neurove.service", "neurove.toml", "zenoh-router.json5", "zenoh-router.service"}, shipped
     for needed in (
         *(f"{package}/py.typed" for package in PACKAGES),
         "neurove_core/models/default.safetensors",

@@ -4,7 +4,7 @@
 #
 #   sh make-ca.sh DIR ROLE-NAME[=HOST,...] ...
 #
-#   ROLE  router, node, driver, consumer, recorder or operator
+#   ROLE  router, node, driver, consumer, recorder, operator, bridge (neurove ros2) or ros (a node of ROS 2)
 #   NAME  name of the node (its `node` setting), of the driver's stream, of the person or of the program
 #   HOST  host names and addresses to which others connect: for a router, and for a node that listens itself
 #
@@ -42,8 +42,8 @@ names_of() {
 # Check all names before any file is made.
 for one in "$@"; do
     name=${one%%=*}
-    echo "$name" | grep -Eq '^(router|node|driver|consumer|recorder|operator)-[A-Za-z0-9_][A-Za-z0-9_.-]{0,51}$' ||
-        refuse "'$name': give ROLE-NAME (router, node, driver, consumer, recorder, operator; a name of up to 52 characters), such as node-edge1"
+    echo "$name" | grep -Eq '^(router|node|driver|consumer|recorder|operator|bridge|ros)-[A-Za-z0-9_][A-Za-z0-9_.-]{0,51}$' ||
+        refuse "'$name': give ROLE-NAME (router, node, driver, consumer, recorder, operator, bridge, ros; a name of up to 52 characters), such as node-edge1"
     case $one in
         *=*) echo "${one#*=}" | grep -Eq '^[A-Za-z0-9.:-]+(,[A-Za-z0-9.:-]+)*$' ||
             refuse "'$one': give hosts as names or addresses, separated by commas" ;;

@@ -1,6 +1,6 @@
 """Make one Zenoh configuration for every certificate of make-ca.sh, including keys and access list.
 
-    python make-configs.py DIR [--prefix neurove/v1] [--listen tls/0.0.0.0:7447]
+    python make-configs.py DIR [--prefix neurove/v1] [--listen tls/0.0.0.0:7447] [--domain 0]
 
 DIR/NAME.json5 contains everything that a participant needs. Pass it to `neurove ... --zenoh-config` and keep it secret.
 The file of a router, or of a node that listens itself, also has the access list of all participants. Each run rewrites
@@ -16,12 +16,16 @@ import subprocess
 import sys
 from pathlib import Path
 
-ROLES = ("router", "node", "driver", "consumer", "recorder", "operator")
+ROLES = ("router", "node", "driver", "consumer", "recorder", "operator", "bridge", "ros")
 TEMPLATES = Path(__file__).resolve().parent
+ALL = [
+    *("put", "delete", "declare_subscriber", "query", "declare_queryable", "reply"),
+    *("liveliness_token", "liveliness_query", "declare_liveliness_subscriber"),
+]  # kinds of message
 IN, OUT = "ingress", "egress"  # seen from the listening side: from the participant, to the participant
 
 
-def access_control(names: list[str], prefix: str) -> dict[str, object]:
+def access_control(names: list[str], prefix: str, domain: int = 0) -> dict[str, object]:
     """Make Zenoh's `access_control` for these participants: default deny, and one policy per participant.
 
     Zenoh applies a rule only if its key expression includes that of the message. A rule with a narrower key therefore
@@ -30,6 +34,7 @@ def access_control(names: list[str], prefix: str) -> dict[str, object]:
     Args:
         names: common names of the certificates, `<role>-<name>`.
         prefix: prefix of all keys.
+        domain: ROS_DOMAIN_ID, for participants of the roles bridge and ros.
 
     Returns:
         the value of `access_control`, ready for JSON.
@@ -37,7 +42,7 @@ def access_control(names: list[str], prefix: str) -> dict[str, object]:
     rules = [
         {"id": f"{name} {number}", "permission": "allow", "flows": [flow], "messages": messages, "key_exprs": keys}
         for name in names
-        for number, (flow, messages, keys) in enumerate(_rules(*name.split("-", 1), prefix))
+        for number, (flow, messages, keys) in enumerate(_rules(*name.split("-", 1), prefix, domain))
     ]
     return {
         "enabled": True,
@@ -55,7 +60,7 @@ def access_control(names: list[str], prefix: str) -> dict[str, object]:
 Rule = tuple[str, list[str], list[str]]
 
 
-def _rules(role: str, name: str, prefix: str) -> list[Rule]:
+def _rules(role: str, name: str, prefix: str, domain: int) -> list[Rule]:
     """List what a participant may send (IN) and receive (OUT): flow, kinds of message, key expressions."""
     node = f"{prefix}/@node/*"
     events, camera, imu = f"{prefix}/*/events", f"{prefix}/*/camera", f"{prefix}/*/imu"
@@ -80,6 +85,16 @@ def _rules(role: str, name: str, prefix: str) -> list[Rule]:
             (OUT, ["liveliness_token"], [f"{own}/instance/*"]),
             (IN, ["liveliness_token"], [f"{own}/alive", f"{own}/serves/*", f"{own}/instance/*"]),
         ]
+    if role == "ros":  # a node of ROS 2: everything of its domain, and nothing of ours
+        return _ros(domain)
+    if role == "bridge":  # as the drivers of all streams and a consumer of results, and a node of ROS 2
+        published = [events, camera, imu]
+        return [
+            *_publishes(published, heard_as=published),
+            *_answers([camera], asked_as=[camera]),
+            *_hears(results),
+            *_ros(domain),
+        ]
     tokens = [f"{node}/alive", f"{node}/serves/*", f"{node}/instance/*"]
     reads = [
         *_hears(results),
@@ -92,6 +107,12 @@ def _rules(role: str, name: str, prefix: str) -> list[Rule]:
     if role == "operator":  # as a consumer, and model changes
         return [*reads, *_asks([change]), *_answers([chunks], asked_as=[chunks])]
     return reads if role == "consumer" else []
+
+
+def _ros(domain: int) -> list[Rule]:
+    """List the keys of rmw_zenoh: messages and services, latched messages, and the tokens of nodes and topics."""
+    keys = [f"{domain}/**", f"{domain}/**/@adv/**", f"@ros2_lv/{domain}/**"]
+    return [(IN, ALL, keys), (OUT, ALL, keys)]
 
 
 def _hears(keys: list[str]) -> list[Rule]:
@@ -154,15 +175,18 @@ def main() -> int:
     parser.add_argument(
         "--listen", default="tls/0.0.0.0:7447", help="endpoint of router and listening nodes; default tls/0.0.0.0:7447"
     )
+    parser.add_argument("--domain", type=int, default=0, help="ROS_DOMAIN_ID of the roles bridge and ros; default 0")
     args = parser.parse_args()
     if not re.fullmatch(r"[A-Za-z0-9_.-]+(/[A-Za-z0-9_.-]+)*", args.prefix):
         parser.error(f"--prefix {args.prefix!r}: chunks of A-Z a-z 0-9 _ . - joined by /")
     if not re.fullmatch(r"tls/[^/\s\"#]+:[0-9]+", args.listen):
         parser.error(f"--listen {args.listen!r}: give one address and port, such as tls/192.168.7.1:7447")
+    if not 0 <= args.domain <= 232:
+        parser.error(f"--domain {args.domain}: 0 to 232")
     names = sorted(path.stem for path in args.folder.glob("*-*.crt") if path.name.split("-")[0] in ROLES)
     if not names:
         parser.error(f"no certificates in {args.folder}: run make-ca.sh first")
-    access = access_control(names, args.prefix)
+    access = access_control(names, args.prefix, args.domain)
     for name in names:
         write(args.folder / f"{name}.json5", config(args.folder, name, access, args.listen))
         print(f"wrote {args.folder / name}.json5")

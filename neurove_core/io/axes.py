@@ -69,12 +69,27 @@ def with_axes(recording: Recording, axes: str | None) -> Recording:
     Raises:
         InvalidField: the axes are no rotation, or the recording has no inertial samples.
     """
+    rotation = rotation_of(axes, recording.name, recording.streams)
+    return recording if rotation is None else _Rotated(recording, rotation)
+
+
+def rotation_of(axes: str | None, name: str, streams: tuple[str, ...]) -> NDArray[np.float64] | None:
+    """Rotation (3, 3) of the inertial samples of a source; None without axes.
+
+    Args:
+        axes: see `parse_axes`.
+        name: of the source.
+        streams: the kinds of data that it has.
+
+    Raises:
+        InvalidField: the axes are no rotation, or the source has no inertial samples.
+    """
     if axes is None:
-        return recording
+        return None
     rotation = parse_axes(axes)
-    if "imu" not in recording.streams:
-        raise InvalidField("imu", "axes", axes, f"{recording.name} has no inertial samples")
-    return _Rotated(recording, rotation)
+    if "imu" not in streams:
+        raise InvalidField("imu", "axes", axes, f"{name} has no inertial samples")
+    return rotation
 
 
 class _Rotated:

@@ -21,7 +21,7 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple, Protocol
 
 from neurove_core.extras import MissingExtra
 from neurove_core.files import pointer_fault
@@ -92,7 +92,22 @@ def read_calibration(file: str, sensor: Sensor) -> CameraInfo:
     return _lens(path, cameras[fitting[0]])
 
 
-def lens_of(recording: Recording, file: str | None, height_m: float | None) -> CameraInfo | None:
+class Source(Protocol):
+    """What the lens of a recording or of a live source depends on."""
+
+    @property
+    def name(self) -> str:
+        """Short name to display."""
+
+    @property
+    def sensor(self) -> Sensor:
+        """The pixel array."""
+
+    def camera(self, stream: str) -> CameraInfo | None:
+        """The camera parameters of the source itself, or None."""
+
+
+def lens_of(recording: Source, file: str | None, height_m: float | None) -> CameraInfo | None:
     """The lens to use for a recording: that of the file, else its own; at the given height, else at its own.
 
     Raises:

@@ -17,6 +17,7 @@ class Reason(StrEnum):
     RESERVED = "reserved_word"  # a word of an unknown type: skipped
     INVALID = "invalid"  # a value that the format does not allow: skipped
     DAMAGED = "damaged"  # a line, message, packet or chunk that cannot be read: skipped
+    LOST = "lost"  # of a live source: lost in its transmission
     UNREAD = "unread"  # the recording cannot be read beyond this place
 
 
@@ -32,6 +33,7 @@ _TEXTS = {
     Reason.RESERVED: "of an unknown word type, skipped",
     Reason.INVALID: "invalid, skipped",
     Reason.DAMAGED: "damaged, skipped",
+    Reason.LOST: "lost in transmission",
     Reason.UNREAD: "place beyond which nothing can be read",
 }
 

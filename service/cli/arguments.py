@@ -13,10 +13,12 @@ from neurove_protocol import Sensor
 from neurove_protocol.errors import InvalidField, NeuroVEError
 from neurove_service import logs
 from neurove_service.config import ClientConfig, ServiceConfig, load
+from neurove_service.endpoints import check_address
 
 if TYPE_CHECKING:
     from neurove_core.geometry.mounting import Mounting
     from neurove_core.io import Recording
+    from neurove_core.live.source import LiveSource
 
 MAX_SECONDS: Final = 1e9
 """Longest time of a flag [s]: 31 years, which clocks and timers can hold."""
@@ -42,7 +44,7 @@ def subcommand(commands: Any, name: str, run: Run, *, as_json: bool = True) -> a
 def add_source(parser: argparse.ArgumentParser, **source: Any) -> None:
     """Add the source of events and how to read it."""
     default = f"; default {source['default']}" if source else ""
-    about = f"recording, pattern:// or sim:// (the built-in simulator){default}"
+    about = f"recording, sim:// (the built-in simulator), pattern://, camera:// or dv://HOST:PORT{default}"
     parser.add_argument("source", metavar="SOURCE", help=about, **source)
     add_recording_flags(parser)
     parser.add_argument("--loop", action="store_true", help="start again at the end")
@@ -121,6 +123,14 @@ def client_config(args: argparse.Namespace) -> ClientConfig:
 def flags(args: argparse.Namespace, kind: type[ServiceConfig] | type[ClientConfig]) -> dict[str, Any]:
     """The settings that the command line gives; None for each that it does not give."""
     return {name: getattr(args, name, None) for name in kind.model_fields}
+
+
+def address(text: str) -> str:
+    """An address to listen on, HOST:PORT."""
+    try:
+        return check_address(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def count(text: str) -> int:
@@ -204,8 +214,8 @@ def duration(text: str) -> float:
     return math.inf if text in ("inf", "max") else seconds(text)
 
 
-def tell_faults(recording: "Recording") -> None:
-    """Print to stderr what a recording's reader skipped, discarded or could not read: one line for each reason."""
+def tell_faults(recording: "Recording | LiveSource") -> None:
+    """Print to stderr what a reader skipped, discarded, lost or could not read: one line for each reason."""
     for fault in recording.faults.found:
         print(f"neurove: {recording.name}: {fault}", file=sys.stderr)
 

@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import importlib
 import json
 import sys
 import threading
@@ -11,13 +12,14 @@ from typing import Any, Final, TypeVar
 
 from neurove_protocol import TwistEstimate
 from neurove_protocol.control import HealthReply, ModelsReply, StreamStatus
-from neurove_protocol.errors import EXIT_FAILURE
+from neurove_protocol.errors import EXIT_FAILURE, InvalidField
 from neurove_service.cli import lines
-from neurove_service.cli.arguments import add_client_flags, client_config, command, count
+from neurove_service.cli.arguments import add_client_flags, address, client_config, command, count
 from neurove_service.cli.waiting import Wait, add_wait
 from neurove_service.config import ClientConfig
 from neurove_service.lifecycle import stop_on_signals
 
+_FOXGLOVE: Final = "127.0.0.1:8765"
 _ONCE_S: Final = 2.0  # longest wait for an estimate of every stream
 _POLL_S: Final = 0.05
 _LINE_POLL_S: Final = 0.1
@@ -29,11 +31,16 @@ def watch(args: argparse.Namespace) -> int:
     """Show live estimates of all streams."""
     from neurove_service.clients import ask
 
+    if args.foxglove is not None:
+        importlib.import_module("foxglove")  # a missing extra is named before the wait for a service
+
     stop = stop_on_signals()
     config = client_config(args)
     wait = Wait(config, args.wait, stop)
     with wait.connect(config) as transport:
         wait.until(lambda: ask.need_service(transport, config))
+        if args.foxglove is not None:
+            return _watch_foxglove(args.foxglove, config, transport, stop)
         if args.once:
             return _watch_once(args, config, transport, stop)
         if args.json or not sys.stdout.isatty():
@@ -111,6 +118,27 @@ def _watch_table(config: ClientConfig, transport: Any, stop: threading.Event) ->
     return 0
 
 
+def _watch_foxglove(address: str, config: ClientConfig, transport: Any, stop: threading.Event) -> int:
+    """Serve the streams to Foxglove until Ctrl-C."""
+    from neurove_service.clients.viewer import Viewer
+    from neurove_service.endpoints import is_loopback, split_address
+
+    host, port = split_address(address)
+    try:
+        viewer = Viewer(transport, config, host, port)
+    except (OSError, RuntimeError) as error:
+        raise InvalidField("watch", "--foxglove", address, f"cannot listen there: {error}") from None
+    where = f"[{host}]:{viewer.port}" if ":" in host else f"{host}:{viewer.port}"
+    print(f"ws://{where}", flush=True)
+    if not is_loopback(host):
+        print("neurove: every host that reaches this address sees the streams", file=sys.stderr, flush=True)
+    try:
+        viewer.run(stop)
+    finally:
+        viewer.close()
+    return 0
+
+
 def health(args: argparse.Namespace) -> int:
     """Show the health of every node."""
     from neurove_service.cli import views
@@ -163,6 +191,8 @@ def add_watch(parser: argparse.ArgumentParser) -> None:
     add_wait(parser)
     about = "show the newest estimate of every stream once; exit code 1 if there is none"
     parser.add_argument("--once", action="store_true", help=about)
+    about = f"serve the streams to Foxglove on this address; default {_FOXGLOVE}; extra foxglove"
+    parser.add_argument("--foxglove", nargs="?", type=address, const=_FOXGLOVE, metavar="HOST:PORT", help=about)
     parser.add_argument("--count", type=count, metavar="N", help="end after N lines; default: until Ctrl-C")
 
 

@@ -21,13 +21,14 @@ class Command(NamedTuple):
 COMMANDS = (
     Command("demo", "Run driver, service and consumer on any source, then print a summary.", "running", "serve"),
     Command("serve", "Run the service until SIGINT or SIGTERM.", "running", "serve"),
-    Command("drive", "Publish a recording or a synthetic source as event packets.", "running", "recordings"),
+    Command("drive", "Publish a recording, a synthetic source or a camera as event packets.", "running", "recordings"),
+    Command("cameras", "List the event cameras at this machine, and say what is missing.", "cameras"),
     Command(
         "ros2", "Bridge the event cameras of a ROS 2 robot to the service, and its estimates back.", "ros2", "ros2"
     ),
     Command("watch", "Show live estimates of all streams.", "asking"),
     Command("health", "Show the health of every node.", "asking"),
-    Command("doctor", "Check connection, streams, compiled kernels, processor and installed extras.", "doctor"),
+    Command("doctor", "Check connection, streams, compiled kernels, processor, cameras and extras.", "doctor"),
     Command(
         "warm-up",
         "Compile ahead what serve, demo, drive and simulate run, and say where it is kept.",
@@ -62,6 +63,7 @@ COMMANDS = (
     Command("reproduce", "Repeat the experiments of the paper.", "experiments", "experiments"),
     Command("bench", "Measure the speed of this machine, as ratios within one run.", "bench", "bench"),
     Command("config", "Show the settings of the service.", "running"),
+    Command("install-units", "Write the systemd units of a plain machine, or show what would be written.", "units"),
     Command("completion", "Print a completion script for a shell.", "completion"),
 )
 

@@ -10,7 +10,14 @@ from neurove_protocol.control import HealthReply, StreamStatus
 from neurove_protocol.errors import EXIT_FAILURE, NeuroVEError
 from neurove_service.cli.arguments import add_client_flags, client_config, command
 from neurove_service.cli.inertial_text import imu_text
-from neurove_service.cli.installation import Check, check_engine, check_extras, check_kernels, check_processor
+from neurove_service.cli.installation import (
+    Check,
+    check_cameras,
+    check_engine,
+    check_extras,
+    check_kernels,
+    check_processor,
+)
 from neurove_service.config import ClientConfig, ConfigError
 
 _LISTEN_S: Final = 2.0
@@ -24,8 +31,9 @@ _WIDE: Final = 200
 
 
 def doctor(args: argparse.Namespace) -> int:
-    """Check connection, streams, compiled kernels, processor and installed extras."""
-    checks = [*_check_connection(args), check_kernels(), check_processor(), check_engine(), *check_extras()]
+    """Check connection, streams, compiled kernels, processor, cameras and installed extras."""
+    checks = [*_check_connection(args), check_kernels(), check_processor(), check_engine(), check_cameras()]
+    checks += check_extras()
     ok = not any(check.level == "bad" for check in checks)
     if args.json:
         print(json.dumps({"ok": ok, "checks": [check._asdict() for check in checks]}))

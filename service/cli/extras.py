@@ -13,7 +13,9 @@ EXTRAS: Final[dict[str, tuple[str, ...]]] = {
     "experiments": ("matplotlib", "scipy", "torch"),
     "bench": ("dv_processing", "faery", "loguru", "snntorch", "tonic", "torch"),
     "carla": ("carla",),
+    "camera": ("dv_processing", "neuromorphic_drivers"),
     "metrics": ("prometheus_client",),
+    "foxglove": ("foxglove",),
     "ros2": ("xxhash",),
 }
 """Modules that an extra installs itself; some extras also include others, see `_DEPENDS` and pyproject.toml."""
@@ -23,6 +25,7 @@ _DEPENDS: Final[dict[str, tuple[str, ...]]] = {
     "experiments": ("serve", "recordings"),
     "bench": ("serve",),
     "carla": ("recordings",),
+    "camera": ("recordings",),
     "ros2": ("recordings",),
 }
 

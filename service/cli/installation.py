@@ -6,6 +6,7 @@ import platform
 from pathlib import Path
 from typing import Final, Literal, NamedTuple
 
+from neurove_core.live.usb import DEVICES, NODES, usb_cameras
 from neurove_service.cli.extras import EXTRAS, absent
 
 CPU_FLAGS: Final = {
@@ -91,6 +92,23 @@ def check_engine() -> Check:
     if ArrayRunner(weights).is_compiled:
         return Check("fast path", f"sparse {precision}; {int8}", "ok")
     return Check("fast path", f"dense {precision}: the sparse form does not work here", "bad", "see the warning above")
+
+
+def check_cameras(devices: Path = DEVICES, nodes: Path = NODES) -> Check:
+    """Whether this user may use the event cameras on USB.
+
+    Args:
+        devices: folder in which Linux lists the USB devices.
+        nodes: folder of the files by which programs use them.
+    """
+    found = usb_cameras(devices, nodes)
+    if not found:
+        state = "none on USB" if found is not None else "none: this machine has no USB bus"
+        return Check("cameras", state, "info")
+    state = ", ".join(f"{one.vendor}:{one.product} ({one.about})" for one in found)
+    if not all(one.accessible for one in found):
+        return Check("cameras", f"no permission: {state}", "bad", "`neurove cameras` prints the line of udev to add")
+    return Check("cameras", state, "ok")
 
 
 def check_extras() -> list[Check]:

@@ -3,9 +3,9 @@
 import argparse
 import sys
 
-from neurove_service.cli.arguments import add_client_flags, client_config, command
+from neurove_service.cli.arguments import add_client_flags, address, client_config, command
 from neurove_service.cli.waiting import Wait, add_wait
-from neurove_service.endpoints import check_address, is_loopback, split_address
+from neurove_service.endpoints import is_loopback, split_address
 from neurove_service.lifecycle import stop_on_signals
 
 DEFAULT_ADDRESS = "127.0.0.1:9465"
@@ -41,18 +41,11 @@ def metrics(args: argparse.Namespace) -> int:
     return 0
 
 
-def _address(text: str) -> str:
-    try:
-        return check_address(text)
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from None
-
-
 def add_metrics(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `neurove metrics`."""
     add_client_flags(command(parser, metrics, as_json=False))
     add_wait(parser)
     about = f"address of the HTTP server, with /metrics, /live, /ready and /health; default {DEFAULT_ADDRESS}"
-    parser.add_argument("--listen", type=_address, default=DEFAULT_ADDRESS, metavar="HOST:PORT", help=about)
+    parser.add_argument("--listen", type=address, default=DEFAULT_ADDRESS, metavar="HOST:PORT", help=about)
     about = "print the metrics once and exit; exit code 1 if no node answers, or one does not"
     parser.add_argument("--once", action="store_true", help=about)

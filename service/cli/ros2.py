@@ -7,7 +7,7 @@ import threading
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from neurove_protocol.errors import InvalidField
+from neurove_protocol.errors import EXIT_FAILURE, InvalidField
 from neurove_service.cli.arguments import (
     add_axes_flag,
     add_client_flags,
@@ -63,11 +63,14 @@ def ros2(args: argparse.Namespace) -> int:
         bridge = Bridge(link, transport, config.keys, parts, args.namespace, config.prefix, guard)
         gc.freeze()
         counts = bridge.run(stop, lambda: _say(cameras, args.namespace))
+        fault = link.fault if args.via == "rclpy" else ""
     if args.json:
         print(json.dumps({"streams": counts, "internal_errors": guard.counts}))
     else:
         print("\n".join(_line(stream, one) for stream, one in counts.items()))
-    return 1 if guard.counts else 0
+    if fault:
+        print(f"neurove: {fault}", file=sys.stderr)
+    return EXIT_FAILURE if guard.counts or fault else 0
 
 
 def _say(cameras: "list[CameraTopics]", namespace: str) -> None:
@@ -139,10 +142,13 @@ def _link(
     guard: "Guard",
 ) -> "Link":
     """The link to ROS."""
+    from neurove_service.ros2.rclpy_link import RclpyLink
     from neurove_service.ros2.zenoh_link import ZenohLink
     from neurove_service.transport import open_transport
 
     name = "bridge_" + "_".join(topics.stream for topics in cameras)
+    if args.via == "rclpy":
+        return RclpyLink(args.ros_python, args.domain, args.namespace, name[:64], stop)
     transport = open_transport(
         "client",
         connect=endpoints,
@@ -194,6 +200,10 @@ def add_ros2(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--namespace", default="/neurove", metavar="NAME", help=about)
     about = "ROS distribution of the robot; default kilted"
     parser.add_argument("--distro", choices=_DISTROS, default="kilted", help=about)
+    about = "way to ROS: zenoh (rmw_zenoh, no ROS here) or rclpy (any middleware, ROS is installed here); default zenoh"
+    parser.add_argument("--via", choices=("zenoh", "rclpy"), default="zenoh", help=about)
+    about = "with --via rclpy: Python that can import rclpy; default python3"
+    parser.add_argument("--ros-python", default="python3", metavar="PROGRAM", help=about)
     about = "endpoint of the router of ROS (rmw_zenohd); default: that of --connect"
     parser.add_argument("--ros-connect", metavar="ENDPOINT", help=about)
     add_client_flags(parser)

@@ -1,12 +1,13 @@
 """The commands that run something: demo, serve, drive; and config, which shows the settings of serve."""
 
 import argparse
+import contextlib
 import gc
 import json
 import math
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ from neurove_service.cli.arguments import (
 from neurove_service.cli.extras import one_thread
 from neurove_service.cli.parser import Parser
 from neurove_service.cli.waiting import Wait, add_wait
-from neurove_service.config import ServiceConfig, load
+from neurove_service.config import ClientConfig, ServiceConfig, load
 from neurove_service.lifecycle import stop_on_signals
 from neurove_service.limits import check_limits
 
@@ -69,47 +70,104 @@ def serve(args: argparse.Namespace) -> int:
 
 
 def drive(args: argparse.Namespace) -> int:
-    """Publish a recording or a synthetic source as one stream; publish a packet log as it was recorded."""
+    """Publish a recording, a synthetic source, a camera or a network stream as one stream; see deploy/cameras.md."""
     from neurove_core.io.axes import with_axes
     from neurove_core.io.calibration import lens_of
-    from neurove_core.sources import open_source
-    from neurove_service.clients import ask
-    from neurove_service.clients.pace import BEHIND_S
+    from neurove_core.sources import is_live, open_source
 
     stop = stop_on_signals(with_parent=args.with_parent)
+    if is_live(args.source):
+        return _drive_live(args, stop)
     config = client_config(args)
     recording = with_axes(open_source(args.source, args.sensor, args.topic, args.time_unit), args.imu_axes)
     lens = lens_of(recording, args.calibration, args.height)
-    wait = Wait(config, args.wait, stop)
-    with wait.connect(config) as transport:
-        player = _player(args, recording, lens, transport, config.keys)
-        if args.wait and not _listened_to(player, wait, stop):
-            hint = "; if one runs, does it accept this certificate?" if config.zenoh_config else ""
-            raise ask.NoService(f"no service subscribed to stream {player.label} within {args.wait:g} s{hint}")
+    with _connected(args, config, stop, lambda to, keys: _player(args, recording, lens, to, keys)) as player:
         duration_s = math.inf if args.seconds is None else args.seconds
         how = {"speed": args.speed, "loop": args.loop, "duration_s": duration_s}
         sent = player.play(stop, **how, **({} if args.json else {"on_behind": _tell_behind}))
-    faults = recording.faults
+    return _report(args, player.label, recording, sent)
+
+
+def _drive_live(args: argparse.Namespace, stop: threading.Event) -> int:
+    """Publish a camera or a network stream, as its events come."""
+    from neurove_core.io.axes import rotation_of
+    from neurove_core.io.calibration import lens_of
+    from neurove_core.sources import open_live
+    from neurove_service.clients.live_driver import LiveDriver
+
+    for flag, value, usual, why in (
+        ("--speed", args.speed, 1.0, "a live source has its own pace"),
+        ("--loop", args.loop, False, "a live source cannot be played again"),
+        ("--topic", args.topic, None, "a live source has one event stream"),
+        ("--time-unit", args.time_unit, None, "the times of a live source are in us"),
+    ):
+        if value != usual:
+            raise InvalidField("drive", flag, value, why)
+    config = client_config(args)
+    source = open_live(args.source, args.sensor)
+    with contextlib.closing(source):
+        lens = lens_of(source, args.calibration, args.height)
+        rotation = rotation_of(args.imu_axes, source.name, source.streams)
+        stream = args.stream or _STREAM
+        with _connected(
+            args, config, stop, lambda to, keys: LiveDriver(source, stream, to, keys, lens, rotation)
+        ) as driver:
+            if not args.json:
+                print(f"neurove: driving {source.name} ({source.sensor}) as {stream}", file=sys.stderr, flush=True)
+            sent = driver.play(stop, duration_s=math.inf if args.seconds is None else args.seconds)
+    return _report(args, driver.label, source, sent)
+
+
+@contextlib.contextmanager
+def _connected(
+    args: argparse.Namespace, config: ClientConfig, stop: threading.Event, make: Callable[..., Any]
+) -> Iterator[Any]:
+    """A driver with a session, after a service has subscribed to its stream.
+
+    Args:
+        args: of the command.
+        config: where the service is.
+        stop: ends the wait.
+        make: the driver, from a session and the keys.
+    """
+    from neurove_service.clients import ask
+
+    wait = Wait(config, args.wait, stop)
+    with wait.connect(config) as transport:
+        driver = make(transport, config.keys)
+        if args.wait and not _listened_to(driver, wait, stop):
+            hint = "; if one runs, does it accept this certificate?" if config.zenoh_config else ""
+            raise ask.NoService(f"no service subscribed to stream {driver.label} within {args.wait:g} s{hint}")
+        yield driver
+
+
+def _report(args: argparse.Namespace, label: str, source: Any, sent: Any) -> int:
+    """Print what was published and what was lost; the exit code."""
+    from neurove_service.clients.pace import BEHIND_S
+
+    faults = source.faults
     broken = sent.broken.message if sent.broken else next(map(str, faults.unread), None)
     if args.json:
-        sensor = {"width": recording.sensor.width, "height": recording.sensor.height}
+        sensor = {"width": source.sensor.width, "height": source.sensor.height}
         found = [fault.as_json() for fault in faults.found]
         played = {
             "packets": sent.packets,
             "events": sent.events,
             "samples": sent.samples,
+            "gaps": sent.gaps,
             "broken": broken,
             "faults": found,
         }
         print(json.dumps({"sensor": sensor, **played, "behind_s": round(sent.behind_s, 3)}))
     else:
-        about = f"{recording.name} ({recording.sensor})"
+        about = f"{source.name} ({source.sensor})"
         late = f", up to {sent.behind_s:.1f} s behind real time" if sent.behind_s > BEHIND_S else ""
         inertial = f" and {sent.samples:,} IMU samples" if sent.samples else ""
-        print(f"{player.label}: {sent.packets:,} packets, {sent.events:,} events{inertial} of {about}{late}")
+        lost = f", {sent.gaps:,} gap{'s' if sent.gaps > 1 else ''} where events were lost" if sent.gaps else ""
+        print(f"{label}: {sent.packets:,} packets, {sent.events:,} events{inertial} of {about}{late}{lost}")
     if sent.broken:
         print(f"neurove: {broken}", file=sys.stderr)
-    tell_faults(recording)
+    tell_faults(source)
     return EXIT_FAILURE if broken else 0
 
 
@@ -153,17 +211,17 @@ def demo(args: argparse.Namespace) -> int:
     """Run driver, service and consumer on any source, then print a summary."""
     from neurove_core.io.calibration import with_lens
     from neurove_core.sim.truth import truth_of
-    from neurove_core.sources import open_source
+    from neurove_core.sources import is_live, open_source
     from neurove_service.cli.console import console
     from neurove_service.cli.demo import run
 
     stop = stop_on_signals()
     logs.configure("warning")
-    opened = open_source(args.source, args.sensor, args.topic, args.time_unit)
-    recording = with_lens(opened, args.calibration, args.height)
+    # the driver opens a live source: a camera can be opened once
+    opened = None if is_live(args.source) else open_source(args.source, args.sensor, args.topic, args.time_unit)
+    endless = opened is None or with_lens(opened, args.calibration, args.height).endless
     if args.screenshot:
         refuse_existing("demo", "--screenshot", args.screenshot, args.source, force=args.force)
-    endless = recording.endless
     shown = console(stderr=args.json)
     duration_s = args.seconds
     if duration_s is None:
@@ -175,7 +233,9 @@ def demo(args: argparse.Namespace) -> int:
         stop=stop,
         console=shown,
         screenshot=args.screenshot,
-        truth=None if args.loop else truth_of(opened),  # a repeated source has other times than its truth
+        truth=None
+        if args.loop or opened is None
+        else truth_of(opened),  # a repeated source has other times than its truth
     )
     print(json.dumps(summary) if args.json else _summary_text(summary))
     return EXIT_FAILURE if summary["broken"] else 0

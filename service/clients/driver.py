@@ -8,18 +8,13 @@ from typing import NamedTuple
 
 from neurove_core.io import BrokenRecording, Recording
 from neurove_core.io.imu_feed import ImuFeed, Turn
-from neurove_core.io.packets import Slice, slices
-from neurove_protocol import CameraInfo, EventPacket, Events, ImuPacket
-from neurove_protocol.camera import SCHEMA as CAMERA_SCHEMA
-from neurove_protocol.events import SCHEMA as EVENTS_SCHEMA
-from neurove_protocol.events import encode_packet
-from neurove_protocol.imu import SCHEMA as IMU_SCHEMA
-from neurove_protocol.imu import encode_imu
+from neurove_core.io.packets import slices
+from neurove_protocol import CameraInfo, Events
+from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.keys import Keys
 from neurove_service.clients.pace import Lag, OnBehind, ignore_behind
+from neurove_service.clients.stream_output import StreamOutput
 from neurove_service.transport import Transport
-
-POLL_S = 0.02
 
 
 class PlaySummary(NamedTuple):
@@ -29,9 +24,10 @@ class PlaySummary(NamedTuple):
     events: int
     first_us: int | None  # sensor clock; None before the first packet
     last_us: int | None  # of the newest event
-    broken: BrokenRecording | None  # where and why the recording ended early; None if it did not
+    broken: NeuroVEError | None  # where and why the source ended early; None if it did not
     samples: int = 0  # of the inertial unit
     behind_s: float = 0.0  # the latest packet was published that long after it was due
+    gaps: int = 0  # places where a live source lost events; each leaves one number out
 
 
 def repeated(recording: Recording, turns: list[Turn] | None = None) -> Iterator[Events]:
@@ -68,25 +64,15 @@ class Driver:
     def __init__(
         self, recording: Recording, stream: str, transport: Transport, keys: Keys, lens: CameraInfo | None = None
     ) -> None:
-        self._recording, self._stream, self._lens = recording, stream, lens
-        self._transport, self._keys = transport, keys
-        self._publisher = transport.publisher(keys.events(stream), EVENTS_SCHEMA)
+        self._recording = recording
         has_imu = "imu" in recording.streams
-        self._imu_publisher = transport.publisher(keys.imu(stream), IMU_SCHEMA) if has_imu else None
-        self._imu_seq = 0
-        self._announce_camera()
-
-    def _announce_camera(self) -> None:
-        camera = self._lens or self._recording.camera(self._stream)
-        if camera is not None:
-            payload = CameraInfo(**(camera.model_dump() | {"stream": self._stream})).encode()
-            self._transport.answer(self._keys.camera(self._stream), lambda _: payload)
-            self._transport.put(self._keys.camera(self._stream), payload, CAMERA_SCHEMA)
+        lens = lens or recording.camera(stream)
+        self._output = StreamOutput(stream, recording.sensor, transport, keys, lens, has_imu=has_imu)
 
     @property
     def label(self) -> str:
         """Name of the stream, for messages."""
-        return self._stream
+        return self._output.stream
 
     def wait_for_listener(self, timeout_s: float, stop: threading.Event) -> bool:
         """Wait until a service subscribes to the stream.
@@ -94,11 +80,7 @@ class Driver:
         Returns:
             whether one did before the timeout and the stop event.
         """
-        deadline = time.monotonic() + timeout_s
-        while not self._publisher.matching:
-            if time.monotonic() >= deadline or stop.wait(POLL_S):
-                return False
-        return True
+        return self._output.wait_for_listener(timeout_s, stop)
 
     def play(
         self,
@@ -130,8 +112,10 @@ class Driver:
                 elapsed_s = (piece.end_us - first_us - piece.skipped_us) / 1e6
                 if elapsed_s > duration_s or _stopped(stop, began + elapsed_s / speed):
                     break
-                samples = sent.samples + self._send_samples(inertial, piece.end_us)
-                self._send(sent.packets, piece)
+                samples = sent.samples
+                if self._output.has_imu:
+                    samples += self._output.send_samples(inertial.until(piece.end_us))
+                self._output.send(sent.packets, piece.t0_us, piece.events)
                 lag.sent(began + elapsed_s / speed, elapsed_s)
                 last_us = int(piece.events.t[-1]) if piece.events.n else sent.last_us
                 events = sent.events + piece.events.n
@@ -146,20 +130,6 @@ class Driver:
             return self._recording.chunks(), ImuFeed(self._recording)
         turns: list[Turn] = []
         return repeated(self._recording, turns), ImuFeed(self._recording, turns)
-
-    def _send_samples(self, inertial: ImuFeed, end_us: int) -> int:
-        """Publish the inertial samples before this time [us]; return their number."""
-        if self._imu_publisher is None:
-            return 0
-        samples = inertial.until(end_us)
-        if samples.n:
-            self._imu_publisher.put(encode_imu(ImuPacket(self._stream, self._imu_seq, samples)))
-            self._imu_seq += 1
-        return samples.n
-
-    def _send(self, seq: int, piece: Slice) -> None:
-        packet = EventPacket(self._stream, seq, self._recording.sensor, piece.t0_us, piece.events)
-        self._publisher.put(encode_packet(packet), sent_us=time.monotonic_ns() // 1000)
 
 
 def _stopped(stop: threading.Event, due: float) -> bool:

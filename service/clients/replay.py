@@ -17,8 +17,9 @@ from neurove_protocol.events import EventPacket, decode_packet
 from neurove_protocol.imu import SCHEMA as IMU_SCHEMA
 from neurove_protocol.imu import decode_imu
 from neurove_protocol.keys import Keys
-from neurove_service.clients.driver import POLL_S, PlaySummary
+from neurove_service.clients.driver import PlaySummary
 from neurove_service.clients.pace import Lag, OnBehind, ignore_behind
+from neurove_service.clients.stream_output import POLL_S
 from neurove_service.transport import Publisher, Transport
 
 log = logging.getLogger(__name__)

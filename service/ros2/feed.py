@@ -108,12 +108,13 @@ class Feed:
     def accept(self, received: Received) -> list[Packet]:
         """The packets that follow from a message; a message that is not valid is counted."""
         packets: list[Packet] = []
+        before = self.counts.messages
         try:
             packets.extend(self._packets_of(received))  # keeps what precedes an error
         except (NeuroVEError, BadMessage) as error:
             self.counts.refused_messages += 1
             self.refusal = str(error)
-            self._seq += received.type == types.EVENTS  # so that the service sees the gap
+            self._seq += self.counts.messages > before  # a gap for the service; without a number, the next one shows it
         return packets
 
     def _packets_of(self, received: Received) -> Iterator[Packet]:

@@ -117,10 +117,10 @@ class TestUnits:
 
     @pytest.mark.parametrize("path", UNITS, ids=lambda path: path.name)
     def test_the_secured_unit_reads_its_credential_without_a_warning(self, path, tmp_path):
-        drop_in = (DEPLOY / "tls" / path.with_suffix(".conf").name).read_text(encoding="utf-8")
-        credential = re.search(r"^LoadCredential=([\w.-]+):/etc/neurove/\1$", drop_in, re.MULTILINE)
+        drop_in = (DEPLOY / "tls" / path.with_suffix(".conf").name).read_text(encoding="utf-8").replace("%n", path.name)
+        credential = re.search(r"^LoadCredential=([\w.-]+)\.json5:/etc/neurove/\1(-%i)?\.json5$", drop_in, re.MULTILINE)
         assert credential is not None
-        assert f"/run/credentials/{path.name}/{credential[1]}" in drop_in
+        assert f"/run/credentials/{path.name}/{credential[1]}.json5" in drop_in
         assert verified(path.read_text(encoding="utf-8") + "\n" + drop_in, tmp_path / path.name) == ""
 
     def test_the_unit_is_watched_and_stops_in_time(self):

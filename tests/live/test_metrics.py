@@ -111,13 +111,6 @@ def test_a_node_that_waits_for_its_router_is_live_and_not_ready():
         assert 'neurove_node_up{node="edge"} 0.0' in get(address, "/metrics")[1]
 
 
-def test_an_address_in_use_stops_the_start_with_one_sentence(node):
-    _, address, _, _ = node
-    refused = neurove("serve", "--listen", free_endpoint(), "--metrics", address)
-    assert refused.returncode == 2
-    assert f"neurove: cannot listen at {address}: Address already in use\n" in refused.stderr
-
-
 def test_the_fleet_is_shown_once_or_served(node):
     endpoint, *_ = node
     once = neurove("metrics", "--once", "--connect", endpoint)

@@ -53,6 +53,33 @@ def test_a_cache_that_cannot_be_written_is_bad(monkeypatch):
     assert (found.level, "NUMBA_CACHE_DIR" in found.advice) == ("bad", True)
 
 
+class TestCameras:
+    @pytest.fixture
+    def devices(self, tmp_path):
+        """A folder as Linux lists a USB device with the numbers of a camera."""
+        device = tmp_path / "devices" / "1-2"
+        device.mkdir(parents=True)
+        for name, value in (("idVendor", "04b4"), ("idProduct", "00f5"), ("busnum", "1"), ("devnum", "4")):
+            (device / name).write_text(value + "\n")
+        (tmp_path / "nodes" / "001").mkdir(parents=True)
+        return tmp_path / "devices"
+
+    def test_no_camera_is_no_fault(self, tmp_path):
+        found = installation.check_cameras(tmp_path / "none", tmp_path)
+        assert (found.level, found.state) == ("info", "none: this machine has no USB bus")
+        assert installation.check_cameras(tmp_path, tmp_path).state == "none on USB"
+
+    def test_a_camera_without_permission_is_bad(self, devices):
+        found = installation.check_cameras(devices, devices.parent / "nodes")
+        assert (found.level, found.state) == ("bad", "no permission: 04b4:00f5 (Prophesee EVK3 or EVK4)")
+        assert "neurove cameras" in found.advice
+
+    def test_a_camera_that_may_be_used_is_ok(self, devices):
+        nodes = devices.parent / "nodes"
+        (nodes / "001" / "004").touch()
+        assert installation.check_cameras(devices, nodes).level == "ok"
+
+
 @pytest.mark.parametrize(
     ("text", "names"),
     [

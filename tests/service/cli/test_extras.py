@@ -13,7 +13,7 @@ from neurove_service.cli.commands import COMMANDS
 from neurove_service.cli.extras import EXTRAS, missing_extra
 
 ROOT = Path(__file__).parents[3]
-MODULE_OF = {"ruamel.yaml": "ruamel", "pillow": "PIL"}
+MODULE_OF = {"ruamel.yaml": "ruamel", "pillow": "PIL", "foxglove-sdk": "foxglove"}
 NOWHERE = "tcp/127.0.0.1:9"  # the discard port: nothing listens there
 
 BASE_INSTALL = f"""
@@ -48,6 +48,10 @@ def on_base_install(*arguments):
         (("reproduce", "firing"), "experiments"),
         (("bench", "window"), "bench"),
         (("info", "a.aedat4"), "recordings"),
+        (("watch", "--foxglove", "--connect", NOWHERE, "--wait", "0"), "foxglove"),
+        (("drive", "camera://"), "camera"),
+        (("drive", "camera://evk4"), "camera"),
+        (("drive", "camera://davis240"), "camera"),
         (("metrics", "--connect", NOWHERE, "--wait", "0"), "metrics"),
     ],
 )
@@ -73,6 +77,18 @@ def test_a_client_without_extras_reports_that_no_service_answers(command):
     ran = on_base_install(*command, "--connect", NOWHERE, "--wait", "0")
     assert ran.returncode == EXIT_FAILURE
     assert ran.stderr.startswith("neurove: no service: ")
+
+
+def test_a_network_stream_of_dv_needs_no_extra():
+    ran = on_base_install("drive", "dv://127.0.0.1:9", "--wait", "0")
+    assert (ran.returncode, ran.stdout) == (EXIT_FAILURE, "")
+    assert ran.stderr.startswith("neurove: dv://127.0.0.1:9: no dv network stream at 127.0.0.1:9: ")
+
+
+def test_cameras_without_its_libraries_names_the_extra():
+    ran = on_base_install("cameras")
+    assert (ran.returncode, ran.stderr) == (EXIT_FAILURE, "")
+    assert "neuromorphic-drivers is not installed: pip install 'neurove[camera]'" in ran.stdout
 
 
 def test_push_needs_no_extra(tmp_path):

@@ -1,12 +1,10 @@
 """AEDAT4 files of DV: compressed packets of events, inertial samples, frames and triggers."""
 
 import re
-import struct
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO, NamedTuple, Self, TypeVar
-from xml.etree import ElementTree
 
 import numpy as np
 
@@ -16,21 +14,18 @@ from neurove_core.io.errors import BrokenRecording, MissingGeometry, UnknownSour
 from neurove_core.io.faults import Faults, Reason, Tally
 from neurove_core.io.format import Format
 from neurove_core.io.formats.aedat.flatbuffer import MAX_PACKET_BYTES, BadPacket, events_of, frame_of, tables_of
+from neurove_core.io.formats.aedat.header import MAX_HEADER_BYTES, PACKET_HEADER, BadHeader, Stream, parse_header
 from neurove_core.io.recording import BLOCK_BYTES, EventsOnly, Frame, Triggers
-from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events, Sensor
 from neurove_protocol.imu import Imu
 
 _MAGIC = b"#!AER-DAT4.0\r\n"
-MAX_HEADER_BYTES = 16 << 20  # a header has about 3,000 bytes
-_PACKET_HEADER = struct.Struct("<ii")  # stream, size of the packet after this header [bytes]
 _PACKET_START = re.compile(rb"\x04\x22\x4d\x18|\x28\xb5\x2f\xfd|(?<=.{8})(?:EVTS|IMUS|TRIG|FRME)", re.DOTALL)
 """First bytes of compressed content, or the identifier at byte 8 of uncompressed content."""
 
 EXTERNAL, GENERATOR, READOUT, EXPOSURE = range(4)
 """Channels of the triggers: the camera's input, its generator, and the readout and exposure of a frame."""
 
-_KINDS = {"EVTS": "events", "IMUS": "imu", "FRME": "frames", "TRIG": "triggers"}  # type in the header -> stream
 _T = (0, "<i8")  # field of a time in the table of an inertial sample or a trigger
 _UNITS = tuple((field, "<f4") for field in range(2, 8))  # accelerometer x y z, gyroscope x y z
 _EDGES = {  # source in the file -> channel and level; a pulse is one rising edge
@@ -48,17 +43,8 @@ _EDGES = {  # source in the file -> channel and level; a pulse is one rising edg
 T = TypeVar("T")
 
 
-class _Stream(NamedTuple):
-    """A stream that the header names."""
-
-    number: int
-    kind: str  # as in `Recording.streams`
-    source: str  # the camera
-    sensor: Sensor | None  # None without a valid size
-
-
 class _Header(NamedTuple):
-    streams: list[_Stream]
+    streams: list[Stream]
     start: int  # byte of the first packet
     end: int  # byte after the last packet; -1 if the recorder did not write it
 
@@ -127,12 +113,12 @@ class Aedat4Recording(EventsOnly):
     def chunks(self) -> Iterator[Events]:
         """All events from the beginning; see `Recording`. Times are Unix time [us]. Other streams are skipped."""
         tally = self.faults.begin("events")
-        return cleaned(self._decoded("events", _events_of, tally), self.sensor, tally)
+        return cleaned(self._decoded("events", decode_events, tally), self.sensor, tally)
 
     def imu(self) -> Iterator[Imu]:
         """All samples in the optical frame; see `Recording` and `axes.OPTICAL`. DV writes deg/s and g."""
         tally = self.faults.begin("imu")
-        return ordered(self._decoded("imu", _imu_of, tally), tally)
+        return ordered(self._decoded("imu", decode_imu, tally), tally)
 
     def triggers(self) -> Iterator[Triggers]:
         """All edges; see `Recording`. DV writes edges of the camera's input (channel EXTERNAL) and also of the frames.
@@ -163,9 +149,9 @@ class Aedat4Recording(EventsOnly):
                 if packet.stream != wanted:
                     continue
                 where = f"byte {packet.start}"
-                file.seek(packet.start + _PACKET_HEADER.size)
+                file.seek(packet.start + PACKET_HEADER.size)
                 try:
-                    content = decode(file.read(packet.stop - packet.start - _PACKET_HEADER.size))
+                    content = decode(file.read(packet.stop - packet.start - PACKET_HEADER.size))
                 except BadPacket as why:
                     tally.add(Reason.DAMAGED, where, f"this packet cannot be read: {why}")
                 else:
@@ -189,12 +175,22 @@ class Aedat4Recording(EventsOnly):
             at = after.start
 
 
-def _events_of(packet: bytes) -> Events:
+def decode_events(packet: bytes) -> Events:
+    """Events of a packet, as they were recorded; see `checked.as_recorded`.
+
+    Raises:
+        BadPacket: the packet is corrupt.
+    """
     rows = events_of(packet)
     return as_recorded(rows["t"], rows["x"], rows["y"], rows["p"] > 0)
 
 
-def _imu_of(packet: bytes) -> Imu:
+def decode_imu(packet: bytes) -> Imu:
+    """Inertial samples of a packet in the optical frame; see `axes.OPTICAL`.
+
+    Raises:
+        BadPacket: the packet is corrupt.
+    """
     t, *numbers = tables_of(packet, b"IMUS", (_T, *_UNITS))
     values = np.stack(numbers, -1).astype(np.float64)
     return optical_samples(t, values[:, :3], values[:, 3:])
@@ -221,54 +217,20 @@ def _read_header(path: Path, file: BinaryIO) -> _Header:
     if len(header) < max(length, 4):
         raise BrokenRecording(path, f"byte {start + len(header)}", "the file ends within its header")
     try:
-        # a flatbuffer: a table of fields, preceded by their offsets, which are 0 for a field with its default
-        (table,) = struct.unpack_from("<I", header)
-        fields = table - struct.unpack_from("<i", header, table)[0]
-        known, _, _, position, text = struct.unpack_from("<5H", header, fields)
-        end = struct.unpack_from("<q", header, table + position)[0] if known >= 8 and position else -1
-        text += table
-        text += struct.unpack_from("<I", header, text)[0]
-        (characters,) = struct.unpack_from("<I", header, text)
-        xml = struct.unpack_from(f"{characters}s", header, text + 4)[0].decode()
-        return _Header(_streams(xml), start + length, end)
-    except (struct.error, UnicodeDecodeError, ElementTree.ParseError, OverflowError) as error:
+        streams, end = parse_header(header)
+    except BadHeader as error:
         raise BrokenRecording(path, f"byte {start}", f"the header cannot be read: {error}") from None
-
-
-def _streams(xml: str) -> list[_Stream]:
-    """The streams that the text of the header describes, by number.
-
-    Raises:
-        ElementTree.ParseError: it is not XML.
-    """
-    found = []
-    for node in ElementTree.fromstring(xml).iterfind(".//node[@name='outInfo']/node"):
-        number, kind = node.get("name", ""), _KINDS.get(_attribute(node, "typeIdentifier"))
-        if kind is None or not number.isdecimal():
-            continue
-        info = node.find("node[@name='info']")
-        try:
-            sensor = Sensor(int(_attribute(info, "sizeX")), int(_attribute(info, "sizeY")))
-        except (ValueError, InvalidField):
-            sensor = None
-        found.append(_Stream(int(number), kind, _attribute(info, "source"), sensor))
-    return sorted(found)
-
-
-def _attribute(node: ElementTree.Element | None, name: str) -> str:
-    """The text of an attribute of a node; empty without one."""
-    found = None if node is None else node.find(f"attr[@key='{name}']")
-    return "" if found is None or found.text is None else found.text
+    return _Header(streams, start + length, end)
 
 
 def _packet(file: BinaryIO, at: int, size: int) -> _Packet | None:
     """The packet that begins at byte `at`, or None if no packet that fits into the file of `size` bytes does."""
     file.seek(at)
-    header = file.read(_PACKET_HEADER.size)
-    if len(header) < _PACKET_HEADER.size:
+    header = file.read(PACKET_HEADER.size)
+    if len(header) < PACKET_HEADER.size:
         return None
-    stream, length = _PACKET_HEADER.unpack(header)
-    stop = at + _PACKET_HEADER.size + length
+    stream, length = PACKET_HEADER.unpack(header)
+    stop = at + PACKET_HEADER.size + length
     return _Packet(at, stream, stop) if 0 <= length <= MAX_PACKET_BYTES and stop <= size else None
 
 
@@ -279,7 +241,7 @@ def _next_packet(file: BinaryIO, at: int, size: int, streams: set[int]) -> _Pack
         block = file.read(BLOCK_BYTES)
         for match in _PACKET_START.finditer(block):
             content = match.start() - (8 if match.group()[:1].isalpha() else 0)
-            packet = _packet(file, at + content - _PACKET_HEADER.size, size) if content >= _PACKET_HEADER.size else None
+            packet = _packet(file, at + content - PACKET_HEADER.size, size) if content >= PACKET_HEADER.size else None
             if packet is not None and packet.stream in streams:
                 return packet
         if at + len(block) >= size:

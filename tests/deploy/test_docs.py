@@ -1,0 +1,87 @@
+"""The documentation site: no broken link, a complete navigation, a reference with what the docstrings say.
+
+tests/test_readme.py checks commands, links and language of its pages, as of every other page.
+"""
+
+import re
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "deploy" / "docs"
+NAVIGATION = re.findall(r": ([\w./-]+\.md)$", (DOCS / "mkdocs.yml").read_text(), re.MULTILINE)
+
+
+class Page(HTMLParser):
+    """The links and the text of a page."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.links, self.text = [], ""
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        given = dict(attributes)
+        self.links += [given[name] for name in ("href", "src") if given.get(name)]
+
+    def handle_data(self, data):
+        self.text += data
+
+
+def run_build(out):
+    command = [sys.executable, str(DOCS / "build.py"), str(out)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    pytest.importorskip("zensical", reason="zensical is not installed: pip install 'neurove[docs]'")
+    out = tmp_path_factory.mktemp("docs")
+    built = run_build(out)
+    assert built.returncode == 0, built.stdout + built.stderr
+    return out / "site"
+
+
+def html_of(site, page):
+    name = page.replace("README.md", "index.md") if page.endswith("README.md") else page
+    return (site / name).with_suffix(".html").read_text()
+
+
+def test_every_page_of_the_navigation_is_built_and_every_guide_is_in_it(site):
+    for page in NAVIGATION:
+        assert len(Page(html_of(site, page)).text) > 500, page
+    guides = {path.relative_to(ROOT).as_posix() for path in DOCS.glob("*.md")}
+    assert guides <= set(NAVIGATION)
+
+
+def test_links_and_pictures_of_the_built_pages_lead_to_files(site):
+    missing = set()
+    for page in NAVIGATION:
+        name = page.replace("README.md", "index.md")
+        for link in Page(html_of(site, page)).links:
+            target = link.partition("#")[0].partition("?")[0]
+            if target and not re.match(r"[a-z]+:|//|/", target):
+                path = (site / name).parent / target
+                if not (path.is_file() or (path / "index.html").is_file()):
+                    missing.add((page, link))
+    assert missing == set()
+
+
+def test_the_reference_has_shapes_units_and_errors_from_the_docstrings(site):
+    estimator = Page(html_of(site, "reference/neurove_core.md")).text
+    for said in ("class Estimator(", "Estimator.push", "Args", "Raises", "InvalidField"):
+        assert said in estimator
+    messages = Page(html_of(site, "reference/neurove_protocol.md")).text
+    for said in ("linear [m/s], then angular [rad/s]", "upper bounds of the buckets", "height of the camera above the"):
+        assert said.lower() in messages.lower()
+    assert "object at 0x" not in estimator + messages
+
+
+@pytest.mark.parametrize("symptom", ["Speed is 0", "Flagged uncertain", "Packets are lost", "wrong scale"])
+def test_the_page_of_symptoms_has_a_section_for(symptom):
+    headings = re.findall(r"^## (.*)$", (DOCS / "troubleshooting.md").read_text(), re.MULTILINE)
+    assert any(symptom.lower() in heading.lower() for heading in headings)
