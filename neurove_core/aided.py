@@ -28,6 +28,7 @@ def aided(
             estimate.low_activity,
             refined=estimate.source == "refined",
             scale_m=height_m or 1.0,
+            scaled=height_m is not None,
         ),
     )
     disagrees = state.disagrees

@@ -223,10 +223,10 @@ class Estimator:
         about = window.start_us, self.config.window.duration_us, window.sample, state.view, estimate.twists.mean(axis=0)
         found = refine(Given(*about, estimate.covariance, estimate.low_activity, state.filter, height_m))
         if found.outcome == "accepted":
-            twists, covariance = _with_rate(estimate.twists, estimate.covariance, found.rate)
+            twists, covariance = _with_rate(estimate.twists, estimate.covariance, found.rate, found.change_rad_s)
             uncertain = self.is_uncertain(twists, covariance)
             estimate = estimate._replace(twists=twists, covariance=covariance, source="refined", uncertain=uncertain)
-        return _over_ground(self, window, estimate, state._replace(filter=found.filter))
+        return _over_ground(self, window, estimate, state._replace(filter=found.filter), found.sigma_rad_s)
 
     def is_uncertain(self, twists: NDArray[np.float64], covariance: NDArray[np.float64]) -> bool:
         """Whether sigma exceeds the bounds, see `Uncertainty.is_uncertain`; False for a model without uncertainty."""
@@ -331,11 +331,14 @@ def _begin(push: Push, pushed: Pushed) -> _Progress:
 
 
 def _with_rate(
-    twists: NDArray[np.float64], covariance: NDArray[np.float64], rate: Rate
+    twists: NDArray[np.float64], covariance: NDArray[np.float64], rate: Rate, change_rad_s: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Twists (n, 6) and covariance (6, 6) with another angular part, which does not correlate with the linear part."""
+    """Twists (n, 6) and covariance (6, 6) with another angular part, which does not correlate with the linear part.
+
+    The angular part changes by `change_rad_s` (3,) within the window.
+    """
     twists, joint = twists.copy(), np.zeros((6, 6))
-    twists[:, 3:] = rate.w_rad_s
+    twists[:, 3:] = rate.w_rad_s + np.outer((np.arange(len(twists)) + 0.5) / len(twists) - 0.5, change_rad_s)
     joint[:3, :3], joint[3:, 3:] = covariance[:3, :3], (rate.covariance + rate.covariance.T) / 2
     return twists, joint
 
@@ -355,20 +358,37 @@ def _is_finite(estimator: Estimator, state: StreamState) -> bool:
 
 
 def _over_ground(
-    estimator: Estimator, window: Window, estimate: WindowEstimate, state: StreamState
-) -> tuple[WindowEstimate, StreamState]:
-    """The estimate with the motion over level ground, where it is accepted; see `refine.ground`."""
+    estimator: Estimator,
+    window: Window,
+    estimate: WindowEstimate,
+    state: StreamState,
+    sigma_rad_s: NDArray[np.float64] | None,
+) -> Refined:
+    """The estimate with the motion over level ground, where it is accepted; see `refine.ground`.
+
+    Args:
+        estimator: made the estimate.
+        window: with the sample of its events.
+        estimate: so far.
+        state: of the stream.
+        sigma_rad_s: (3,) of its angular part; None for that of its covariance.
+    """
     if window.sample is None or state.view is None or state.camera is None or estimate.covariance is None:
         return estimate, state
     if state.camera.height_m is None:
         return estimate, state  # nothing says that the camera looks at level ground
     events = ground.events_of(state.view, window.sample, window.start_us)
-    known = estimate.twists.mean(axis=0), np.sqrt(np.diagonal(estimate.covariance)[3:])
-    answer = ground.refine(events, estimate.start_us, estimate.end_us, state.camera, *known, state.ground)
+    sigma = np.sqrt(np.diagonal(estimate.covariance)[3:]) if sigma_rad_s is None else sigma_rad_s
+    known = estimate.twists.mean(axis=0), sigma, state.ground
+    measured = estimate.covariance[3:, 3:] if estimate.source == "refined" else None
+    answer = ground.refine(events, estimate.start_us, estimate.end_us, state.camera, *known, measured)
     state = state._replace(ground=answer.state)
-    if answer.outcome != "accepted" or answer.motion is None:
+    if answer.outcome not in ("accepted", "turning") or answer.motion is None:
         return estimate, state
     twists, covariance = np.tile(answer.motion.twist, (len(estimate.twists), 1)), answer.motion.covariance
+    if answer.outcome == "turning":
+        rate = Rate(answer.motion.twist[3:], covariance[3:, 3:])
+        twists, covariance = _with_rate(estimate.twists, estimate.covariance, rate, np.zeros(3))
     uncertain = estimator.is_uncertain(twists, covariance)
     return estimate._replace(twists=twists, covariance=covariance, source="refined", uncertain=uncertain), state
 

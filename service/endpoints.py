@@ -28,12 +28,16 @@ def check_endpoint(text: str) -> str:
         if not address:
             raise ValueError(f"{text!r} has no path: give unixsock-stream/PATH")
         return text
+    _check_host_port(text, address, f"has no HOST:PORT after {protocol}/: give an endpoint {_EXAMPLE}")
+    return text
+
+
+def _check_host_port(text: str, address: str, why_not: str) -> None:
     found = _HOST_PORT.fullmatch(address)
     if not found:
-        raise ValueError(f"{text!r} has no HOST:PORT after {protocol}/: give an endpoint {_EXAMPLE}")
+        raise ValueError(f"{text!r} {why_not}")
     if int(found[1]) > 65535:
         raise ValueError(f"{text!r}: port {found[1]}: a port is at most 65535")
-    return text
 
 
 def _wrong_protocol(text: str) -> str:
@@ -58,11 +62,7 @@ def check_address(text: str) -> str:
     ('127.0.0.1:9464', '0.0.0.0:9464', '[::1]:0')
     """
     address = f"{LOOPBACK}:{text.removeprefix(':')}" if text.removeprefix(":").isdecimal() else text
-    found = _HOST_PORT.fullmatch(address)
-    if not found:
-        raise ValueError(f"{text!r} is no address: give HOST:PORT, such as {LOOPBACK}:9464")
-    if int(found[1]) > 65535:
-        raise ValueError(f"{text!r}: port {found[1]}: a port is at most 65535")
+    _check_host_port(text, address, f"is no address: give HOST:PORT, such as {LOOPBACK}:9464")
     return address
 
 

@@ -31,13 +31,18 @@ settings.register_profile("ci", max_examples=50, deadline=None, derandomize=True
 settings.load_profile("ci" if os.environ.get("CI") else "dev")
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def logging_as_before():
-    root = logging.getLogger()
-    handlers, level = root.handlers[:], root.level
+    """Each test begins with the logging of pytest, whatever a command in a test or in a wider fixture configured."""
+    _forget_logging()
     yield
-    root.handlers[:] = handlers
-    root.setLevel(level)
+    _forget_logging()
+
+
+def _forget_logging():
+    root = logging.getLogger()
+    root.handlers[:] = [one for one in root.handlers if not type(one).__module__.startswith("neurove")]
+    root.setLevel(logging.WARNING)
     structlog.reset_defaults()
 
 

@@ -88,6 +88,7 @@ MAY_IMPORT = {
         "core:files core:geometry core:models logs guard lifecycle latency endpoints config transport streams models "
         "metrics"
     ),
+    "neurove_service.page": "logs config guard transport clients",
     "neurove_service": "",
     "neurove_service.cli": "*",
     "neurove_protocol": "",

@@ -1,4 +1,4 @@
-"""The bias of a gyroscope: learned while the unit does not move, and less certain from then on."""
+"""The bias of a gyroscope: learned at rest at once, and slowly in motion (see `moving`); less certain from then on."""
 
 from typing import Final, NamedTuple
 
@@ -24,15 +24,16 @@ class Bias(NamedTuple):
     mean_rad_s: NDArray[np.float64] = np.zeros(3)  # (3,); never changed in place
     variance: NDArray[np.float64] = np.full(3, UNKNOWN_RAD_S**2)  # (3,)
     noise_rad_s: float = NOISE_RAD_S
-    at_us: int | None = None  # sensor time of the newest rest; None before the first one
+    at_us: int | None = None  # sensor time of the variance; None if nothing was learned yet
+    rested: bool = False  # the unit has been at rest
 
     @property
     def known(self) -> bool:
-        """Whether the unit has been at rest."""
-        return self.at_us is not None
+        """Whether rest has shown the bias, or motion has halved its uncertainty on each axis."""
+        return self.rested or bool((self.variance < UNKNOWN_RAD_S**2 / 4).all())
 
     def variance_at(self, t_us: int) -> NDArray[np.float64]:
-        """Variance (3,) at a time [us]: it grows after a rest, up to that of an unknown bias."""
+        """Variance (3,) at a time [us]: it grows with time, up to that of an unknown bias."""
         if self.at_us is None:
             return self.variance
         grown = self.variance + DRIFT_RAD_S**2 * max(0, t_us - self.at_us) * 1e-6
@@ -51,8 +52,8 @@ def learned(bias: Bias, gyro_rad_s: NDArray[np.float64], samples: int, noise_rad
     """
     before = bias.variance_at(t_us)
     measured = noise_rad_s**2 / max(1, samples) + FLOOR_RAD_S**2
-    gain = before / (before + measured) if bias.known else np.ones(3)  # the first rest says all there is to know
+    gain = before / (before + measured) if bias.rested else np.ones(3)  # the first rest says all there is to know
     mean = bias.mean_rad_s + gain * (gyro_rad_s - bias.mean_rad_s)
-    variance = np.maximum((1 - gain) * before, FLOOR_RAD_S**2) if bias.known else np.full(3, measured)
-    noise = 0.9 * bias.noise_rad_s + 0.1 * noise_rad_s if bias.known else noise_rad_s
-    return Bias(mean, variance, noise, t_us)
+    variance = np.maximum((1 - gain) * before, FLOOR_RAD_S**2) if bias.rested else np.full(3, measured)
+    noise = 0.9 * bias.noise_rad_s + 0.1 * noise_rad_s if bias.rested else noise_rad_s
+    return Bias(mean, variance, noise, t_us, rested=True)

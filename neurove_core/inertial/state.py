@@ -9,9 +9,11 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.inertial import agreement, bias, buffer, gyro, rest
+from neurove_core.inertial import agreement, bias, buffer, gyro, moving, rest
 from neurove_core.inertial.agreement import Agreement, Track
 from neurove_core.inertial.bias import Bias
+from neurove_core.inertial.gyro import Rates
+from neurove_core.inertial.moving import Seen, Tilt
 from neurove_protocol.imu import Imu
 
 REST_M_S: Final = 0.2
@@ -29,6 +31,7 @@ class InertialState(NamedTuple):
 
     samples: Imu = Imu.empty()  # the newest ones
     bias: Bias = Bias()
+    tilt: Tilt = Tilt()
     track: Track = Track()
     agreement: Agreement = Agreement()
     doubts: int = 0  # judgements in a row that disagree
@@ -50,6 +53,7 @@ class Window(NamedTuple):
     low_activity: bool
     refined: bool
     scale_m: float = 1.0  # height of the camera that the linear part assumes or knows
+    scaled: bool = False  # it is known
 
 
 class Aided(NamedTuple):
@@ -73,8 +77,9 @@ def push(state: InertialState, more: Imu) -> tuple[InertialState, int]:
 def aid(state: InertialState, window: Window) -> tuple[Aided, InertialState]:
     """Use the samples at hand for a window; without them its estimate stands.
 
-    The angular part becomes the mean of the gyroscope over each bin without its bias. At rest the twist is zero. While
-    gyroscope and events disagree, the gyroscope is not used.
+    The angular part becomes the mean of the gyroscope over each bin without its bias. At rest the twist is zero. Rest
+    teaches the bias at once, and refined windows teach it slowly. While gyroscope and events disagree, the gyroscope is
+    not used, and a bias that only motion has taught is dropped.
 
     Args:
         state: with the samples up to the end of the window, as far as they have arrived.
@@ -89,13 +94,15 @@ def aid(state: InertialState, window: Window) -> tuple[Aided, InertialState]:
         return Aided(window.twists, window.covariance, used=False, resting=False), state
     still = rest.still(known, window.end_us)
     if still is not None and _seems_at_rest(window) and not state.disagrees:
-        mean = found.gyro_rad_s.mean(0) if state.bias.known else still.gyro_rad_s
-        samples = found.samples if state.bias.known else still.samples
+        mean = found.gyro_rad_s.mean(0) if state.bias.rested else still.gyro_rad_s
+        samples = found.samples if state.bias.rested else still.samples
         learned = bias.learned(state.bias, mean, samples, still.noise_rad_s, window.end_us)
-        state = state._replace(bias=learned, resting=True)
+        state = state._replace(bias=learned, tilt=Tilt(), resting=True)
         return _at_rest(window), state
     if state.disagrees:
+        state = state._replace(tilt=Tilt(), bias=state.bias if state.bias.rested else Bias())
         return Aided(window.twists, window.covariance, used=False, resting=False), state
+    state = _learned_in_motion(state, window, known, found)
     twists = window.twists.copy()
     twists[:, 3:] = found.gyro_rad_s - state.bias.mean_rad_s
     covariance = window.covariance
@@ -104,6 +111,24 @@ def aid(state: InertialState, window: Window) -> tuple[Aided, InertialState]:
         covariance[3:] = covariance[:, 3:] = 0.0
         covariance[range(3, 6), range(3, 6)] = found.variance + state.bias.variance_at(window.end_us)
     return Aided(twists, covariance, used=True, resting=False), state
+
+
+def _learned_in_motion(state: InertialState, window: Window, known: Imu, found: Rates) -> InertialState:
+    """The state with the bias after a window in which the unit moved."""
+    if window.covariance is None:
+        return state
+    first = int(known.t.searchsorted(window.start_us))
+    seen = Seen(
+        window.end_us,
+        window.end_us - window.start_us,
+        found.gyro_rad_s.mean(0),
+        known.accel_m_s2[first:].mean(0) if first < known.n else None,
+        window.twists[:, :3].mean(0) if window.scaled and not window.low_activity else None,
+        window.twists[:, 3:].mean(0) if window.refined else None,
+        np.diagonal(window.covariance)[3:],
+    )
+    now, tilt = moving.learned(state.bias, state.tilt, seen)
+    return state._replace(bias=now, tilt=tilt)
 
 
 def _seems_at_rest(window: Window) -> bool:

@@ -19,6 +19,11 @@ The refined motion is accepted if
 - the search ends at a maximum, and the result is more certain than the network;
 - the network sees a turn of STILL_RAD_S, or the alignment is better than without motion by MIN_SHARPER.
 Else the network's answer stands.
+
+Two things outweigh the network:
+- A motion that goes on: for MAX_AGAINST windows in a row, an answer that continues the windows before (MAX_OFF) is
+  accepted although the network contradicts it or sees the camera move fast.
+- A fast turn, see `fast`: it is looked for where the rules above fail as they do in fast turns.
 """
 
 from typing import Final, Literal, NamedTuple
@@ -28,7 +33,8 @@ from numpy.typing import NDArray
 
 from neurove_core.ingest.sample import Sample
 from neurove_core.refine.alignment import Grid, Rays
-from neurove_core.refine.search import Agreement, Found, Gaussian, agreement, measure, search
+from neurove_core.refine.fast import fast_turn
+from neurove_core.refine.search import Found, Gaussian, agreement, measure, search
 from neurove_core.refine.view import View
 
 Array = NDArray[np.float64]
@@ -45,6 +51,21 @@ Outcome = Literal[
     "no maximum",
     "still",
 ]
+
+_PERHAPS_FAST: Final = ("disagreeing", "out of range", "contradicted", "no maximum")
+"""A fast turn looks so to the search over the whole window."""
+
+SURELY_FAST_RAD_S: Final = 3.0
+"""After a faster turn, a fast one is looked for first."""
+
+MAX_AGAINST: Final = 3
+"""Windows in a row in which a motion that goes on outweighs a network that contradicts it, or sees a fast camera."""
+
+MAX_OFF: Final = 3.0
+"""A motion goes on if it is within so many sigmas of the one before."""
+
+MOVING_EVERY: Final = 4
+"""While the network sees the camera move fast, only each fourth window is searched for a fast turn."""
 
 MIN_EVENTS: Final = 500
 MIN_SPREAD: Final = 0.04
@@ -83,6 +104,11 @@ _TURN_NOISE: Final = 0.1  # growth of sigma of the angular velocity per window [
 _TURN_NOISE_SHARE: Final = 0.3  # the same, as a share of the angular velocity
 _SHIFT_NOISE: Final = 0.016  # growth of sigma of the translation over depth [1/s]
 _DISPERSION: Final = 2.0  # variance of the events' gradient over that of independent events
+_CHANGE_GAIN: Final = 0.8  # of the change within a window over that since the window before
+_CHANGE_ERROR: Final = 0.12  # error of pitch and yaw rate, as a share of the change of the rate since the last window
+_SHIFT_ERROR: Final = 0.7  # the same by the square of the translation over depth [s]: depths differ
+_ROLL_SCALE: Final = 0.75  # of the sigma of the roll rate, which no translation resembles
+_ROLL_SHARE: Final = 0.4  # of the other errors
 _LOST_SIGMA: Final = 0.5  # the filter begins again above this [rad/s]
 
 
@@ -99,6 +125,7 @@ class Filter(NamedTuple):
     motion: Array  # (6,) angular velocity [rad/s], and translation over depth [1/s]
     covariance: Array  # (6, 6)
     end_us: int  # end of its newest window
+    against: int = 0  # newest windows in a row that were accepted against the network
 
 
 class Given(NamedTuple):
@@ -118,9 +145,13 @@ class Given(NamedTuple):
 class Refined(NamedTuple):
     """The angular velocity of one window."""
 
-    rate: Rate
+    rate: Rate  # mean of the window
     outcome: Outcome
     filter: Filter | None  # for the next window
+    change_rad_s: Array = np.zeros(3)  # (3,) of the rate from the start of the window to its end
+    sigma_rad_s: Array | None = (
+        None  # (3,) of the rate, if the scene has one depth; None if the network's answer stands
+    )
 
 
 def refine(given: Given) -> Refined:
@@ -131,15 +162,47 @@ def refine(given: Given) -> Refined:
     rays = given.view.rays_of(given.sample, given.window_us)
     if given.low_activity or rays.x.size < MIN_EVENTS:
         return Refined(not_accepted, "few events", before)
-    speed, sigma = np.linalg.norm(given.twist[:3]), np.sqrt(np.trace(given.covariance[:3, :3]))
-    if speed > MAX_SPEED * given.height_m and speed > _CERTAIN * sigma:
-        return Refined(not_accepted, "moving", before)
     if spread(rays, given.view.grid) < MIN_SPREAD:
         return Refined(not_accepted, "narrow", before)
     try:
-        return _searched(given, known, before, not_accepted, rays)
+        return _slow_or_fast(given, known, before, not_accepted, rays)
     except np.linalg.LinAlgError:  # events that make no finite Hessian
         return Refined(not_accepted, "few events", None)
+
+
+def _slow_or_fast(given: Given, known: Rate, before: Filter | None, not_accepted: Rate, rays: Rays) -> Refined:
+    speed, sigma = np.linalg.norm(given.twist[:3]), np.sqrt(np.trace(given.covariance[:3, :3]))
+    moving = bool(speed > MAX_SPEED * given.height_m and speed > _CERTAIN * sigma)
+    fast = before is not None and float(np.linalg.norm(before.motion[:3])) >= SURELY_FAST_RAD_S
+    found = _turned_fast(given, known, before, rays) if fast else None
+    if found is not None:
+        return found
+    steady = before is not None and before.against < MAX_AGAINST
+    if moving and not steady:
+        found = Refined(not_accepted, "moving", before)
+        seldom = given.start_us // given.window_us % MOVING_EVERY == 0
+        return found if fast or not seldom else _turned_fast(given, known, before, rays) or found
+    found = _searched(given, known, before, not_accepted, rays)
+    if found.outcome == "accepted" and found.filter is not None:
+        against = moving or _contradicted(found.rate.w_rad_s, known)
+        found = found._replace(filter=found.filter._replace(against=before.against + 1 if before and against else 0))
+    if found.outcome in _PERHAPS_FAST and not fast:
+        return _turned_fast(given, known, before, rays) or found
+    return found
+
+
+def _turned_fast(given: Given, known: Rate, before: Filter | None, rays: Rays) -> Refined | None:
+    """A fast turn; None if there is none."""
+    seconds = given.window_us / 1e6
+    guesses = [known.w_rad_s] if before is None else [known.w_rad_s, before.motion[:3]]
+    turn, _ = fast_turn(rays, given.view.grid, seconds, guesses)
+    if turn is None:
+        return None
+    motion, covariance = np.append(turn.newest_rad_s, np.zeros(3)), np.eye(6) * _SHIFT_SIGMA**2
+    covariance[:3, :3] = turn.covariance
+    filtered = Filter(motion, covariance, given.start_us + given.window_us)
+    sigma = np.sqrt(np.diagonal(turn.covariance))
+    return Refined(Rate(turn.w_rad_s, turn.covariance), "accepted", filtered, turn.change_rad_s, sigma)
 
 
 def _searched(given: Given, known: Rate, before: Filter | None, not_accepted: Rate, rays: Rays) -> Refined:
@@ -150,11 +213,30 @@ def _searched(given: Given, known: Rate, before: Filter | None, not_accepted: Ra
     if not np.linalg.eigvalsh(posterior)[0] > 0:
         return Refined(not_accepted, "no maximum", before)
     covariance = np.asarray(np.linalg.inv(posterior) / seconds**2, np.float64)
-    outcome = _outcome(found, agreement(found), rays, known, covariance, seconds)
+    steady = before is not None and _goes_on(found.motion / seconds, covariance, before)
+    outcome = _outcome(found, rays, known, covariance, seconds, steady=steady)
     if outcome != "accepted":
         return Refined(not_accepted, outcome, before)
     motion, end_us = found.motion / seconds, given.start_us + given.window_us
-    return Refined(Rate(motion[:3], covariance[:3, :3]), outcome, Filter(motion, covariance, end_us))
+    change = np.zeros(3) if before is None else _CHANGE_GAIN * (motion[:3] - before.motion[:3])
+    rate = Rate(motion[:3], _honest(motion, covariance, before))
+    return Refined(rate, outcome, Filter(motion, covariance, end_us), change, np.sqrt(np.diagonal(covariance)[:3]))
+
+
+def _honest(motion: Array, covariance: Array, before: Filter | None) -> Array:
+    """Covariance (3, 3) of the angular velocity with the errors that the model of the search does not have.
+
+    Args:
+        motion: (6,) angular velocity, and translation over depth.
+        covariance: (6, 6) of it, if the rate is constant in the window and the scene has one depth.
+        before: the filter, if it runs.
+    """
+    size = float(np.linalg.norm(motion[:3]))
+    usual = _TURN_NOISE + _TURN_NOISE_SHARE * size
+    change = usual if before is None else float(np.linalg.norm(motion[:3] - before.motion[:3]))
+    more = (_CHANGE_ERROR * change) ** 2 + (_SHIFT_ERROR * float(motion[3:] @ motion[3:])) ** 2
+    scale = np.array([1.0, 1.0, _ROLL_SCALE])
+    return covariance[:3, :3] * np.outer(scale, scale) + np.diag(more * np.array([1.0, 1.0, _ROLL_SHARE**2]))
 
 
 def spread(rays: Rays, grid: Grid) -> float:
@@ -180,7 +262,7 @@ def _predicted(before: Filter | None, start_us: int, window_us: int) -> Filter |
     covariance = before.covariance * np.outer(kept, kept) + np.diag(growth)
     if turn * np.sqrt(windows) > max(_LOST_SIGMA, 2 * turn):
         return None
-    return Filter(before.motion * kept, covariance, start_us)
+    return Filter(before.motion * kept, covariance, start_us, before.against)
 
 
 def _prior(known: Rate, before: Filter | None, seconds: float) -> Gaussian:
@@ -202,18 +284,30 @@ def _guesses(known: Rate, before: Filter | None, seconds: float) -> list[Array]:
     return guesses if before is None else [*guesses, before.motion * seconds]
 
 
-def _outcome(found: Found, parts: Agreement, rays: Rays, known: Rate, covariance: Array, seconds: float) -> Outcome:
+def _contradicted(w_rad_s: Array, known: Rate) -> bool:
+    off = w_rad_s - known.w_rad_s
+    return float(off @ np.linalg.solve(known.covariance, off)) > MAX_SIGMAS**2
+
+
+def _goes_on(motion: Array, covariance: Array, before: Filter) -> bool:
+    """Whether a motion continues that of the windows before, which is known well enough to outweigh the network."""
+    off = motion - before.motion
+    likely = float(off[:3] @ np.linalg.solve((covariance + before.covariance)[:3, :3], off[:3])) <= MAX_OFF**2
+    return likely and before.against < MAX_AGAINST
+
+
+def _outcome(found: Found, rays: Rays, known: Rate, covariance: Array, seconds: float, *, steady: bool) -> Outcome:
+    parts = agreement(found)
     turn, shift = float(np.linalg.norm(found.motion[:3])), float(np.linalg.norm(found.motion[3:]))
     inside = float(found.tiles.events.sum()) / rays.x.size
     if turn > MAX_TURN_RAD or shift > MAX_SHIFT or inside < MIN_INSIDE:
         return "out of range"
     if parts.apart > MAX_APART * parts.noise or parts.sharp < MIN_SHARP:
         return "disagreeing"
-    off = found.motion[:3] / seconds - known.w_rad_s
-    if float(off @ np.linalg.solve(known.covariance, off)) > MAX_SIGMAS**2:
-        return "contradicted"
     if np.trace(covariance[:3, :3]) > np.trace(known.covariance):
         return "no gain"
+    if not steady and _contradicted(found.motion[:3] / seconds, known):
+        return "contradicted"
     if float(np.linalg.norm(known.w_rad_s)) >= STILL_RAD_S:
         return "accepted"
     without = float(measure(rays, found.grid, np.zeros(6)).value.sum())

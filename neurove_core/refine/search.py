@@ -47,7 +47,7 @@ class Found(NamedTuple):
     grid: Grid
 
 
-def search(rays: Rays, grid: Grid, prior: Gaussian, guesses: Sequence[Array]) -> Found:
+def search(rays: Rays, grid: Grid, prior: Gaussian, guesses: Sequence[Array], levels: Sequence[int] = LEVELS) -> Found:
     """The most probable motion near some guesses.
 
     Args:
@@ -55,9 +55,10 @@ def search(rays: Rays, grid: Grid, prior: Gaussian, guesses: Sequence[Array]) ->
         grid: the finest image.
         prior: what is known of the motion before.
         guesses: motions (6,) over the window.
+        levels: coarse to fine, see LEVELS.
     """
     motions, found = list(guesses), list[Found]()
-    for level in LEVELS:
+    for level in levels:
         some = Rays(*(np.ascontiguousarray(column[::level]) for column in rays)) if level > 1 else rays
         view = coarser(grid, level)
         scale = _scale(measure(some, view, motions[0]))
@@ -66,7 +67,7 @@ def search(rays: Rays, grid: Grid, prior: Gaussian, guesses: Sequence[Array]) ->
         motions = [found[0].motion]
         for one in found[1:]:
             apart = min(float(np.linalg.norm(one.motion[:3] - motion[:3])) for motion in motions)
-            if len(motions) < _KEPT and level == LEVELS[0] and apart * view.focal > _APART_CELLS:
+            if len(motions) < _KEPT and level == levels[0] and apart * view.focal > _APART_CELLS:
                 motions.append(one.motion)
     return found[0]
 

@@ -7,8 +7,9 @@ intervals of LEVEL contain that share of the errors. Each sequence is evaluated 
 (cross-conformal prediction, Vovk 2015).
 
 There are three sets of sequences: sequences like those of training, drives at full speed, and hard sequences without
-ground texture, dark or noisy. The model sees each sequence four times: unchanged, mirrored with gaps in the events,
-with few events, and with many random events. It always starts from the zero state.
+ground texture, dark or noisy. The model sees each sequence five times: unchanged, mirrored with gaps in the events,
+with few events, with many random events, and with the noise of a stationary camera instead of its events. It always
+starts from the zero state.
 """
 
 import copy
@@ -32,7 +33,7 @@ from neurove_core.models.uncertainty import LEVEL, LEVELS, Uncertainty, half_wid
 from neurove_core.networks.encoding import to_spikes
 from neurove_core.networks.neurove import NetworkState, NeuroVE
 from neurove_core.timescales import Answer, Longer, chosen, followed, jobs, slowed
-from neurove_core.training.batches import mirrored, with_gain, with_noise
+from neurove_core.training.batches import mirrored, stationary, with_gain, with_noise
 from neurove_core.training.config import DataConfig, TrainingConfig
 from neurove_core.training.data import Cache, Sequences
 from neurove_core.training.loop import commit
@@ -43,7 +44,7 @@ SEQUENCES: Final = 96
 UNCERTAIN_ABOVE: Final = 0.3
 """Relative bound of sigma for the flag `uncertain` (decision 48); the absolute bounds are optional (decision 91)."""
 
-VARIANTS: Final = ("unchanged", "gaps", "few events", "noise")
+VARIANTS: Final = ("unchanged", "gaps", "few events", "noise", "stationary")
 """Variants of each sequence."""
 
 _SECONDS: Final = 3.0  # many short sequences say more than a few long ones, because errors persist within a sequence
@@ -55,6 +56,7 @@ _PROVENANCE_CHARS: Final = 1000
 _PENALTY: Final = 0.003  # on the weights of the spread; its inputs have variance 1 on average
 _NEWTON_STEPS: Final = 50
 _CLIPPED: Final = 3.0  # limit of an error in the correlation, in sigma, so that one bad sequence does not dominate
+_STILL_NOISE: Final = (1e-5, 0.3)  # mean events per cell and bin of a stationary camera
 _SHRUNK: Final = 0.02  # shrinkage towards no correlation; it makes the matrix positive definite
 
 Array = NDArray[np.float64]
@@ -289,7 +291,8 @@ def variants_of(
     few, many = counts.copy(order="C"), counts.copy(order="C")
     few[from_here:] = with_gain(rng, few[from_here:], float(np.exp(rng.uniform(np.log(0.01), np.log(0.5)))))
     many[from_here:] = with_noise(rng, many[from_here:], float(np.exp(rng.uniform(np.log(0.01), np.log(0.4)))))
-    return [(counts, twists), (gaps, turned), (few, twists), (many, twists)]
+    noise = stationary(rng, counts.shape, float(np.exp(rng.uniform(*np.log(_STILL_NOISE)))))
+    return [(counts, twists), (gaps, turned), (few, twists), (many, twists), (noise, np.zeros_like(twists))]
 
 
 def laplace_scale(inputs: Array, size: Array, penalty: float) -> Array:

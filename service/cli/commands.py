@@ -36,6 +36,7 @@ COMMANDS = (
         "serve",
     ),
     Command("metrics", "Show the metrics of every node for Prometheus, on one address.", "metering", "metrics"),
+    Command("page", "Show streams, nodes and models live in a browser.", "paging", "page"),
     Command("models", "List the models of every node.", "asking"),
     Command("push", "Send a bundle to a running node.", "changing"),
     Command("activate", "Change the model of a running node.", "changing"),

@@ -52,6 +52,7 @@ def run(
     console: Console,
     screenshot: Path | None = None,
     truth: Truth | None = None,
+    page: Sequence[str] | None = None,
 ) -> dict[str, Any]:
     """Run driver, service and consumer on any source, and return a summary.
 
@@ -63,12 +64,13 @@ def run(
         console: receives the live table, if it is a terminal.
         screenshot: SVG file to write the last live table to.
         truth: of a simulated source; the table and the summary compare the estimates with it.
+        page: flags of `neurove page` to run as well; None: no page.
 
     Returns:
         counts, losses, latency and model, as `neurove demo --json` prints them.
 
     Raises:
-        DemoFailed: the service or the driver ended with an error, which it printed to stderr.
+        DemoFailed: the service, the driver or the page ended with an error, which it printed to stderr.
     """
     endpoint = f"tcp/127.0.0.1:{_free_port()}"
     config = ClientConfig(connect=(endpoint,))
@@ -76,7 +78,11 @@ def run(
     board = Board(truth=None if truth is None else comparison.truth_of)
     serve = ["serve", "--listen", endpoint, "--node", "demo", *serving]
     drive = ["drive", source, "--connect", endpoint, "--stream", STREAM, "--wait", "10", "--json", *playing]
-    with _process(*serve) as service, _session(config, service, stop, console) as transport:
+    with (
+        contextlib.nullcontext() if page is None else _page(endpoint, page, console),
+        _process(*serve) as service,
+        _session(config, service, stop, console) as transport,
+    ):
 
         def on_estimate(estimate: TwistEstimate) -> None:
             board.on_estimate(estimate)
@@ -92,6 +98,17 @@ def run(
             sent = _sent(driver, stop)
         status = _drained(transport, config, sent, stop)
     return _summary(source, sent, status, board) | {"error": comparison.error}
+
+
+@contextlib.contextmanager
+def _page(endpoint: str, flags: Sequence[str], console: Console) -> Iterator[None]:
+    """Run the page on a free port, and print its address before the table begins."""
+    with _process("page", "--connect", endpoint, "--listen", "0", *flags, stdout=subprocess.PIPE) as child:
+        address = child.stdout.readline().strip() if child.stdout else ""
+        if not address:
+            raise DemoFailed(f"the page ended with exit code {child.wait()}")
+        console.print(address, highlight=False, soft_wrap=True)
+        yield
 
 
 class Comparison:

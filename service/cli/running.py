@@ -236,6 +236,7 @@ def demo(args: argparse.Namespace) -> int:
         truth=None
         if args.loop or opened is None
         else truth_of(opened),  # a repeated source has other times than its truth
+        page=["--open"] * args.open if args.page or args.open else None,
     )
     print(json.dumps(summary) if args.json else _summary_text(summary))
     return EXIT_FAILURE if summary["broken"] else 0
@@ -308,6 +309,8 @@ def add_demo(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--model", metavar="BUNDLE", help=about)
     parser.add_argument("--screenshot", type=Path, metavar="FILE", help="write the last live table as SVG")
     add_force(parser, "FILE")
+    parser.add_argument("--page", action="store_true", help="show a live page for browsers too; needs the extra page")
+    parser.add_argument("--open", action="store_true", help="open that page in the browser of this machine")
 
 
 def add_serve(parser: argparse.ArgumentParser) -> None:

@@ -112,7 +112,7 @@ class HttpServer:
         for key, _ in self._selector.select(_POLL_S):
             if key.fileobj is self._listener:
                 self._accept()
-            elif isinstance(key.data, _Connection):
+            elif key.data in self._open:  # `_accept` may have dropped it
                 self._serve(key.data)
         now_s = time.monotonic()
         for connection in [one for one in self._open if one.deadline_s <= now_s]:

@@ -55,6 +55,7 @@ def test_every_page_of_the_navigation_is_built_and_every_guide_is_in_it(site):
     for page in NAVIGATION:
         assert len(Page(html_of(site, page)).text) > 500, page
     guides = {path.relative_to(ROOT).as_posix() for path in DOCS.glob("*.md")}
+    guides |= {path.relative_to(ROOT).as_posix() for path in (ROOT / "deploy").glob("*.md")}
     assert guides <= set(NAVIGATION)
 
 

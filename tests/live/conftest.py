@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
@@ -24,6 +25,29 @@ def free_endpoint():
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+
+
+def free_ports():
+    """Two ports, both free at once."""
+    with socket.socket() as one, socket.socket() as other:
+        one.bind(("127.0.0.1", 0))
+        other.bind(("127.0.0.1", 0))
+        return one.getsockname()[1], other.getsockname()[1]
+
+
+def start_router(endpoint):
+    script = Path(__file__).with_name("router.py")
+    return subprocess.Popen([sys.executable, str(script), endpoint])
+
+
+@pytest.fixture(scope="module")
+def router():
+    endpoint = free_endpoint()
+    process = start_router(endpoint)
+    with client(endpoint):
+        yield endpoint
+    process.kill()
+    process.wait()
 
 
 def wait_until(condition, timeout_s=120.0):

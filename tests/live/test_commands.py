@@ -8,8 +8,7 @@ import pytest
 from neurove_core.io.packets import slices
 from neurove_core.models import bundle
 from neurove_core.sources import open_source
-from tests.live.conftest import Process, client, free_endpoint, neurove, running, service, wait_until
-from tests.live.test_feed import start_router
+from tests.live.conftest import Process, client, free_endpoint, neurove, running, service, start_router, wait_until
 from tests.recordings import shared
 
 pytestmark = pytest.mark.live

@@ -4,8 +4,7 @@ import json
 
 import pytest
 
-from tests.live.conftest import Heard, free_endpoint, running, service, wait_until
-from tests.live.test_feed import start_router
+from tests.live.conftest import Heard, free_endpoint, running, service, start_router, wait_until
 
 pytestmark = pytest.mark.live
 

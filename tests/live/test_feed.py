@@ -1,10 +1,7 @@
 import random
 import signal
-import subprocess
-import sys
 import threading
 import time
-from pathlib import Path
 
 import pytest
 
@@ -26,6 +23,7 @@ from tests.live.conftest import (
     neurove,
     running,
     service,
+    start_router,
     wait_until,
 )
 
@@ -186,11 +184,6 @@ def load(config: ClientConfig, stop: threading.Event):
             source.put(payload)
             if stop.wait(0.002):
                 return
-
-
-def start_router(endpoint):
-    script = Path(__file__).with_name("router.py")
-    return subprocess.Popen([sys.executable, str(script), endpoint])
 
 
 def test_the_data_feed_resumes_after_the_router_was_killed_and_restarted():

@@ -16,10 +16,9 @@ from neurove_protocol import CameraInfo, Events
 from neurove_protocol.events import decode_packet
 from neurove_protocol.imu import decode_imu
 from neurove_protocol.keys import Keys
-from tests.live.conftest import client, free_endpoint, neurove, wait_until
+from tests.live.conftest import client, free_ports, neurove, wait_until
 from tests.live.dv_writer import DV_SENSOR, dv_events, dv_writer, store_of, tell
 from tests.live.fake_camera import EVK4, SERIAL, camera_events
-from tests.live.test_feed import start_router
 
 pytestmark = pytest.mark.live
 
@@ -32,22 +31,9 @@ distortion_coefficients: {{rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}}
 """
 
 
-@pytest.fixture(scope="module")
-def router():
-    endpoint = free_endpoint()
-    process = start_router(endpoint)
-    with client(endpoint):
-        yield endpoint
-    process.kill()
-    process.wait()
-
-
 @pytest.fixture
 def ports():
-    with socket.socket() as one, socket.socket() as other:
-        one.bind(("127.0.0.1", 0))
-        other.bind(("127.0.0.1", 0))
-        return one.getsockname()[1], other.getsockname()[1]
+    return free_ports()
 
 
 class Heard:

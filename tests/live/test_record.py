@@ -13,22 +13,11 @@ from neurove_protocol.imu import decode_imu
 from neurove_protocol.keys import Keys
 from neurove_service.clients.recorder import Recorder
 from tests.builders import make_packets
-from tests.live.conftest import client, free_endpoint, running, wait_until
-from tests.live.test_feed import start_router
+from tests.live.conftest import client, running, wait_until
 
 pytestmark = pytest.mark.live
 
 CAMERA = CameraInfo(stream="left", width=64, height=48, lens="pinhole", fx=50.0, fy=50.0, cx=31.5, cy=23.5)
-
-
-@pytest.fixture(scope="module")
-def router():
-    endpoint = free_endpoint()
-    process = start_router(endpoint)
-    with client(endpoint):
-        yield endpoint
-    process.kill()
-    process.wait()
 
 
 class Listener:

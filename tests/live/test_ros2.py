@@ -1,5 +1,6 @@
 """The bridge to ROS 2 over Zenoh: real processes, a real router, and a node of rmw_zenoh in plain zenoh-python."""
 
+import contextlib
 import json
 import threading
 from contextlib import ExitStack
@@ -7,13 +8,21 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
+from neurove_core.geometry.mounting import Mounting
+from neurove_core.io.formats.ros.types import HASHES
 from neurove_protocol import Sensor
 from neurove_service.clients import ask
 from neurove_service.config import ClientConfig
+from neurove_service.guard import Guard
+from neurove_service.ros2 import graph
+from neurove_service.ros2.graph import Entity, Topic
+from neurove_service.ros2.zenoh_link import ZenohLink
+from neurove_service.transport import open_transport
 from tests import ros_peer
 from tests.builders import make_events
 from tests.builders_evt import write_evt3
 from tests.live.conftest import START_S, Heard, Process, client, free_endpoint, is_alive, wait_until
+from tests.recordings import shared
 from tests.ros_peer import CAMERA, DIAGNOSTICS, EVENTS, IMU, LATCHED, TWIST, RosNode, header, make
 
 pytestmark = pytest.mark.live
@@ -232,6 +241,54 @@ def test_the_bridge_lives_through_faults_and_counts_them(place):
         counted = place.counted("faulty")
         assert (counted.width, counted.height) == (80, 60)
     assert bridge.end()[0] == 0
+
+
+def test_a_robot_with_humble_receives_twists_of_its_base(place, tmp_path):
+    mounting = Mounting.from_angles(pitch_deg=20, position_m=(0.5, 0.1, 0.8))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = mounting
+    (tmp_path / "camera.txt").write_text(str(pose.tolist()))
+    flags = ("--distro", "humble", "--frame", "base_link", "--extrinsics", str(tmp_path / "camera.txt"))
+    with RosNode(place.endpoint, hash_of=lambda _: "TypeHashNotSupported") as node, client(place.endpoint) as consumer:
+        bridge = place.bridge("humble", *flags, topic="/humble/events")
+        heard, twists = Heard(consumer, place.config), node.subscribe("/neurove/humble/velocity", TWIST)
+        publish = node.publisher("/humble/events", EVENTS)
+        wait_until(publish.matching)
+        camera = Camera(publish)
+        wait_until(lambda: camera.play(5) or (len(twists) >= 2 and len(heard.of("humble")) >= 2))
+    assert bridge.end()[0] == 0
+    (message, _), estimate = twists[1], heard.of("humble")[1]
+    twist = message.twist.twist
+    sent = [getattr(part, axis) for part in (twist.linear, twist.angular) for axis in "xyz"]
+    np.testing.assert_allclose(sent, mounting.adjoint @ estimate.twist, atol=1e-12)
+    assert message.header.frame_id == "base_link"
+
+
+def test_the_recorded_node_of_rmw_zenoh_is_heard_as_a_peer(place):
+    """Its tokens and messages, byte for byte: each arrives with its type and the identity of its publisher."""
+    recorded = json.loads(shared("ros2/rmw_zenoh_kilted.json").read_text())
+    tokens = [token for _, token in recorded["tokens"] if "/MP/" in token]
+    entities = {graph.gid_of(token): Entity.of_token(token) for token in tokens}
+    entities = {gid: entity for gid, entity in entities.items() if entity.type in HASHES}
+    samples = [sample for sample in recorded["samples"] if graph.type_of(sample["key"]) in HASHES]
+    own = open_transport("client", connect=(place.endpoint,), patience_s=START_S, timestamps=True)
+    link, heard = ZenohLink(own, 0, "/neurove", "listener", "kilted", Guard()), []
+    with contextlib.closing(link), client(place.endpoint) as peer:
+        for entity in entities.values():
+            link.subscribe(Topic(entity.topic, entity.type), entity.qos, heard.append)
+        for token in tokens:
+            peer.token(token)
+        kept = [peer.session.declare_publisher(sample["key"]) for sample in samples]
+        wait_until(lambda: all(getattr(one.matching_status, "matching", False) for one in kept))
+        for sample, publisher in zip(samples, kept, strict=True):
+            publisher.put(bytes.fromhex(sample["payload"]), attachment=bytes.fromhex(sample["attachment"]))
+        wait_until(lambda: len(heard) == len(samples))
+        assert link.fault == ""
+    assert len(samples) == 10
+    for one, sample in zip(heard, samples, strict=True):
+        entity = entities[one.publisher]
+        assert (one.type, one.payload.hex()) == (entity.type, sample["payload"])
+        assert sample["key"].startswith(f"0{entity.topic}/")
 
 
 def test_after_a_restart_of_the_router_the_node_is_back_and_velocities_come(place):

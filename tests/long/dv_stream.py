@@ -16,9 +16,8 @@ from pathlib import Path
 
 from neurove_protocol.events import decode_packet
 from neurove_protocol.keys import Keys
-from tests.live.conftest import client, free_endpoint, wait_until
+from tests.live.conftest import client, free_endpoint, start_router, wait_until
 from tests.live.dv_writer import dv_writer, tell
-from tests.live.test_feed import start_router
 
 RATES_PER_MS = (100, 1_000)
 PIECES, PIECE_MS = 40, 50  # of a round; the next piece follows when a consumer has the one before

@@ -107,7 +107,7 @@ def _texture(seed: int, sensor: Sensor) -> NDArray[np.float32]:
 
 def _view(texture: NDArray[np.float32], sensor: Sensor, t_us: int) -> NDArray[np.float32]:
     """The image on the sensor at a time: log intensity (H * W,), interpolated bilinearly."""
-    (fx, left), (fy, top) = (math.modf(-shift % PERIOD_PX) for shift in shift_px(t_us))
+    (fx, left), (fy, top) = (math.modf(-shift % PERIOD_PX % PERIOD_PX) for shift in shift_px(t_us))
     h, stride = sensor.height, sensor.width + 1
     window = texture[int(top) : int(top) + h + 1, int(left) : int(left) + stride].ravel()
     rows = window[:-stride] + np.float32(fy) * (window[stride:] - window[:-stride])

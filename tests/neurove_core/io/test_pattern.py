@@ -74,3 +74,11 @@ def test_the_pattern_supports_another_sensor():
 def test_a_seed_that_is_not_a_whole_number_is_refused(seed):
     with pytest.raises(InvalidField, match="seed="):
         open_source(f"pattern://?seed={seed}")
+
+
+def test_a_shift_that_rounds_to_a_whole_period_is_no_shift(monkeypatch):
+    def shift(t_us):
+        return (3.3e-16, 3.3e-16) if t_us == 0 else (1e-3 * t_us, 0.0)  # the first in x, after 203 s
+
+    monkeypatch.setattr("neurove_core.io.formats.pattern.shift_px", shift)
+    assert next(iter(open_source("pattern://").chunks())).n > 0

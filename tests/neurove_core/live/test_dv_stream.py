@@ -17,6 +17,7 @@ from neurove_core.live.source import LiveEnded, NoCamera
 from neurove_core.sources import is_live, open_live, open_source, supported
 from neurove_protocol import Events
 from neurove_protocol.errors import InvalidField
+from tests.live.conftest import free_ports
 from tests.live.dv_writer import DV_SENSOR, ask, dv_events, dv_writer, tell
 
 pytestmark = pytest.mark.live
@@ -27,10 +28,7 @@ PATIENT = "delay=3600"  # no tick by the clock of a busy machine
 
 @pytest.fixture
 def ports():
-    with socket.socket() as one, socket.socket() as other:
-        one.bind(("127.0.0.1", 0))
-        other.bind(("127.0.0.1", 0))
-        return one.getsockname()[1], other.getsockname()[1]
+    return free_ports()
 
 
 class Read:

@@ -236,15 +236,18 @@ def test_a_bundle_with_another_camera_or_unit_is_not_calibrated(made, tmp_path):
         calibration.calibration_sets(TrainingConfig(), 15)
 
 
-def test_a_sequence_is_used_unchanged_with_gaps_with_few_and_with_many_events():
+def test_a_sequence_is_used_unchanged_with_gaps_with_few_and_with_many_events_and_as_a_stationary_camera():
     rng = np.random.default_rng(3)
     counts = rng.integers(0, 4, (60, 4, 5, 6)).astype(np.uint8)
-    plain, gaps, few, many = (variant for variant, _ in variants_of(rng, counts, np.ones((60, 2, 6), np.float32)))
+    variants = variants_of(rng, counts, np.ones((60, 2, 6), np.float32))
+    plain, gaps, few, many, still = (variant for variant, _ in variants)
     assert (plain == counts).all()
     empty = (gaps == 0).all(axis=(1, 2, 3))
     assert 0 < empty.sum() < 60
     assert few[40:].sum() < 0.7 * counts[40:].sum()
     assert many.sum() > counts.sum()
+    assert still.mean() < 1
+    assert [bool(true.any()) for _, true in variants] == [True, True, True, True, False]
 
 
 def test_the_half_width_of_an_interval_is_that_of_a_normal_distribution():

@@ -110,7 +110,8 @@ def test_a_hostile_name_stays_one_label_of_bounded_length(name):
 
 
 def test_the_number_of_series_is_bounded_and_what_is_left_out_is_counted():
-    streams = [status(f"cam{number}") for number in range(100)]
+    small = {"latency_histogram": None, "flag_counts": {}, "sigma": None, "imu": None}
+    streams = [status(f"cam{number}", **small) for number in range(100)]
     errors = {f"place {number}": 1 for number in range(200)}
     some = reply("first", streams[:1], internal_errors=errors)
     many = [some.model_copy(update={"node": f"n{number}", "streams": tuple(streams)}) for number in range(42)]

@@ -12,13 +12,17 @@ import pytest
 from neurove_service.guard import Guard
 from neurove_service.metrics.http import MAX_CONNECTIONS, MAX_REQUEST_BYTES, AddressError, HttpServer, Response
 
-LARGE = b"x" * (64 << 20)
+LARGE = b"x" * (16 << 20)
+entered, go_on = threading.Event(), threading.Event()
 
 
 def respond(path):
+    if path == "/slow":
+        entered.set()
+        assert go_on.wait(60)
     if path == "/broken":
         raise ZeroDivisionError
-    return {"/live": Response(b"live\n"), "/large": Response(LARGE)}.get(path)
+    return {"/live": Response(b"live\n"), "/large": Response(LARGE), "/slow": Response(LARGE)}.get(path)
 
 
 @pytest.fixture
@@ -28,7 +32,7 @@ def guard():
 
 @pytest.fixture
 def server(guard):
-    server = HttpServer("127.0.0.1", 0, respond, guard)
+    server = HttpServer("127.0.0.1", 0, respond, guard, deadline_s=120)
     yield server
     server.close()
 
@@ -140,3 +144,19 @@ def test_a_port_in_use_is_named(server, guard):
 def test_an_address_of_another_machine_is_named(guard):
     with pytest.raises(AddressError, match="cannot listen at 192.0.2.1:9464: "):
         HttpServer("192.0.2.1", 9464, respond, guard)
+
+
+def test_a_connection_that_is_dropped_while_its_request_arrives_is_no_error(server, guard, monkeypatch):
+    monkeypatch.setattr("neurove_service.metrics.http.MAX_CONNECTIONS", 2)
+    address = ("127.0.0.1", port_of(server))
+    entered.clear()
+    go_on.clear()
+    with socket.create_connection(address, timeout=60) as oldest, socket.create_connection(address, timeout=60) as slow:
+        slow.sendall(b"GET /slow HTTP/1.1\r\n\r\n")
+        assert entered.wait(60)  # its answer is too long to be sent at once, so it stays open
+        with socket.create_connection(address, timeout=60) as newest:
+            oldest.sendall(b"GET /live HTTP/1.1\r\n\r\n")
+            newest.sendall(b"GET /live HTTP/1.1\r\n\r\n")
+            go_on.set()
+            assert newest.recv(15) == b"HTTP/1.1 200 OK"
+    assert guard.counts == {}

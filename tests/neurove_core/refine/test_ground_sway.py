@@ -1,0 +1,55 @@
+"""Rates of pitch and roll: no slow mean, less noise, and yaw as it was."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurove_core.refine.ground_sway import NOISE_RAD_S, Sway, swayed
+
+PITCH = math.radians(5)
+UP = np.array([0.0, math.cos(PITCH), math.sin(PITCH)])
+AHEAD = np.array([0.0, -math.sin(PITCH), math.cos(PITCH)])
+
+
+def filtered(
+    pitching: NDArray[np.float64], rolling: NDArray[np.float64], speed_m_s: float = 8.0
+) -> NDArray[np.float64]:
+    """Rates about the axes of the ground (N, 3): pitch, yaw, roll, of a camera that yaws at 0.4 rad/s."""
+    sway, out = Sway(), []
+    for pitch, roll in zip(pitching, rolling, strict=True):
+        w = np.array([pitch, 0, 0]) + 0.4 * UP + roll * AHEAD
+        twist, sway = swayed(np.concatenate([[0.1, 0.2, speed_m_s], w]), PITCH, sway)
+        np.testing.assert_array_equal(twist[:3], [0.1, 0.2, speed_m_s])
+        out.append([twist[3], twist[3:] @ UP, twist[3:] @ AHEAD])
+    return np.array(out)
+
+
+def test_a_constant_pitch_rate_is_an_error_and_yaw_stays() -> None:
+    found = filtered(np.full(60, 0.05), np.zeros(60))
+    assert abs(found[-1, 0]) < 0.01
+    np.testing.assert_allclose(found[:, 1], 0.4, atol=1e-12)
+
+
+def test_rates_with_noise_are_nearer_to_the_truth() -> None:
+    rng = np.random.default_rng(0)
+    time_s = np.arange(400) * 0.05
+    truth = 0.02 * np.stack([np.sin(2 * np.pi * time_s), np.cos(1.7 * np.pi * time_s)])
+    noisy = truth + NOISE_RAD_S * rng.normal(size=truth.shape)
+    found = filtered(*noisy)[:, [0, 2]].T
+    for axis in (0, 1):
+        before, after = (np.sqrt(np.mean((one[axis] - truth[axis]) ** 2)) for one in (noisy, found))
+        assert after < before
+
+
+def test_noise_alone_is_drawn_to_zero() -> None:
+    rng = np.random.default_rng(1)
+    noisy = NOISE_RAD_S / 2 * rng.normal(size=(2, 200))
+    found = filtered(*noisy)[100:, [0, 2]]
+    assert np.abs(found).max() < NOISE_RAD_S / 4
+
+
+def test_the_rates_of_a_slow_camera_stay() -> None:
+    found = filtered(np.full(30, 0.1), np.full(30, -0.1), speed_m_s=0.0)
+    np.testing.assert_allclose(found[:, 0], 0.1, atol=0.01)
+    np.testing.assert_allclose(found[:, 2], -0.1, atol=0.01)
