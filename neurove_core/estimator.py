@@ -115,8 +115,8 @@ class Estimator:
     """A loaded model that serves any number of streams. It holds no stream's state and is safe to share.
 
     Args:
-        bundle: the model; a network in memory is put into evaluation mode.
-        runner: runs the network; by default the fastest one, without torch where the bundle was read from a file.
+        bundle: the model. Its weights are copied; later changes have no effect.
+        runner: runs the network; by default the fastest one, which needs torch for baselines alone.
             `PlainRunner(bundle.network)` runs the network itself.
         bounds: absolute bounds of sigma for `uncertain`; they take precedence over those of the bundle.
         refine: whether to refine estimates by the events, see `refine.rotation` and `refine.ground`. It needs the
@@ -182,8 +182,8 @@ class Estimator:
     def push_many(self, pushes: Sequence[Push]) -> list[PushResult]:
         """Add a packet to each of several streams, and estimate all windows that they complete, in common batches.
 
-        The results are those of `push` for each, in less time where several streams complete a window. See
-        `FastRunner` for when they are equal bit for bit.
+        The results are those of `push` for each, in less time where several streams complete a window, and equal bit
+        for bit where the network runs on arrays.
 
         Args:
             pushes: at most one packet of each stream.
@@ -311,12 +311,14 @@ class Estimator:
 
 
 def _runner_of(bundle: Bundle) -> Runner:
-    """The fastest runner of a model: on arrays as they were read from a file, or of a network in memory in torch."""
-    weights = bundle.weights
-    if weights is not None and weights.config.kind == "neurove":
+    """The fastest runner of a model: on arrays, whether it was read from a file or is in memory; baselines in torch.
+
+    Both run the same code, so a golden test that was recorded of a model in memory holds for its file.
+    """
+    if bundle.config.kind == "neurove":
         from neurove_core.engine.array_runner import ArrayRunner
 
-        found = ArrayRunner(weights)
+        found = ArrayRunner(bundle.current_weights)
         if found.is_compiled or not installed("torch"):
             return found  # else torch is faster than plain numpy
     from neurove_core.engine.runner import runner_of

@@ -137,6 +137,14 @@ class Bundle:
         return stored if isinstance(stored, Weights) else None
 
     @property
+    def current_weights(self) -> Weights:
+        """The weights of a NeuroVE network as they are now; those of one in memory are copied."""
+        if (weights := self.weights) is not None:
+            return weights
+        tensors = {name: array.copy() for name, array in _stored(self).items()}
+        return Weights(self.config, tensors, spread="spread.weight" in tensors)
+
+    @property
     def scaling(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Offset (6) and scale (6): twist = network output * scale + offset."""
         offset, scale = (as_array(field.stored(self)).astype(np.float64) for field in (_BUNDLE_OFFSET, _BUNDLE_SCALE))
