@@ -7,10 +7,9 @@ a covariance), `manifest` and `signing_keys` (signatures). README.md describes h
 """
 
 import functools
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
-
-from neurove_core.extras import installed
 
 if TYPE_CHECKING:
     from neurove_core.models.bundle import Bundle
@@ -35,14 +34,15 @@ def shipped() -> tuple["Bundle", ...]:
     return tuple(bundle.load(file) for file in sorted(Path(__file__).parent.glob(f"*{bundle.SUFFIX}")))
 
 
-@functools.cache
 def built_in() -> tuple["Bundle", ...]:
-    """All built-in models: those of `shipped` and, where torch is installed, `untrained`.
+    """The built-in models: those of `shipped` and, in a process that has loaded torch, `untrained`.
+
+    A service has not, and a list of models would take seconds and 180 MB more if it did. `find` loads it.
 
     Raises:
         BadModel: a file of this installation is damaged.
     """
-    return (*shipped(), *([untrained()] if installed("torch") else []))
+    return (*shipped(), *([untrained()] if "torch" in sys.modules else []))
 
 
 @functools.cache

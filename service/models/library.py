@@ -1,10 +1,12 @@
 """Library: every model that a node can activate, found by name or digest."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from neurove_core import models
+from neurove_core.extras import installed
 from neurove_core.files import Stamp, stamp, why_unreadable
 from neurove_core.models import bundle
 from neurove_core.models.bundle import Bundle
@@ -13,6 +15,8 @@ from neurove_protocol.errors import BadModel, UnknownModel
 
 MIN_DIGEST = 8
 """Minimum number of digits of a digest that name a model."""
+
+_DIGEST: Final = re.compile(f"[0-9a-f]{{{MIN_DIGEST},64}}")
 
 Files = Callable[[], dict[str, Path]]
 """Digest and file of every model that was pushed to this node."""
@@ -101,9 +105,8 @@ class Library:
             if found.digest != digest:
                 raise BadModel(model, f"the file changed while it was read: its sha256 is now {found.digest}")
             return found
-        for one in models.built_in():  # here alone, because a model with random weights needs torch
-            if _matches(one.info, model):
-                return one
+        if _DIGEST.fullmatch(model) and installed("torch") and _matches(models.untrained().info, model):
+            return models.untrained()  # it served before the node was started again
         raise UnknownModel(model, tuple(one.name for one in self.available().models))
 
     def is_built_in(self, digest: str) -> bool:

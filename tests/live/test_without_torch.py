@@ -11,6 +11,7 @@ import pytest
 
 from neurove_core import models, self_test
 from neurove_core.config import NetworkConfig
+from neurove_core.engine.engine import Engine
 from neurove_core.engine.runner import FastRunner
 from neurove_core.estimator import Estimator
 from neurove_core.io.packets import slices
@@ -67,8 +68,10 @@ def int8(tmp_path_factory):
 
 
 def in_torch(network_of, sensor: Sensor, pieces):
-    """Twists of a model for these slices, computed by torch's path."""
-    estimator = Estimator(network_of, FastRunner(network_of.network.requires_grad_(requires_grad=False)))
+    """Twists of a model for these slices, computed by torch's path where it adds in our order on this processor."""
+    network = network_of.network.requires_grad_(requires_grad=False)
+    ours = network.config.network.precision == "int8" or Engine(network).reads_counts
+    estimator = Estimator(network_of, FastRunner(network) if ours else None)
     state, found = estimator.initial_state(sensor), {}
     for piece in pieces:
         pushed = estimator.push(piece.events, state, piece.t0_us)

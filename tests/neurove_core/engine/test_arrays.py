@@ -10,6 +10,7 @@ from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.engine.array_fast import FirstLayer, ListLayer, ListProjection
 from neurove_core.engine.array_folding import convolutions, projection
 from neurove_core.engine.array_runner import ArrayRunner
+from neurove_core.engine.engine import Engine
 from neurove_core.engine.runner import FastRunner
 from neurove_core.models import bundle
 from neurove_core.networks import encoding, quantisation, tables
@@ -31,6 +32,12 @@ def runners(network):
     read = bundle.from_bytes(made.to_bytes(), "x")
     assert read.digest == made.digest
     return ArrayRunner(read.weights), FastRunner(made.network.requires_grad_(requires_grad=False))
+
+
+def sums_in_our_order(network):
+    """Whether torch's form runs over spike lists here: not where oneDNN adds in another order on this processor."""
+    made = bundle.untrained(3, ModelConfig(canonical=GRID, network=network))
+    return network.precision == "int8" or Engine(made.network).reads_counts
 
 
 def windows(config, seed):
@@ -56,7 +63,7 @@ def test_arrays_answer_as_torch_does_bit_for_bit(name):
     assert ours.is_compiled
     got, want = answers(ours, config), answers(theirs, config)
     assert (np.diff(want, axis=0) != 0).any()
-    if name == "int8, narrow":  # torch projects and runs the cells in one dense pass there
+    if name == "int8, narrow" or not sums_in_our_order(NETWORKS[name]):  # torch projects and runs the cells dense there
         np.testing.assert_allclose(got, want, rtol=0, atol=1e-5)
     else:
         assert np.array_equal(got, want)
