@@ -15,16 +15,15 @@ from numpy.typing import NDArray
 
 from neurove_core.engine import array_plain, sparse_int8_kernels, sparse_kernels
 from neurove_core.engine.array_folding import ArrayLayer
-from neurove_core.engine.spike_lists import SPARE, SpikeList, empty_list, output_shape
+from neurove_core.engine.spike_lists import SPARE, SpikeList, empty_list, in_groups, output_shape
 from neurove_core.engine.tiles import tile_of
-from neurove_core.engine.vectors import has_byte_products
+from neurove_core.engine.vectors import cells_tile, has_byte_products, list_tile
 from neurove_core.networks import tables
 from neurove_core.networks.arrays import Array
 
 Counts = NDArray[np.uint8]
 
 _CHUNK: Final = 512  # inputs of the projection whose weights stay in the second-level cache
-_EXACT: Final = 1 << 24  # integers below this are exact in float32
 _NO_VALUES: Final = np.empty(0, np.float32)
 _SILENT: Final = np.float32(0), np.float32(np.inf)  # no neuron fires, and the potentials equal the currents
 
@@ -39,16 +38,13 @@ class FirstLayer:
 
     def __init__(self, layer: ArrayLayer, encoding: str) -> None:
         self._layer, self._inputs = layer, layer.weight.shape[2]
-        self._tile, self._firing = tile_of(layer.outputs, most=2), tile_of(layer.outputs)
+        self._tile, self._firing = cells_tile(layer.outputs), tile_of(layer.outputs)
         self._table = tables.of_encoding(encoding)
         self._codes = tables.codes_of(encoding)
-        self._by_bytes = layer.factor is not None and has_byte_products()
-        if self._by_bytes:
-            self._weight: NDArray[np.generic] = _in_fours(layer.weight)
+        if layer.factor is None:
+            self._weight: NDArray[Any] = layer.weight.reshape(-1)
         else:
-            self._weight = layer.weight.astype(np.float32).reshape(-1)
-            if layer.factor is not None:
-                self._table = self._codes.astype(np.float32)
+            self._weight = in_groups(layer.weight, 4 if has_byte_products() else 2)
 
     def __call__(self, counts: Counts, v: Array, decay: np.float32, v_th: np.float32) -> tuple[SpikeList, Array]:
         """Potentials v (B, H', W', C') before the step to spikes and potentials after it."""
@@ -59,21 +55,14 @@ class FirstLayer:
         factor, offset = self._layer.factor, self._layer.offset
         written: Any = v, after, decay, v_th, indices, starts
         if factor is None:
-            count = self._sums(counts, given, offset, *written)
-        elif self._by_bytes:
+            layer: Any = given, _NO_VALUES, counts.reshape(-1), self._table, self._weight, offset
+            count = sparse_kernels.convolve_values(self._tile, self._firing, *layer, *written)
+        else:
             codes = np.empty(counts.size, np.uint8)
             sparse_int8_kernels.look_up(counts.reshape(-1), self._codes, codes)
             weights: Any = self._weight, factor, offset
             count = sparse_int8_kernels.convolve_codes(self._tile, codes.reshape(counts.shape), *weights, *written)
-        else:  # sums of integers in float32, which are exact
-            sums, none = np.empty_like(v), np.zeros(offset.size, np.float32)
-            self._sums(counts, given, none, np.zeros_like(v), sums, *_SILENT, indices, starts)
-            count = sparse_int8_kernels.fire_sums(self._firing, sums.reshape(-1), factor, offset, *written)
         return SpikeList(indices, starts, shape, count), after
-
-    def _sums(self, counts: Counts, given: tuple[int, ...], offset: Array, *written: Any) -> int:
-        layer: Any = self._tile, self._firing, given, _NO_VALUES, counts.reshape(-1), self._table, self._weight, offset
-        return sparse_kernels.convolve_values(*layer, *written)
 
     def agrees(self) -> bool:
         """Whether it equals plain numpy bit for bit, on a small map."""
@@ -95,7 +84,7 @@ class ListLayer:
 
     def __init__(self, layer: ArrayLayer) -> None:
         self._layer, self._widths = layer, (layer.weight.shape[2], layer.outputs)
-        self._tile, self._weight = tile_of(layer.outputs), layer.weight.reshape(-1)
+        self._tile, self._weight = list_tile(layer.outputs), layer.weight.reshape(-1)
         if layer.factor is not None:
             self._weight = np.concatenate([self._weight, np.zeros(layer.outputs, np.int8)])
             wide = layer.weight.astype(np.int32).reshape(-1, layer.outputs)
@@ -136,7 +125,7 @@ class ListProjection:
     """
 
     def __init__(self, layer: ArrayLayer) -> None:
-        self._layer, self._tile, self._rows = layer, tile_of(layer.outputs), layer.weight.reshape(-1)
+        self._layer, self._tile, self._rows = layer, list_tile(layer.outputs), layer.weight.reshape(-1)
 
     def __call__(self, spikes: SpikeList) -> Array:
         """The currents."""
@@ -163,7 +152,7 @@ def fits(layers: Sequence[ArrayLayer], projection: ArrayLayer) -> bool:
         return True
     first, *_ = layers
     return (
-        (has_byte_products() or _largest_sum(first) * 255 < _EXACT)
+        _largest_sum(first) * 255 < 1 << 31
         and all(_largest_sum(layer) < 1 << 31 for layer in layers)
         and _largest_sum(projection) < 1 << 31
     )
@@ -182,12 +171,3 @@ def list_of(maps: NDArray[np.bool_]) -> SpikeList:
 
 def _largest_sum(layer: ArrayLayer) -> int:
     return int(np.abs(layer.weight.astype(np.int64)).reshape(-1, layer.outputs).sum(axis=0).max())
-
-
-def _in_fours(weight: NDArray[np.generic]) -> NDArray[np.generic]:
-    """Weights (3, 3, C, C') as (3, groups of four channels, 3, C', 4), flat, for dot products."""
-    inputs, outputs = weight.shape[2:]
-    fours = -(-inputs // 4)
-    by_input = np.zeros((3, fours * 4, 3, outputs), weight.dtype)
-    by_input[:, :inputs] = weight.transpose(0, 2, 1, 3)
-    return np.ascontiguousarray(by_input.reshape(3, fours, 4, 3, outputs).transpose(0, 1, 3, 4, 2)).reshape(-1)

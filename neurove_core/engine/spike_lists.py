@@ -96,3 +96,12 @@ def fill_spikes(indices: Indices, starts: Indices, maps: NDArray[Any]) -> None: 
     for r in range(maps.shape[0]):
         for i in range(starts[r * cells], starts[(r + 1) * cells]):
             maps[r, indices[i]] = 1
+
+
+def in_groups(weight: NDArray[np.int8], group: int) -> NDArray[np.signedinteger[Any]]:
+    """Weights (3, 3, C, C') as (3, groups of channels, 3, C', group), flat: int8 for groups of four, int16 for two."""
+    inputs, outputs = weight.shape[2:]
+    groups = -(-inputs // group)
+    by_input = np.zeros((3, groups * group, 3, outputs), np.int8 if group == 4 else np.int16)
+    by_input[:, :inputs] = weight.transpose(0, 2, 1, 3)
+    return np.ascontiguousarray(by_input.reshape(3, groups, group, 3, outputs).transpose(0, 1, 3, 4, 2)).reshape(-1)

@@ -44,6 +44,7 @@ COMMANDS = (
     Command(
         "fleet", "List the nodes of a deployment, with their labels and models, and those that do not answer.", "fleet"
     ),
+    Command("rollout", "Change the model of many nodes step by step, and stop or go back if one fails.", "rollout"),
     Command("bundle", "Make, inspect, sign and verify bundles: files that hold a model.", "bundles", "serve"),
     Command("record", "Record the packets that drivers publish, until Ctrl-C.", "recordings", "recordings"),
     Command("info", "Show what a recording holds: sensor, counts, rates, IMU and truth.", "recordings", "recordings"),
