@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from neurove_core.extras import installed
 from neurove_core.geometry.tables import TABLES
 from neurove_core.ingest import windows
-from neurove_core.ingest.channels import Recent, remembered, with_history
+from neurove_core.ingest.channels import Recent, network_input, remembered, with_history
 from neurove_core.ingest.windows import Pushed, Window, WindowsState
 from neurove_core.ingest.wire import read_packet
 from neurove_core.io.packets import slices
@@ -277,6 +277,11 @@ class Estimator:
         recent = remembered(window.counts, state.recent, self.config)
         stream.state = state._replace(network=network, age=state.age + 1, end_us=end_us, recent=recent)
 
+    @property
+    def form(self) -> str:
+        """The form of the engine that serves, and why; see `engine.choice`."""
+        return str(getattr(self._runner, "choice", "torch (this network or this machine has no compiled form)"))
+
     def warm_up(self) -> None:
         """Compile all code and run all parts, so that the first packet does not wait for it.
 
@@ -320,6 +325,7 @@ def _runner_of(bundle: Bundle) -> Runner:
         from neurove_core.engine.array_runner import ArrayRunner
 
         found = ArrayRunner(bundle.current_weights)
+        found.choose(None if bundle.golden is None else network_input(bundle.golden.counts, bundle.config))
         if found.is_compiled or not installed("torch"):
             return found  # else torch is faster than plain numpy
     from neurove_core.engine.runner import runner_of
