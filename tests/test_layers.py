@@ -77,7 +77,8 @@ MAY_IMPORT = {
         "core:inertial core:aided logs guard clock_offset"
     ),
     "neurove_service.models": (
-        "core:config core:files core:ingest core:networks core:models core:estimator core:self_test logs guard streams"
+        "core:config core:extras core:files core:ingest core:networks core:models core:estimator core:self_test"
+        " logs guard streams"
     ),
     "neurove_service.metrics": "logs guard",
     "neurove_service.clients": (
