@@ -18,6 +18,7 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ from neurove_service.transport import Transport
 from tests.bundles import proven
 from tests.live.conftest import Process, client, free_endpoint, neurove, running, start_router, wait_until
 from tests.long.light_nodes import health_of
-from tests.long.swaps import cameras, resident_kib
+from tests.long.swaps import resident_kib
 from tests.service.conftest import SMALL
 
 START_S = 300.0
@@ -87,6 +88,16 @@ def kinds(journal: Path) -> list[str]:
     return [event["event"] for event in events_of(journal)]
 
 
+@contextlib.contextmanager
+def camera(endpoint: str) -> Iterator[None]:
+    """A camera of few events: every node of the run answers it, on the same cores."""
+    process = Process(endpoint, "50000", "60", "cam0", module="tests.long.cameras")
+    try:
+        yield
+    finally:
+        process.end()
+
+
 def bad_at_a_tenth(fleet: Fleet) -> dict[str, Any]:
     """The first node has no windows, so the bundle seems fine. Cameras begin with the second step."""
     journal = fleet.folder / "wild.jsonl"
@@ -104,7 +115,7 @@ def bad_at_a_tenth(fleet: Fleet) -> dict[str, Any]:
     )
     process = Process(*fleet.command(str(fleet.folder / "wild.safetensors"), *flags))
     wait_until(lambda: kinds(journal).count("step") == 2 or process.child.poll() is not None, START_S)
-    with cameras(fleet.endpoint, ["cam0"]):
+    with camera(fleet.endpoint):
         code, _, err = process.end(0, timeout_s=START_S)
         again = neurove(*fleet.command("--resume", str(journal)), timeout_s=START_S)
     events = events_of(journal)
@@ -120,23 +131,20 @@ def bad_at_a_tenth(fleet: Fleet) -> dict[str, Any]:
 
 
 def killed(fleet: Fleet, kills: int, seed: int) -> dict[str, Any]:
-    """A rollout that is killed at random times and resumed until it ends, with a camera."""
+    """A rollout that is killed at random times and resumed until it ends."""
     journal, chance = fleet.folder / "two.jsonl", random.Random(seed)
     begin = (str(fleet.folder / "two.safetensors"), "--soak", "3s", "--patience", "20s", "--journal", str(journal))
     done = 0
-    with cameras(fleet.endpoint, ["cam0"]):
-        while done < kills:
-            lines = len(events_of(journal))
-            process = Process(*fleet.command(*(("--resume", str(journal)) if journal.exists() else begin)))
-            wait_until(lambda n=lines, p=process: len(events_of(journal)) > n or p.child.poll() is not None, START_S)
-            threading.Event().wait(chance.uniform(0.0, 3.0))
-            if process.child.poll() is None:
-                done += 1
-                process.child.kill()
-            process.end()
-            if "end" in kinds(journal):
-                break
-        last = neurove(*fleet.command("--resume", str(journal)), timeout_s=START_S)
+    while done < kills and "end" not in kinds(journal):
+        lines = len(events_of(journal))
+        process = Process(*fleet.command(*(("--resume", str(journal)) if journal.exists() else begin)))
+        wait_until(lambda n=lines, p=process: len(events_of(journal)) > n or p.child.poll() is not None, START_S)
+        threading.Event().wait(chance.uniform(0.0, 3.0))
+        if process.child.poll() is None:
+            done += 1
+            process.child.kill()
+        process.end()
+    last = neurove(*fleet.command("--resume", str(journal)), timeout_s=START_S)
     events = events_of(journal)
     return {
         "kills": done,
@@ -153,13 +161,12 @@ def node_killed(fleet: Fleet) -> dict[str, Any]:
     """kill -9 of a node in its soak; it starts again and serves the bundle, and still it is not fine."""
     journal, victim = fleet.folder / "one.jsonl", fleet.names[1]
     flags = ("--plan", "100%", "--soak", "20s", "--max-failed", "1", "--patience", "300s", "--journal", str(journal))
-    with cameras(fleet.endpoint, ["cam0"]):
-        process = Process(*fleet.command(str(fleet.folder / "one.safetensors"), *flags))
-        wait_until(lambda: any(e["event"] == "active" and e["node"] == victim for e in events_of(journal)), START_S)
-        fleet.processes[victim].child.kill()
-        fleet.processes[victim].child.wait()
-        fleet.start(victim)
-        code, _, _ = process.end(0, timeout_s=2 * START_S)
+    process = Process(*fleet.command(str(fleet.folder / "one.safetensors"), *flags))
+    wait_until(lambda: any(e["event"] == "active" and e["node"] == victim for e in events_of(journal)), START_S)
+    fleet.processes[victim].child.kill()
+    fleet.processes[victim].child.wait()
+    fleet.start(victim)
+    code, _, _ = process.end(0, timeout_s=2 * START_S)
     summary = events_of(journal)[-1]["summary"]
     return {"exit_code": code, "fine": sorted(summary["fine"]), "failed": summary["failed"]}
 
