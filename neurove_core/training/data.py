@@ -199,13 +199,18 @@ class Cache:
         """Indices of the sequences that do not exist yet."""
         return [index for index in range(self._config.data.sequences) if not self.path(index).exists()]
 
-    def fill(self, workers: int = 1) -> Iterator[str]:
+    def fill(self, workers: int = 1, share: tuple[int, int] = (0, 1)) -> Iterator[str]:
         """Simulate the missing sequences, and yield the name of each one when it is done.
 
         Several processes and several runs may fill one folder at once, because files are written atomically.
+
+        Args:
+            workers: number of processes that simulate.
+            share: (i, n): only the i-th of n equal shares of all sequences.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
-        jobs = [(self._config, index, self.path(index)) for index in self.missing()]
+        missing = [index for index in self.missing() if index % share[1] == share[0]]
+        jobs = [(self._config, index, self.path(index)) for index in missing]
         if workers <= 1:
             yield from map(_make, jobs)
             return

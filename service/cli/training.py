@@ -21,10 +21,12 @@ from neurove_service.cli.arguments import (
     tell_faults,
 )
 from neurove_service.cli.bars import event_count, progress
+from neurove_service.lifecycle import end_with_parent
 
 if TYPE_CHECKING:
     from neurove_core.geometry.motion import Twists
     from neurove_core.io import Recording
+    from neurove_core.training.config import TrainingConfig
 
 _CALIBRATION_SEQUENCES = 96
 
@@ -36,30 +38,63 @@ def train(args: argparse.Namespace) -> int:
     from neurove_core import models
     from neurove_core.models import bundle
     from neurove_core.training import config as configs
-    from neurove_core.training import loop, pipeline
+    from neurove_core.training import joining, loop, pipeline
 
     torch.set_num_threads(args.threads)
     config = configs.load(args.config)
     out: Path = args.out or Path("runs") / config.name
+    started = joining.launched()  # by torchrun, which starts the same command again after a failure
     if not args.resume:
-        _refuse_run(out, (out / loop.CHECKPOINT, out / f"{config.name}{bundle.SUFFIX}"), force=args.force)
-    with progress() as show:
+        results = (out / f"{config.name}{bundle.SUFFIX}", *([] if started else [out / loop.CHECKPOINT]))
+        if not (started and (out / loop.CHECKPOINT).exists()):
+            _refuse_run(out, results, force=args.force)
+    if args.devices > 1 and not started:
+        return _launch(args, config, out)
+    if started:
+        end_with_parent()
+    start = models.find(args.start) if args.start else None
+    with joining.joined(args.device) as ranks, progress(shown=ranks.leads) as show:
+        if args.devices not in (1, ranks.count):
+            bound = f"the launcher started {ranks.count} processes; leave the flag out, or give that number"
+            raise InvalidField("training", "--devices", args.devices, bound)
         path = pipeline.train(
             config,
             out,
             data=args.data,
-            start=models.find(args.start) if args.start else None,
-            resume=args.resume,
-            devices=args.devices,
-            device=args.device,
+            start=start,
+            resume=args.resume or started,
+            ranks=ranks,
             workers=args.workers,
             calibration_sequences=args.calibration_sequences,
             on_progress=show,
         )
+    if not ranks.first:
+        return 0
     size, told = path.stat().st_size, json.loads((out / loop.RUN_JSON).read_bytes())["validated"]
     summary = {"bundle": str(path), "bytes": size, "run": str(out / loop.RUN_JSON), "validated": told}
     print(json.dumps(summary) if args.json else "\n".join([*told, f"wrote {path}, {size:,} bytes"]))
     return 0
+
+
+def _launch(args: argparse.Namespace, config: "TrainingConfig", out: Path) -> int:
+    """Start this command once for each device, through the launcher of torch; errors of the arguments come first."""
+    from neurove_core import models
+    from neurove_core.training import launch, loop, pipeline
+    from neurove_core.training.ranks import device_of
+
+    device_of(args.device, devices=args.devices)
+    pipeline.check(
+        config,
+        out,
+        models.find(args.start) if args.start else None,
+        resume=args.resume,
+        devices=args.devices,
+        workers=args.workers,
+        calibration_sequences=args.calibration_sequences,
+    )
+    if not args.resume:  # the processes continue from a checkpoint, if there is one
+        (out / loop.CHECKPOINT).unlink(missing_ok=True)
+    return launch.launch(args.devices, "neurove_service.cli", args.words)
 
 
 def _refuse_run(out: Path, results: tuple[Path, ...], *, force: bool) -> None:
@@ -207,7 +242,7 @@ def add_train(parser: argparse.ArgumentParser) -> None:
     add_force(parser, "a run in OUT")
     about = "initialise weights from BUNDLE, a file or `default`, instead of randomly"
     parser.add_argument("--start", metavar="BUNDLE", help=about)
-    about = "number of devices that share each batch; default 1"
+    about = "number of processes of this machine that share each batch, one GPU each if there are any; default 1"
     parser.add_argument("--devices", type=count, default=1, metavar="N", help=about)
     about = "auto, cpu or cuda; default auto: GPUs if there are any"
     parser.add_argument("--device", default="auto", metavar="KIND", help=about)
