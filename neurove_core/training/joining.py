@@ -19,7 +19,7 @@ import numpy as np
 import torch
 import torch.distributed as dist
 
-from neurove_core.training.ranks import LostRank, Ranks, device_of
+from neurove_core.training.ranks import LostRank, Ranks, device_of, first_words
 from neurove_protocol.errors import InvalidField
 
 _TIMEOUT: Final = timedelta(minutes=10)  # of one exchange; a closed connection is detected at once
@@ -76,7 +76,7 @@ def joined(device: str) -> Iterator[Ranks]:
     try:
         dist.init_process_group("gloo", init_method="env://", timeout=_TIMEOUT)
     except (RuntimeError, ValueError) as error:
-        raise LostRank(ranks.rank, f"cannot reach the others ({str(error).splitlines()[0][:200]})") from error
+        raise LostRank(ranks.rank, f"cannot reach the others ({first_words(error)})") from error
     try:
         ranks.agree(
             "versions", f"Python {platform.python_version()}, torch {torch.__version__}, numpy {np.__version__}"

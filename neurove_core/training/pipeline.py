@@ -25,6 +25,7 @@ from neurove_core.files import make_writable
 from neurove_core.models import bundle
 from neurove_core.models.bounds import UNSET, Bounds
 from neurove_core.models.bundle import Bundle
+from neurove_core.tasks import HERE, Pool
 from neurove_core.training import calibration, loop, validation
 from neurove_core.training.config import TrainingConfig
 from neurove_core.training.data import Cache, check_names
@@ -46,7 +47,7 @@ def train(
     start: Bundle | None = None,
     resume: bool = False,
     ranks: Ranks = ALONE,
-    workers: int = 1,
+    pool: Pool = HERE,
     calibration_sequences: int = calibration.SEQUENCES,
     on_progress: OnProgress = lambda *_: None,
 ) -> Path:
@@ -63,7 +64,7 @@ def train(
         resume: continue from the checkpoint in `out`, if it exists.
         ranks: this process and the others of the run, which share each batch; see `joining.joined`. The first rank
             writes the results. The machines share the simulation if they share `data`, else each makes all sequences.
-        workers: number of processes that simulate on each machine.
+        pool: where the sequences are simulated; see `tasks` and `cluster`.
         calibration_sequences: number of sequences that the uncertainty is fitted on; 0 skips the calibration. Only a
             network of kind `neurove` has an uncertainty.
         on_progress: called after each sequence, recording and segment.
@@ -76,6 +77,7 @@ def train(
         InvalidField: the batch does not split over the ranks, another rank has another configuration, a recording
             cannot be trained on, there are too few calibration sequences, a name in the configuration is unknown, or a
             folder cannot be written. All of these are checked before anything is simulated.
+        FailedTasks, ClusterError: sequences could not be simulated.
         BrokenRecording, UnknownSource, MissingGeometry, MissingExtra: a recording cannot be read.
         LostRank: one of the processes ended early.
     """
@@ -87,7 +89,6 @@ def train(
         start,
         resume=resume,
         devices=ranks.count,
-        workers=workers,
         calibration_sequences=calibration_sequences,
     )
     ranks.agree("config", config.model_dump_json())
@@ -101,9 +102,9 @@ def train(
         def make(machines: int = machines) -> None:
             if ranks.leads:
                 own = (ranks.machine % machines, machines)
-                _fill(config, data, recordings, workers, on_progress, own)
+                _fill(config, data, recordings, pool, on_progress, own)
                 if validating:
-                    _simulate("simulated to validate", validating, data, workers, on_progress, own)
+                    _simulate("simulated to validate", validating, data, pool, on_progress, own)
 
         ranks.together(make)
     held = None
@@ -128,7 +129,7 @@ def train(
 
     def fit() -> None:
         if calibrated and ranks.first:
-            calibrate(bundle.load(path), config, data, path, calibration_sequences, workers, on_progress)
+            calibrate(bundle.load(path), config, data, path, calibration_sequences, pool, on_progress)
 
     ranks.together(fit)  # the launcher ends only when the first rank has written everything
     return path
@@ -140,7 +141,7 @@ def calibrate(
     data: Path,
     out: Path,
     sequences: int = calibration.SEQUENCES,
-    workers: int = 1,
+    pool: Pool = HERE,
     on_progress: OnProgress = lambda *_: None,
     bounds: Bounds = UNSET,
 ) -> dict[str, Any]:
@@ -152,7 +153,7 @@ def calibrate(
         data: folder for the sequences.
         out: file of the bundle to write.
         sequences: how many sequences the uncertainty is fitted on.
-        workers: number of processes that simulate.
+        pool: where the sequences are simulated.
         on_progress: called after each sequence.
         bounds: absolute bounds for the flag `uncertain`; by default those that the model has.
 
@@ -164,8 +165,7 @@ def calibrate(
     """
     calibration.check(model, config, sequences)
     _check_writable("out", out.parent)
-    _check_count("workers", workers)
-    for done, name in enumerate(calibration.fill(config, data, sequences, workers), 1):
+    for done, name in enumerate(calibration.fill(config, data, sequences, pool), 1):
         on_progress("simulated to calibrate", done, sequences, name)
     made = calibration.calibrate(model, config, data, sequences, bounds)
     bundle.save(made.bundle, out)
@@ -179,7 +179,6 @@ def check(
     *,
     resume: bool = False,
     devices: int = 1,
-    workers: int = 1,
     calibration_sequences: int = calibration.SEQUENCES,
 ) -> None:
     """Check the arguments of a run that need no data; see `train`.
@@ -189,18 +188,12 @@ def check(
     """
     if start is not None:
         check_start(start, config)
-    _check_count("workers", workers)
     check_split(config, devices)
     check_names(config.data)
     if calibration_sequences != 0 and config.model.kind == "neurove":
         calibration.calibration_sets(config, calibration_sequences)
     if resume and (out / loop.CHECKPOINT).exists():
         TrainingRun.restore(out / loop.CHECKPOINT, config, Ranks(count=devices))
-
-
-def _check_count(field: str, count: int) -> None:
-    if count < 1:
-        raise InvalidField("training", field, count, "must be at least 1")
 
 
 def _check_writable(field: str, folder: Path) -> None:
@@ -228,7 +221,7 @@ def _fill(
     config: TrainingConfig,
     folder: Path,
     recordings: RecordedSequences,
-    workers: int,
+    pool: Pool,
     on_progress: OnProgress,
     share: tuple[int, int],
 ) -> None:
@@ -236,17 +229,17 @@ def _fill(
     missing = recordings.missing()
     for done, name in enumerate(recordings.fill(), 1):
         on_progress("split into windows", done, missing, name)
-    _simulate("simulated", config, folder, workers, on_progress, share)
+    _simulate("simulated", config, folder, pool, on_progress, share)
 
 
 def _simulate(
     task: str,
     config: TrainingConfig,
     folder: Path,
-    workers: int,
+    pool: Pool,
     on_progress: OnProgress,
     share: tuple[int, int],
 ) -> None:
     cache, wanted = Cache(folder, config), config.data.sequences
-    for done, name in enumerate(cache.fill(workers, share), wanted - len(cache.missing()) + 1):
+    for done, name in enumerate(cache.fill(pool, share), wanted - len(cache.missing()) + 1):
         on_progress(task, done, wanted, name)

@@ -5,6 +5,7 @@ statistics of the norms, the losses of the dynamic scaling, and the gradient. N 
 device would take on the same batch. `joining` makes the group of ranks, `launch` starts the ranks of one machine.
 """
 
+import re
 import threading
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -28,7 +29,7 @@ class LostRank(NeuroVEError):
     exit_code = EXIT_FAILURE
 
     def __init__(self, rank: int, why: str) -> None:
-        sentence = f"process {rank} of the run {why}; run the same command with --resume to continue"
+        sentence = f"process {rank} of the run {why}; if no launcher starts it again, continue with --resume"
         super().__init__(sentence, rank=rank, why=why)
 
 
@@ -140,7 +141,17 @@ class Ranks:
 
     def lost(self, error: RuntimeError) -> LostRank:
         """The error for an exchange that failed on this rank."""
-        return LostRank(self.rank, f"lost the connection to another one ({str(error).splitlines()[0][:200]})")
+        return LostRank(self.rank, f"lost the connection to another one ({first_words(error)})")
+
+
+def first_words(error: Exception) -> str:
+    """The first sentence of an error of torch, without the place in its sources.
+
+    >>> first_words(RuntimeError("[/gloo/pair.cc:553] Connection closed by peer [127.0.0.1]:11657. This is typical."))
+    'Connection closed by peer [127.0.0.1]:11657'
+    """
+    line = (str(error).splitlines() or [type(error).__name__])[0]
+    return re.sub(r"^\[/[^]]*\] ", "", line).partition(". ")[0][:200]
 
 
 ALONE: Final = Ranks()

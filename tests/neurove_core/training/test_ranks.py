@@ -34,7 +34,7 @@ from tests.neurove_core.training.rank_worker import one_update
 ROOT = Path(__file__).parents[3]
 TOML = tiny.toml(sequences=3, steps=60, batch=4, warm_up_steps=2, checkpoint_s=0, validation_sequences=0)
 CONFIG = TrainingConfig.model_validate(tomllib.loads(TOML))
-AGAIN = "run the same command with --resume to continue"
+AGAIN = "if no launcher starts it again, continue with --resume"
 
 
 def free_port():
