@@ -70,7 +70,8 @@ MAY_IMPORT = {
     "neurove_service.clock_offset": "",
     "neurove_service.limits": "",
     "neurove_service.endpoints": "",
-    "neurove_service.config": "core:files endpoints",
+    "neurove_service.labels": "",
+    "neurove_service.config": "core:files endpoints labels",
     "neurove_service.guard": "logs",
     "neurove_service.desk": "",
     "neurove_service.transport": "logs guard desk",
@@ -91,6 +92,7 @@ MAY_IMPORT = {
         "core:files core:geometry core:models logs guard lifecycle latency endpoints config transport streams models "
         "metrics"
     ),
+    "neurove_service.fleet": "core:files logs config labels transport clients",
     "neurove_service.page": "logs config guard transport clients",
     "neurove_service": "",
     "neurove_service.cli": "*",

@@ -41,6 +41,10 @@ COMMANDS = (
     Command("push", "Send a bundle to a running node.", "changing"),
     Command("activate", "Change the model of a running node.", "changing"),
     Command("rollback", "Activate the previous model of a running node again.", "changing"),
+    Command(
+        "fleet", "List the nodes of a deployment, with their labels and models, and those that do not answer.", "fleet"
+    ),
+    Command("rollout", "Change the model of many nodes step by step, and stop or go back if one fails.", "rollout"),
     Command("bundle", "Make, inspect, sign and verify bundles: files that hold a model.", "bundles", "serve"),
     Command("record", "Record the packets that drivers publish, until Ctrl-C.", "recordings", "recordings"),
     Command("info", "Show what a recording holds: sensor, counts, rates, IMU and truth.", "recordings", "recordings"),

@@ -93,8 +93,7 @@ class Service:
         check_folders(config)
         TABLES.max_bytes = config.tables_mib << 20
         self._guard = Guard()
-        self._monitor = _monitor(config, self._guard)
-        self._keys = config.keys
+        self._monitor, self._keys = _monitor(config, self._guard), config.keys
         self._active_file = ActiveFile(config.state_folder)
         self._store = ModelStore(
             config.state_folder, config.models_dir, config.store_mib << 20, verifier(config.trusted_keys)
@@ -188,6 +187,7 @@ class Service:
             self._store,
             self._active_file,
             lambda: not self._stop.is_set() and registry.alive(),
+            self._config.labels,
         )
         transport.subscribe_timed(keys.camera(), route(keys, registry, registry.put_camera))
         transport.subscribe_timed(keys.imu(), route(keys, registry, registry.put_imu))

@@ -187,6 +187,7 @@ EXAMPLES: dict[str, Fields] = {
         "dropped_log_lines": 3,
         "missing_streams": ["cam1"],
         "namesakes": 1,
+        "labels": {"site": "hall-2"},
     },
     "ModelsRequest": {"v": 1},
     "ModelsReply": {
@@ -442,6 +443,7 @@ ANY: dict[str, st.SearchStrategy[Fields]] = {
             "dropped_log_lines": counts,
             "missing_streams": st.lists(names, max_size=2),
             "namesakes": counts,
+            "labels": st.dictionaries(names, names, max_size=3),
         }
     ),
     "ModelsRequest": st.just({}),

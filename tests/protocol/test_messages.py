@@ -54,7 +54,7 @@ NULLABLE = {
     ("ActivateRequest", "force"),
     ("RollbackRequest", "expect"),
 }
-FREE_MAPS = ("details", "unreadable", "figures", "partial", "internal_errors", "flag_counts")
+FREE_MAPS = ("details", "unreadable", "figures", "partial", "internal_errors", "flag_counts", "labels")
 DEFAULTED = {"release", "figures", "signature"}  # of a ModelInfo
 DEFAULTED |= {
     "recovered_packets",
@@ -138,6 +138,7 @@ OUT_OF_BOUND: dict[str, dict[str, tuple[Any, ...]]] = {
         "model.parameters": (-1,),
         "streams.0.lost.late_events": (-1,),
         "streams.0.stream": ("a/b",),
+        "labels": ({"a/b": "c"}, {"site": ""}, {f"label{i}": "x" for i in range(17)}),
     },
     "ModelsReply": {"node": ("",), "epoch": (-1,), "available.0.parameters": (-1,), "staged.0.release": (-1,)},
     "PushRequest": {
