@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeVar
 
+import neurove_protocol
 from neurove_core import tasks
 from neurove_core.extras import MissingExtra
 from neurove_core.tasks import Done, FailedTasks
@@ -74,12 +75,8 @@ def _version(package: str) -> str:
 
 def _code_digest() -> str:
     """Digest of all sources that a task can run."""
-    import neurove_core
-    import neurove_protocol
-
     found = hashlib.sha256()
-    for package in (neurove_core, neurove_protocol):
-        folder = Path(str(package.__file__)).parent
+    for folder in (Path(__file__).parent, Path(str(neurove_protocol.__file__)).parent):
         for path in sorted(folder.rglob("*.py")):
             found.update(path.relative_to(folder).as_posix().encode() + b"\0" + path.read_bytes())
     return found.hexdigest()[:12]
