@@ -23,6 +23,7 @@ from neurove_protocol.errors import Busy, InternalError, NeuroVEError
 from neurove_protocol.events import MAX_PACKET_BYTES
 from neurove_service import logs
 from neurove_service.desk import Desk
+from neurove_service.endpoints import unreached, where
 from neurove_service.guard import Guard
 
 log = logs.get(__name__)
@@ -179,6 +180,13 @@ class Transport:
                 self._guard.caught("message", error)
 
         return _keep(self._kept, self.session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
+
+    def subscribe_newest(self, key: str, most: int) -> tuple[Callable[[], list[bytes]], Callable[[], None]]:
+        """Keep the newest messages of a key, without Python for each; returns what takes them and what ends it."""
+        declared = self.session.declare_subscriber(key, zenoh.handlers.RingChannel(most))
+        return lambda: [sample.payload.to_bytes() for sample in iter(declared.try_recv, None)], _keep(
+            self._kept, declared
+        )
 
     def answer(self, key: str, handle: Callable[[bytes], bytes], schema: str = CONTROL_SCHEMA) -> None:
         """Answer the queries of a key on a separate thread; an error of `handle` goes to the caller.
@@ -402,12 +410,12 @@ def open_transport(
         except zenoh.ZError as error:
             if not str(error).startswith("Unable to connect"):  # Zenoh has one error class and no codes
                 raise EndpointError(
-                    f"cannot open a Zenoh session: {_where(listen, connect)}: {_reason(error)}"
+                    f"cannot open a Zenoh session: {where(listen, connect)}: {_reason(error)}"
                 ) from None
         if time.monotonic() >= deadline or stop.is_set():
-            raise Unreachable(_unreached(connect))
+            raise Unreachable(unreached(connect))
         if not waiting:
-            log.info("waiting for a router", connect=", ".join(connect), why=_unreached(connect))
+            log.info("waiting for a router", connect=", ".join(connect), why=unreached(connect))
             waiting = True
         stop.wait(_RETRY_S)
 
@@ -425,21 +433,9 @@ def _session_config(
         for key, value in (_SETTINGS | ({"timestamping/enabled": True} if timestamps else {})).items():
             config.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
-        where = f"zenoh_config={config_file}" if config_file else _where(listen, connect)
-        raise EndpointError(f"cannot configure Zenoh: {where}: {_reason(error)}") from None
+        place = f"zenoh_config={config_file}" if config_file else where(listen, connect)
+        raise EndpointError(f"cannot configure Zenoh: {place}: {_reason(error)}") from None
     return config
-
-
-def _where(listen: tuple[str, ...], connect: tuple[str, ...]) -> str:
-    parts = [f"listen={', '.join(listen)}"] * bool(listen) + [f"connect={', '.join(connect)}"] * bool(connect)
-    return " ".join(parts) or "no endpoints"
-
-
-def _unreached(connect: tuple[str, ...]) -> str:
-    """Why there is no connection; Zenoh reports a closed port and a refused certificate in the same way."""
-    secured = any(endpoint.startswith(("tls/", "quic/")) for endpoint in connect)
-    refused = ", or one side refuses the other's certificate (zenoh_config)" if secured else ""
-    return f"no process listens at {', '.join(connect)}{refused}"
 
 
 def _reason(error: zenoh.ZError) -> str:

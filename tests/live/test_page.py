@@ -216,7 +216,7 @@ def test_a_request_from_elsewhere_or_without_a_token_changes_nothing(node):
 
 def test_every_answer_forbids_what_the_page_does_not_need(node):
     page, *_ = node
-    for path in ("/", "/main.js", "/absent", "/image/absent.png", "/image/..%2Fx.png"):
+    for path in ("/", "/main.js", "/absent", "/images?s=absent", "/images?s=..%2Fx"):
         code, headers, _ = page.request(path)
         assert code == (404 if "absent" in path or ".." in path else 200)
         policy = headers["Content-Security-Policy"]
@@ -342,10 +342,10 @@ def test_beyond_loopback_nothing_is_shown_without_the_token():
         page = Page.__new__(Page)
         page.url = f"http://127.0.0.1:{port}/"
         assert page.request("/")[0] == 200  # the empty page, which asks for the token
-        assert page.request("/feed")[0] == page.request("/image/cam0.png")[0] == 401
+        assert page.request("/feed")[0] == page.request("/images?s=cam0")[0] == 401
         assert page.request("/session", {"token": "guess"})[0] == 403
         code, headers, _ = page.request("/session", {"token": token})
         assert code == 200
         key = headers["Set-Cookie"].partition(";")[0]
-        assert page.request("/image/cam0.png", Cookie=key)[0] == 404
+        assert page.request("/images?s=cam0", Cookie=key)[0] == 404
         assert page.request("/operate/rollback", {"node": "n1"}, Cookie=key)[0] == 403
