@@ -169,8 +169,9 @@ class Transport:
         """Receive every message of a key expression until the result is called or the session is closed."""
         return self.subscribe_timed(key, lambda name, payload, received_ns, _: on_sample(name, payload, received_ns))
 
-    def subscribe_timed(self, key: str, on_sample: OnTimedSample) -> Callable[[], None]:
-        """As subscribe, with the time of sending, if the driver attaches it [us]."""
+    def subscribe_timed(self, key: str, on_sample: OnTimedSample, *, remote: bool = False) -> Callable[[], None]:
+        """As subscribe, with the time of sending, if the driver attaches it [us]; `remote`: not of this session."""
+        origin = zenoh.Locality.REMOTE if remote else zenoh.Locality.ANY
 
         def receive(sample: zenoh.Sample) -> None:
             received_ns = time.monotonic_ns()
@@ -179,7 +180,8 @@ class Transport:
             except Exception as error:  # noqa: BLE001  # one message must not end the subscription
                 self._guard.caught("message", error)
 
-        return _keep(self._kept, self.session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
+        handler = zenoh.handlers.Callback(receive, indirect=False)
+        return _keep(self._kept, self.session.declare_subscriber(key, handler, allowed_origin=origin))
 
     def subscribe_newest(self, key: str, most: int) -> tuple[Callable[[], list[bytes]], Callable[[], None]]:
         """Keep the newest messages of a key, without Python for each; returns what takes them and what ends it."""
