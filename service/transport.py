@@ -186,9 +186,7 @@ class Transport:
     def subscribe_newest(self, key: str, most: int) -> tuple[Callable[[], list[bytes]], Callable[[], None]]:
         """Keep the newest messages of a key, without Python for each; returns what takes them and what ends it."""
         declared = self.session.declare_subscriber(key, zenoh.handlers.RingChannel(most))
-        return lambda: [sample.payload.to_bytes() for sample in iter(declared.try_recv, None)], _keep(
-            self._kept, declared
-        )
+        return lambda: _taken(declared), _keep(self._kept, declared)
 
     def answer(self, key: str, handle: Callable[[bytes], bytes], schema: str = CONTROL_SCHEMA) -> None:
         """Answer the queries of a key on a separate thread; an error of `handle` goes to the caller.
@@ -319,6 +317,10 @@ def _keep(kept: list[Any], declared: Any) -> Callable[[], None]:
         declared.undeclare()
 
     return undeclare
+
+
+def _taken(declared: Any) -> list[bytes]:
+    return [sample.payload.to_bytes() for sample in iter(declared.try_recv, None)]
 
 
 def _sent_us(attachment: zenoh.ZBytes | None) -> int | None:

@@ -6,6 +6,7 @@ import re
 import shutil
 import signal
 import socket
+import threading
 import time
 import urllib.error
 import urllib.request
@@ -64,7 +65,7 @@ class Page:
         request = urllib.request.Request(self.url.rstrip("/") + path, data, sent)
         try:
             with urllib.request.urlopen(request, timeout=60) as answer:
-                return answer.status, answer.headers, answer.read().decode()
+                return answer.status, answer.headers, answer.read().decode(errors="replace")
         except urllib.error.HTTPError as error:
             with error:
                 return error.code, error.headers, error.read().decode()
@@ -316,6 +317,45 @@ def test_estimates_go_on_while_a_page_is_stopped_or_killed(node, number):
         before = heard.of("cam0")[-1:]
         wait_until(lambda: len(heard.of("cam0")) > len(before) + 60)  # three seconds
         process.child.kill()
+
+
+def test_estimates_go_on_while_a_page_is_flooded_and_it_recovers(node):
+    _, transport, config = node
+    with opened(config.connect[0]) as (page, _), contextlib.ExitStack() as stack:
+        host, port = page.url.removeprefix("http://").rstrip("/").split(":")
+        wait_until(lambda: page.request("/images?s=cam0&n=0")[0] == 200)
+        done = threading.Event()
+
+        def connected():
+            return stack.enter_context(socket.create_connection((host, int(port)), timeout=60))
+
+        def greedy(text):
+            """Send requests as fast as the page takes them, and read nothing; begin anew where it closes."""
+            while not done.is_set():
+                with contextlib.suppress(OSError), socket.create_connection((host, int(port)), timeout=1) as client:
+                    while not done.is_set():
+                        client.sendall(text)
+
+        for _ in range(300):  # more than the page takes; each has sent half a request
+            connected().sendall(b"GET /feed HTTP/1.1\r\n")
+        about = f"HTTP/1.1\r\nHost: {host}:{port}\r\n\r\n"
+        texts = (f"GET /images?s=cam0&n=0 {about}", f"GET /feed {about}", f"GET / {about}", "x" * 1000)
+        threads = [threading.Thread(target=greedy, args=(text.encode() * 50,)) for text in texts]
+        for thread in threads:
+            thread.start()
+        try:
+            heard = Heard(transport, config)
+            wait_until(lambda: len(heard.of("cam0")) >= 60)
+        finally:
+            done.set()
+            for thread in threads:
+                thread.join()
+        seqs = [one.seq for one in heard.of("cam0")]
+        assert seqs == sorted(set(seqs))
+        assert is_alive(transport, config)
+        stack.close()
+        wait_until(lambda: page.request("/images?s=cam0&n=0")[0] == 200)
+        assert "cam0" in [one["name"] for one in page.state()["streams"]]
 
 
 def test_the_demo_opens_a_page_and_ends_it():
