@@ -17,7 +17,11 @@ FOLDER = Path(__file__).with_name("diagrams")
 FENCE = re.compile(r"^```mermaid\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 DRAW = """async (text) => {
-  mermaid.initialize({ startOnLoad: false, theme: "neutral", flowchart: { htmlLabels: false } });
+  mermaid.initialize({
+    startOnLoad: false, theme: "neutral", htmlLabels: true, flowchart: { wrappingWidth: 600 },
+    themeCSS: ".cluster-label div { display: block !important; white-space: nowrap !important }"
+      + " .cluster-label foreignObject { overflow: visible }",
+  });
   return (await mermaid.render("diagram", text)).svg;
 }"""
 
@@ -47,7 +51,8 @@ def draw(mermaid: Path) -> None:
         page.add_script_tag(path=mermaid)
         for file, text in wanted.items():
             svg: str = page.evaluate(DRAW, text)
-            file.write_text(svg.replace("<br>", "<br/>") + "\n", encoding="utf-8")
+            svg = svg.replace("<br>", "<br/>").replace('style="', 'style="background: white; ', 1)  # on a dark page too
+            file.write_text(svg + "\n", encoding="utf-8")
         browser.close()
 
 
