@@ -52,12 +52,12 @@ def measured(streams: int, seconds: float, cold: bool) -> dict[str, Any]:
             running("serve", "--listen", endpoint, "--node", "n1", "--log-level", "info", **given)
         )
         assert node.child.stderr is not None
-        ready = next(line for line in node.child.stderr if " ready" in line)  # the log says it last
+        ready = next(line for line in node.child.stderr if '"event": "ready"' in line)
         found: dict[str, Any] = {
             "ready_s": round(time.monotonic() - began, 2),
             "ready_cpu_s": round(process_seconds(node.child.pid), 2),
             "packages_refused": len(absent),
-            "log": ready.strip(),
+            "model": json.loads(ready)["model"],
             "resident_mib": [resident_kib(node.child.pid) >> 10],
         }
         transport = stack.enter_context(client(endpoint))
