@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from neurove_core.extras import installed
 from neurove_core.geometry.tables import TABLES
 from neurove_core.ingest import windows
-from neurove_core.ingest.channels import Recent, network_input, remembered, with_history
+from neurove_core.ingest.channels import Recent, remembered, with_history
 from neurove_core.ingest.windows import Pushed, Window, WindowsState
 from neurove_core.ingest.wire import read_packet
 from neurove_core.io.packets import slices
@@ -325,12 +325,23 @@ def _runner_of(bundle: Bundle) -> Runner:
         from neurove_core.engine.array_runner import ArrayRunner
 
         found = ArrayRunner(bundle.current_weights)
-        found.choose(None if bundle.golden is None else network_input(bundle.golden.counts, bundle.config))
+        found.choose(_golden_input(bundle))
         if found.is_compiled or not installed("torch"):
             return found  # else torch is faster than plain numpy
     from neurove_core.engine.runner import runner_of
 
     return runner_of(bundle.network.eval().requires_grad_(requires_grad=False))
+
+
+def _golden_input(bundle: Bundle) -> NDArray[np.uint8] | None:
+    """The network's input for the golden windows of a model; None where it has none."""
+    if bundle.golden is None:
+        return None
+    found, recent = [], Recent()
+    for window in bundle.golden.counts:
+        found.append(with_history(window, recent, bundle.config))
+        recent = remembered(window, recent, bundle.config)
+    return np.stack(found)
 
 
 def _begin(push: Push, pushed: Pushed) -> _Progress:

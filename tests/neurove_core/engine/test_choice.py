@@ -1,6 +1,7 @@
 """The form that serves is chosen by time; answers never depend on it."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from neurove_core.engine.choice import VARIABLE, fastest
 from neurove_core.engine.fallback import vectors_work
 from neurove_core.estimator import Estimator
 from neurove_core.models import bundle
-from neurove_core.self_test import answers
+from neurove_core.self_test import answers, record
 from neurove_protocol.errors import InvalidField
 
 compiled_only = pytest.mark.skipif(not vectors_work(), reason="no compiled forms with this numba")
@@ -103,6 +104,19 @@ def test_an_estimator_says_which_form_serves_and_the_environment_pins_it(monkeyp
     monkeypatch.setenv(VARIABLE, "sparse")
     some = model.golden.counts[:3]
     np.testing.assert_array_equal(answers(pinned, some), answers(Estimator(model), some))
+
+
+@compiled_only
+@pytest.mark.parametrize("change", [{"canonical": {"subcells": 2}}, {"network": {"history": (1, 2)}}])
+def test_golden_windows_of_any_input_can_be_timed(change):
+    config = CONFIGS["float32"].model_dump()
+    for part, fields in change.items():
+        config[part] |= fields
+    model = bundle.untrained(3, ModelConfig.model_validate(config))
+    rng = np.random.default_rng(20_501)
+    counts = rng.poisson(0.3, (3, *model.config.window_shape)).astype(np.uint8)
+    golden = record(Estimator(model), counts)
+    assert "fastest on its golden windows" in Estimator(replace(model, golden=golden)).form
 
 
 def test_an_unknown_form_is_an_error_that_names_the_known_ones(monkeypatch):
