@@ -82,9 +82,9 @@ class Following:
         self._heard.clear()
         return kept
 
-    def drop(self) -> None:
-        """Forget what is kept: it is older than a long pause."""
-        self._kept.clear()
+    def renew(self, now_ns: int) -> None:
+        """Wait anew for what is kept: a long pause says nothing about the other node."""
+        self._kept = deque(((own, now_ns) for own, _ in self._kept), maxlen=KEPT)
 
     def seq_of(self, own: TwistEstimate) -> int:
         """The number of an estimate on the wire: it goes on where the other node stopped."""

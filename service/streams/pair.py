@@ -152,7 +152,7 @@ class Pair:
             self._confirm(pause_ns)
             self._run_calls()
         elif not self._tenure.answers and pause_ns > LONG_PAUSE_NS:
-            self._following.drop()
+            self._following.renew(self._turned_ns)
             self._tenure.set_patience()
         if self._tenure.answers:
             return [self._stamped(estimate)]
