@@ -30,6 +30,7 @@ DOUBT_WINDOWS: Final = 1.25
 LONG_PAUSE_NS: Final = 1_000_000_000
 """After a pause as long, a node that gets no reply listens first: packets were lost, and another node may answer."""
 
+_COLD: Final = 20  # a node whose state is not that of the others waits so many times longer for them
 _CONFIRM_WINDOWS: Final = 4  # how long to wait for replies
 
 
@@ -77,7 +78,7 @@ class Pair:
         return self._now_ns() - self._answered_ns < LONG_PAUSE_NS
 
     def heard(self, estimate: TwistEstimate) -> None:
-        """Another node has published an estimate of the stream."""
+        """Another node has published an estimate."""
         self._call(lambda: self._hear(estimate))
 
     def gone(self, node: str) -> None:
@@ -176,11 +177,16 @@ class Pair:
         since_ns = self._following.since_ns
         if self._tenure.answers or since_ns is None:
             return most_s
-        return min(most_s, max(0.0, (since_ns + self._tenure.patience_ns(self._window_ns) - self._now_ns()) / 1e9))
+        return min(most_s, max(0.0, (since_ns + self._patience_ns - self._now_ns()) / 1e9))
 
     def close(self) -> None:
         """The worker has ended."""
         self._on_close(self)
+
+    @property
+    def _patience_ns(self) -> float:
+        cold = not self._following.equal and bool(self._peers.names(self._stream))
+        return self._tenure.patience_ns(self._window_ns) * (_COLD if cold else 1)
 
     def _call(self, call: Callable[[], None]) -> None:
         self._calls.append(call)
@@ -197,9 +203,9 @@ class Pair:
         return self._pause_ns
 
     def _due(self) -> list[TwistEstimate]:
-        """What to publish: nothing, or all that is kept, if this node takes over now."""
+        """All that is kept, if this node takes over now."""
         since_ns, tenure = self._following.since_ns, self._tenure
-        if since_ns is None or self._now_ns() - since_ns < tenure.patience_ns(self._window_ns):
+        if since_ns is None or self._now_ns() - since_ns < self._patience_ns:
             return []
         tenure.take_over("no other node answers" if tenure.role == "listens" else f"{tenure.leader} is late")
         if self._following.other_model:
