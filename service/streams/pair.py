@@ -8,6 +8,7 @@ A node that was suspended may have been superseded without having heard of it. S
 of `DOUBT_WINDOWS` in its own work asks the others before it publishes.
 """
 
+import math
 import threading
 import time
 from collections import deque
@@ -30,7 +31,6 @@ DOUBT_WINDOWS: Final = 1.25
 LONG_PAUSE_NS: Final = 1_000_000_000
 """After a pause as long, a node that gets no reply listens first: packets were lost, and another node may answer."""
 
-_COLD: Final = 20  # a node whose state is not that of the others waits so many times longer for them
 _CONFIRM_WINDOWS: Final = 4  # how long to wait for replies
 
 
@@ -64,8 +64,7 @@ class Pair:
     ) -> None:
         self._tenure, self._peers, self._wake, self._now_ns, self._on_close = tenure, peers, wake, now_ns, on_close
         self._stream = tenure.stream
-        self._following = Following()
-        self._sync = Sync(self._stream)
+        self._following, self._sync = Following(), Sync(tenure.stream)
         self._calls: deque[Callable[[], None]] = deque()  # from other threads, for the worker
         self._turned_ns = self._answered_ns = now_ns()
         self._pause_ns = 0  # longest pause of the worker since the last answer
@@ -126,7 +125,7 @@ class Pair:
         """The state of the stream for a follower; None if this node has no such state, or is stuck."""
         found = self._sync.ask(digest, timeout_s, self._wake)
         about = {"node": self._tenure.node, "stream": self._stream, "digest": digest}
-        return None if found is None else StateReply.model_validate(about | found._asdict())
+        return StateReply.model_validate(about | found._asdict()) if found else None
 
     def status(self) -> StandbyStatus:
         """For the status of the stream."""
@@ -169,24 +168,16 @@ class Pair:
         if self._tenure.role == "follows" and self._following.wants_state(self._now_ns()):
             if self._sync.fetch(stream, lambda digest: self._peers.state(self._stream, leader, digest)):
                 log.info("state taken", stream=self._stream, leader=leader)
-            self._turned_ns = self._now_ns()
+            self._note_pause()
         return [] if self._tenure.answers else self._due()
 
     def wait_s(self, most_s: float) -> float:
         """Until the oldest estimate that is kept is late."""
-        since_ns = self._following.since_ns
-        if self._tenure.answers or since_ns is None:
-            return most_s
-        return min(most_s, max(0.0, (since_ns + self._patience_ns - self._now_ns()) / 1e9))
+        return most_s if self._tenure.answers else min(most_s, max(0.0, self._due_in_s))
 
     def close(self) -> None:
         """The worker has ended."""
         self._on_close(self)
-
-    @property
-    def _patience_ns(self) -> float:
-        cold = not self._following.equal and bool(self._peers.names(self._stream))
-        return self._tenure.patience_ns(self._window_ns) * (_COLD if cold else 1)
 
     def _call(self, call: Callable[[], None]) -> None:
         self._calls.append(call)
@@ -202,10 +193,17 @@ class Pair:
         self._pause_ns, self._turned_ns = max(self._pause_ns, now_ns - self._turned_ns), now_ns
         return self._pause_ns
 
+    @property
+    def _due_in_s(self) -> float:
+        """When this node takes over, unless another estimate is heard; infinite if nothing is kept [s]."""
+        since_ns = self._following.since_ns
+        patience_ns = self._tenure.patience_ns(self._window_ns, equal=self._following.equal)
+        return math.inf if since_ns is None else (since_ns + patience_ns - self._now_ns()) / 1e9
+
     def _due(self) -> list[TwistEstimate]:
         """All that is kept, if this node takes over now."""
-        since_ns, tenure = self._following.since_ns, self._tenure
-        if since_ns is None or self._now_ns() - since_ns < self._patience_ns:
+        tenure = self._tenure
+        if self._due_in_s > 0:
             return []
         tenure.take_over("no other node answers" if tenure.role == "listens" else f"{tenure.leader} is late")
         if self._following.other_model:
