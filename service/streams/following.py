@@ -170,4 +170,5 @@ class Sync:
         except NeuroVEError as error:
             log.warning("state refused", stream=self._stream, leader=reply.node, why=error.message)
             return False
+        log.info("state taken", stream=self._stream, leader=reply.node)
         return True

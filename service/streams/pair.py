@@ -42,9 +42,7 @@ class Resigned(NamedTuple):
 
 
 class Pair:
-    """The duty of one node on one stream.
-
-    The worker calls `answer`, `turn`, `wait_s` and `close`; the other methods are for any thread.
+    """The duty of one node on one stream. The worker calls `answer`, `turn`, `wait_s` and `close`; the other methods are for any thread.
 
     Args:
         tenure: the role of this node.
@@ -67,8 +65,7 @@ class Pair:
         self._following, self._sync = Following(), Sync(tenure.stream)
         self._calls: deque[Callable[[], None]] = deque()  # from other threads, for the worker
         self._turned_ns = self._answered_ns = now_ns()
-        self._pause_ns = 0  # longest pause of the worker since the last answer
-        self._window_ns = 50_000_000
+        self._pause_ns, self._window_ns = 0, 50_000_000  # longest pause of the worker since the last answer
         self._last: TwistEstimate | None = None  # published last
 
     @property
@@ -166,8 +163,7 @@ class Pair:
         self._sync.serve(stream)
         leader = self._tenure.leader
         if self._tenure.role == "follows" and self._following.wants_state(self._now_ns()):
-            if self._sync.fetch(stream, lambda digest: self._peers.state(self._stream, leader, digest)):
-                log.info("state taken", stream=self._stream, leader=leader)
+            self._sync.fetch(stream, lambda digest: self._peers.state(self._stream, leader, digest))
             self._note_pause()
         return [] if self._tenure.answers else self._due()
 
