@@ -173,6 +173,18 @@ class ImuStatus(Part):
     problem: str  # what is wrong, in one sentence; empty if nothing is
 
 
+class StandbyStatus(Part):
+    """The part of a node in a stream that several nodes can answer."""
+
+    role: Literal["answers", "follows", "listens", "absent"]
+    leader: Name | None  # the node that answers; None if this node knows none
+    term: Count  # of that node
+    equal: bool  # the newest estimates of this node were those of the leader, bit for bit; only of a node that follows
+    other_model: str = ""  # of the newest other leader, where it is another one than that of this node
+    draining: bool = False
+    followers: Count = 0  # other nodes that serve the stream, where this one answers
+
+
 class StreamStatus(Message):
     """The verdict and the counters of one stream on one node, since the stream began."""
 
@@ -203,6 +215,7 @@ class StreamStatus(Message):
     latency_histogram: LatencyHistogram | None = None  # None from an older node
     flag_counts: Annotated[dict[str, Count], Field(max_length=MAX_FLAGS)] = Field(default_factory=dict)  # estimates
     sigma: Annotated[tuple[float, ...], Field(strict=False, min_length=6, max_length=6)] | None = None  # of the newest
+    standby: StandbyStatus | None = None  # None on a node without standby
 
 
 class ModelInfo(Part):

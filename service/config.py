@@ -71,6 +71,12 @@ def _given(value: object) -> object:
     return value
 
 
+def _standby(value: object) -> object:
+    """The setting as text; TOML and the environment may also say true or false."""
+    text = str(value).lower()
+    return {"true": "last", "false": "off"}.get(text, value)
+
+
 Endpoints = Annotated[tuple[Annotated[str, AfterValidator(check_endpoint)], ...], NoDecode, BeforeValidator(_listed)]
 GivenPath = Annotated[Path, BeforeValidator(_given)]
 Names = Annotated[
@@ -167,6 +173,11 @@ class ServiceConfig(_Settings):
     expect_streams: Annotated[Names, Field(description="Streams that must be served; health names a missing one.")] = ()
     allow_same_name: bool = Field(
         False, description="Start even if another node of this name is on the network; each estimate comes twice."
+    )
+    standby: Annotated[Literal["off", "lot", "last"], BeforeValidator(_standby)] = Field(
+        "off",
+        description="Stand by for other nodes on the same streams: one answers, the others follow and take over. lot: "
+        "any node may answer first; last or true: the other nodes take precedence; off or false: answer every stream.",
     )
     max_packet_events: int = Field(
         1_000_000,

@@ -37,6 +37,7 @@ MAY_IMPORT = {
     "neurove_core.estimator": "geometry ingest networks engine models io refine timescales",
     "neurove_core.self_test": "config models estimator",
     "neurove_core.aided": "estimator inertial",
+    "neurove_core.carried": "spiking networks refine estimator timescales",
     "neurove_core.io": "files extras figures geometry",
     "neurove_core.io.formats": "compiled files extras geometry io",
     "neurove_core.sim": "compiled config figures geometry io io.formats",
@@ -74,7 +75,7 @@ MAY_IMPORT = {
     "neurove_service.transport": "logs guard desk",
     "neurove_service.streams": (
         "core:config core:geometry core:ingest core:networks core:models core:estimator "
-        "core:inertial core:aided logs guard clock_offset"
+        "core:inertial core:aided core:carried logs guard clock_offset"
     ),
     "neurove_service.models": (
         "core:config core:files core:ingest core:networks core:models core:estimator core:self_test logs guard streams"

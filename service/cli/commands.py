@@ -41,6 +41,7 @@ COMMANDS = (
     Command("push", "Send a bundle to a running node.", "changing"),
     Command("activate", "Change the model of a running node.", "changing"),
     Command("rollback", "Activate the previous model of a running node again.", "changing"),
+    Command("drain", "Hand over the streams of a node to the nodes that follow them.", "draining"),
     Command(
         "fleet", "List the nodes of a deployment, with their labels and models, and those that do not answer.", "fleet"
     ),

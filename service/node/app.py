@@ -21,6 +21,7 @@ from neurove_service.models.slot import ModelSlot
 from neurove_service.models.store import ModelStore
 from neurove_service.node import memory
 from neurove_service.node.condition import Watch
+from neurove_service.node.fellows import Fellows
 from neurove_service.node.folders import check_folders
 from neurove_service.node.handlers import Handlers
 from neurove_service.node.housekeeping import Housekeeping
@@ -29,6 +30,7 @@ from neurove_service.node.outlets import open_outlet, route
 from neurove_service.node.snapshot import Snapshot
 from neurove_service.node.watchdog import Watchdog
 from neurove_service.streams.comparison import TrialLimits
+from neurove_service.streams.duty import alone
 from neurove_service.streams.history import RingSize
 from neurove_service.streams.registry import StreamRegistry, StreamSettings
 from neurove_service.transport import EndpointError, Report, Transport, open_transport
@@ -39,6 +41,7 @@ if TYPE_CHECKING:
 log = logs.get(__name__)
 
 _CHUNK_S = 10.0
+_LEAVE_S = 0.1  # for each reply of the node that takes over a stream
 _ROUTER_PATIENCE_S = 365 * 86_400.0
 
 
@@ -73,6 +76,25 @@ def _monitor(config: ServiceConfig, guard: Guard) -> "Monitor | None":
     from neurove_service.node.monitor import Monitor
 
     return Monitor(config.node, config.metrics, guard)
+
+
+def _fellows(config: ServiceConfig, transport: Transport) -> Fellows | None:
+    """The other nodes that answer the same streams, if the settings ask for a standby."""
+    if config.standby == "off":
+        return None
+    return Fellows(transport, config.keys, config.node, reluctant=config.standby == "last")
+
+
+def _housekeeping(
+    config: ServiceConfig, transport: Transport, registry: StreamRegistry, watch: Watch, guard: Guard
+) -> Housekeeping:
+    return Housekeeping(
+        registry,
+        watch.statuses,
+        lambda stream: transport.publisher(config.keys.status(stream), STATUS_SCHEMA),
+        config.status_period_s,
+        guard,
+    )
 
 
 class Service:
@@ -137,21 +159,24 @@ class Service:
                 return
             raise
         with opened as transport:
-            settings = _stream_settings(self._config)
+            fellows = _fellows(self._config, transport)
             registry = StreamRegistry(
                 self._slot,
-                settings,
+                _stream_settings(self._config),
                 lambda name: open_outlet(transport, self._keys, self._config.node, name),
                 self._guard,
+                fellows.open_duty if fellows else alone,
             )
             namesakes = Namesakes(transport, self._keys, self._config.node)
             namesakes.join(self._stop, allowed=self._config.allow_same_name)
             watch = Watch(
                 self._config.node, registry, self._guard, self._config.expect_streams, lambda: namesakes.count
             )
+            if fellows:
+                fellows.join()
             handlers = self._declare(transport, registry, watch)
             self._log_ready()
-            housekeeping = self._housekeeping(transport, registry, watch)
+            housekeeping = _housekeeping(self._config, transport, registry, watch, self._guard)
             if self._monitor is not None:
                 self._monitor.attach(handlers.report, registry.stuck, lambda: housekeeping.beat_s)
             Watchdog(lambda: housekeeping.beat_s, self._guard).start(self._stop)
@@ -159,6 +184,8 @@ class Service:
                 housekeeping.run(self._stop)
             finally:
                 notify("STOPPING=1")
+                if fellows:
+                    fellows.drain(patience_s=_LEAVE_S)
                 self._slot.close()
                 registry.close()
         log.info("stopped", node=self._config.node)
@@ -214,15 +241,6 @@ class Service:
             return answers[0].payload if answers else None
 
         return lambda request, report: handlers.push(request, report, pull, self._stop)
-
-    def _housekeeping(self, transport: Transport, registry: StreamRegistry, watch: Watch) -> Housekeeping:
-        return Housekeeping(
-            registry,
-            watch.statuses,
-            lambda stream: transport.publisher(self._keys.status(stream), STATUS_SCHEMA),
-            self._config.status_period_s,
-            self._guard,
-        )
 
     def _log_ready(self) -> None:
         config, model = self._config, self._slot.active.estimator.bundle
