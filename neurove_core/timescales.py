@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from neurove_core.config import ModelConfig
 from neurove_core.ingest.channels import Counts, add_saturating
-from neurove_core.networks.kinds import Network, State
+from neurove_core.networks.arrays import Begins, State
 
 STEPS: Final = 3
 """Long windows that a state must have seen before its scale answers."""
@@ -54,13 +54,13 @@ class Job(NamedTuple):
     turn: int  # which state of its scale
 
 
-def jobs(window: Counts, longer: Longer, network: Network, config: ModelConfig) -> tuple[list[Job], Longer]:
+def jobs(window: Counts, longer: Longer, network: Begins, config: ModelConfig) -> tuple[list[Job], Longer]:
     """The runs that a new window of a stream asks for, and the stream's state with that window.
 
     Args:
         window: (2n * parts, H, W), the newest.
         longer: state of the stream.
-        network: of the model.
+        network: of the model, or its runner.
         config: of the model.
     """
     scales = config.scales

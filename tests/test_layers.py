@@ -24,17 +24,19 @@ MAY_IMPORT = {
     "neurove_core.compiled": "",
     "neurove_core.files": "",
     "neurove_core.extras": "",
+    "neurove_core.tasks": "",
+    "neurove_core.cluster": "extras tasks",
     "neurove_core.figures": "files extras",
     "neurove_core.geometry": "config",
     "neurove_core.spiking": "compiled",
     "neurove_core.ingest": "config compiled geometry",
     "neurove_core.networks": "config compiled spiking",
     "neurove_core.engine": "compiled spiking networks",
-    "neurove_core.models": "config files networks",
+    "neurove_core.models": "config files extras networks",
     "neurove_core.timescales": "config ingest networks",
     "neurove_core.refine": "compiled geometry ingest",
     "neurove_core.inertial": "",
-    "neurove_core.estimator": "geometry ingest networks engine models io refine timescales",
+    "neurove_core.estimator": "extras geometry ingest networks engine models io refine timescales",
     "neurove_core.self_test": "config models estimator",
     "neurove_core.aided": "estimator inertial",
     "neurove_core.carried": "spiking networks refine estimator timescales",
@@ -43,20 +45,21 @@ MAY_IMPORT = {
     "neurove_core.sim": "compiled config figures geometry io io.formats",
     "neurove_core.live": "extras io io.formats",
     "neurove_core.sources": "io io.formats live sim",
-    "neurove_core.evaluation": "compiled figures geometry networks models estimator inertial aided io",
+    "neurove_core.series": "files io.formats sources tasks",
+    "neurove_core.evaluation": "compiled figures geometry networks models estimator inertial aided io sources",
     "neurove_core.training": (
         "config files extras figures geometry ingest networks "
-        "engine models estimator self_test io io.formats sim sources timescales"
+        "engine models estimator self_test io io.formats sim sources tasks timescales"
     ),
     "neurove_core.adaptation": (
-        "config files geometry models estimator self_test io io.formats sources evaluation training"
+        "config files geometry models estimator self_test io io.formats sources tasks evaluation training"
     ),
     "neurove_core.bench": (
         "config compiled figures geometry spiking ingest networks engine models refine estimator sim sources"
     ),
     "neurove_core.experiments": (
         "config files extras figures geometry spiking ingest networks engine models estimator io sim sources "
-        "evaluation training"
+        "evaluation training tasks"
     ),
     "neurove_core": "spiking models estimator sources",
     # neurove_service
@@ -72,13 +75,14 @@ MAY_IMPORT = {
     "neurove_service.config": "core:files endpoints labels",
     "neurove_service.guard": "logs",
     "neurove_service.desk": "",
-    "neurove_service.transport": "logs guard desk",
+    "neurove_service.transport": "logs guard desk endpoints",
     "neurove_service.streams": (
         "core:config core:geometry core:ingest core:networks core:models core:estimator "
         "core:inertial core:aided core:carried logs guard clock_offset"
     ),
     "neurove_service.models": (
-        "core:config core:files core:ingest core:networks core:models core:estimator core:self_test logs guard streams"
+        "core:config core:extras core:files core:ingest core:networks core:models core:estimator core:self_test"
+        " logs guard streams"
     ),
     "neurove_service.metrics": "logs guard",
     "neurove_service.clients": (

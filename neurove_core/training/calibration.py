@@ -32,6 +32,7 @@ from neurove_core.models.bundle import PER_HEIGHT, Bundle
 from neurove_core.models.uncertainty import LEVEL, LEVELS, Uncertainty, half_width
 from neurove_core.networks.encoding import to_spikes
 from neurove_core.networks.neurove import NetworkState, NeuroVE
+from neurove_core.tasks import HERE, Pool
 from neurove_core.timescales import Answer, Longer, chosen, followed, jobs, slowed, watched
 from neurove_core.training.batches import mirrored, stationary, with_gain, with_noise
 from neurove_core.training.config import DataConfig, TrainingConfig
@@ -106,10 +107,10 @@ def calibration_sets(config: TrainingConfig, sequences: int) -> list[tuple[Train
     return made
 
 
-def fill(config: TrainingConfig, folder: Path, sequences: int, workers: int = 1) -> Iterator[str]:
+def fill(config: TrainingConfig, folder: Path, sequences: int, pool: Pool = HERE) -> Iterator[str]:
     """Simulate the missing calibration sequences, and yield the name of each one when it is done."""
     for one, _ in calibration_sets(config, sequences):
-        yield from Cache(folder, one).fill(workers)
+        yield from Cache(folder, one).fill(pool)
 
 
 def calibrate(
