@@ -75,7 +75,7 @@ MAY_IMPORT = {
     "neurove_service.config": "core:files endpoints labels",
     "neurove_service.guard": "logs",
     "neurove_service.desk": "",
-    "neurove_service.transport": "logs guard desk",
+    "neurove_service.transport": "logs guard desk endpoints",
     "neurove_service.streams": (
         "core:config core:geometry core:ingest core:networks core:models core:estimator "
         "core:inertial core:aided core:carried logs guard clock_offset"
