@@ -42,7 +42,7 @@ class Resigned(NamedTuple):
 
 
 class Pair:
-    """The duty of one node on one stream; `answer`, `turn`, `wait_s`, `close` are for the worker, others for any thread.
+    """The duty of one node on one stream; `answer`, `turn`, `wait_s`, `close` are the worker's, others for any thread.
 
     Args:
         tenure: the role of this node.
