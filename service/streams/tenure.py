@@ -115,8 +115,8 @@ def ranked(stream: str, nodes: set[str]) -> list[str]:
     """Nodes in the order in which they answer a stream: rendezvous hashing, the same on every node.
 
     >>> ranked("cam0", {"n1", "n2", "n3"})
-    ['n3', 'n2', 'n1']
+    ['n3', 'n1', 'n2']
     >>> [one for one in ranked("cam0", {"n1", "n2", "n3", "n4"}) if one != "n4"]
-    ['n3', 'n2', 'n1']
+    ['n3', 'n1', 'n2']
     """
     return sorted(nodes, key=lambda node: hashlib.sha256(f"{stream} {node}".encode()).digest())
