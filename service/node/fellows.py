@@ -105,6 +105,16 @@ class Fellows:
         log.info("drained" if not resume else "draining ended", handed=len(handed), kept=len(kept))
         return DrainReply(node=self._node, handed=handed, kept=kept)
 
+    def leaves(self, stream: str) -> bool:
+        """Hand over a stream if this node answers it; whether another node answers it now."""
+        pair = self._pairs.get(stream)
+        if pair is None:
+            return False
+        if pair.reply().role == "answers":
+            node, _ = self._hand_over(stream, pair, _TAKE_S)
+            return bool(node)
+        return pair.reply().role == "follows"
+
     def _hand_over(self, stream: str, pair: Pair, patience_s: float) -> tuple[str, str]:
         """Hand over one stream; the node that answers it now, or why there is none."""
         others = self.roles(stream, patience_s) if self.names(stream) else []

@@ -16,6 +16,7 @@ LATE_WINDOWS: Final = 1.5
 DRAINING: Final = 4.0
 """A node that is drained waits so many times longer before it takes over again."""
 
+_COLD: Final = 20  # times the patience of a node whose state is not that of the others
 _RELUCTANT: Final = 2  # ranks behind the other nodes
 
 
@@ -59,9 +60,10 @@ class Tenure:
         """Whether this node answers the stream."""
         return self.role == "answers"
 
-    def patience_ns(self, window_ns: int) -> float:
-        """How long the estimates of another node may be missing [ns]."""
-        return self._patience * LATE_WINDOWS * window_ns
+    def patience_ns(self, window_ns: int, *, equal: bool) -> float:
+        """How long the estimates of another node may be missing [ns]; longer unless the state is that of the others."""
+        cold = not equal and bool(self._peers.names(self.stream))
+        return self._patience * LATE_WINDOWS * window_ns * (_COLD if cold else 1)
 
     def hear(self, sender: str, term: int, now_ns: int) -> bool:
         """Another node has published; False if it does not know yet that it was superseded."""
@@ -113,8 +115,8 @@ def ranked(stream: str, nodes: set[str]) -> list[str]:
     """Nodes in the order in which they answer a stream: rendezvous hashing, the same on every node.
 
     >>> ranked("cam0", {"n1", "n2", "n3"})
-    ['n3', 'n2', 'n1']
+    ['n3', 'n1', 'n2']
     >>> [one for one in ranked("cam0", {"n1", "n2", "n3", "n4"}) if one != "n4"]
-    ['n3', 'n2', 'n1']
+    ['n3', 'n1', 'n2']
     """
     return sorted(nodes, key=lambda node: hashlib.sha256(f"{stream} {node}".encode()).digest())
