@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.extras import installed
 from neurove_core.geometry.tables import TABLES
 from neurove_core.ingest import windows
 from neurove_core.ingest.channels import Recent, remembered, with_history
@@ -28,6 +27,7 @@ from neurove_core.refine.rotation import Filter, Given, Rate, refine
 from neurove_core.refine.rotation import Refined as RotationFound
 from neurove_core.refine.search import compile_kernels
 from neurove_core.refine.view import View
+from neurove_core.running import form_of, runner_of
 from neurove_core.timescales import Answer, Longer, chosen, followed, jobs, slowed, watched
 from neurove_protocol import CameraInfo, Events, Sensor
 from neurove_protocol.errors import BadModel
@@ -131,7 +131,8 @@ class Estimator:
         self._refines = refine and bundle.uncertainty is not None and bundle.metadata.refine == "auto"
         self._bounds = bounds
         self.config = bundle.config
-        self._runner: Runner = runner or _runner_of(bundle)
+        self._runner: Runner = runner or runner_of(bundle)
+        self.form = form_of(self._runner)  # of the engine, and why this one serves
         self._offset, self._scale = bundle.scaling
 
     def initial_state(self, sensor: Sensor, camera: CameraInfo | None = None) -> StreamState:
@@ -277,11 +278,6 @@ class Estimator:
         recent = remembered(window.counts, state.recent, self.config)
         stream.state = state._replace(network=network, age=state.age + 1, end_us=end_us, recent=recent)
 
-    @property
-    def form(self) -> str:
-        """The form of the engine that serves, and why; see `engine.choice`."""
-        return str(getattr(self._runner, "choice", "torch (this network or this machine has no compiled form)"))
-
     def warm_up(self) -> None:
         """Compile all code and run all parts, so that the first packet does not wait for it.
 
@@ -314,34 +310,6 @@ class Estimator:
             covariance=covariance,
             uncertain=self.is_uncertain(twists, covariance),
         )
-
-
-def _runner_of(bundle: Bundle) -> Runner:
-    """The fastest runner of a model: on arrays, whether it was read from a file or is in memory; baselines in torch.
-
-    Both run the same code, so a golden test that was recorded of a model in memory holds for its file.
-    """
-    if bundle.config.kind == "neurove":
-        from neurove_core.engine.array_runner import ArrayRunner
-
-        found = ArrayRunner(bundle.current_weights)
-        found.choose(_golden_input(bundle))
-        if found.is_compiled or not installed("torch"):
-            return found  # else torch is faster than plain numpy
-    from neurove_core.engine.runner import runner_of
-
-    return runner_of(bundle.network.eval().requires_grad_(requires_grad=False))
-
-
-def _golden_input(bundle: Bundle) -> NDArray[np.uint8] | None:
-    """The network's input for the golden windows of a model; None where it has none."""
-    if bundle.golden is None:
-        return None
-    found, recent = [], Recent()
-    for window in bundle.golden.counts:
-        found.append(with_history(window, recent, bundle.config))
-        recent = remembered(window, recent, bundle.config)
-    return np.stack(found)
 
 
 def _begin(push: Push, pushed: Pushed) -> _Progress:
