@@ -100,7 +100,8 @@ def _connect(ranks: Ranks) -> None:
         dist.init_process_group("gloo", init_method="env://", timeout=_TIMEOUT)
         return
     round_ = _whole("TORCHELASTIC_RESTART_COUNT", 0)  # a file holds what the processes of one start have said
-    store = dist.FileStore(str(Path(folder) / f"round{round_}"), ranks.count)
+    path = str(Path(folder) / f"round{round_}")
+    store = dist.FileStore(path, ranks.count)  # type: ignore[attr-defined]  # gap in the stubs of torch
     dist.init_process_group("gloo", store=store, rank=ranks.rank, world_size=ranks.count, timeout=_TIMEOUT)
 
 
