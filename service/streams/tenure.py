@@ -2,6 +2,7 @@
 
 import hashlib
 import time
+import zlib
 from collections.abc import Callable, Sequence
 from typing import Final, Protocol
 
@@ -36,8 +37,9 @@ class Peers(Protocol):
 class Tenure:
     """The role of one node on one stream; only the worker of the stream changes it.
 
-    A term is the time of taking over in milliseconds since 1970, or one more than the newest term if that is later. So
-    it rises when all nodes restart, too.
+    A term is the time of taking over in microseconds since 1970, with the last three digits drawn from the name of the
+    node, or one more than the newest term if that is later. So it rises when all nodes restart, too, and two nodes that
+    take over in one millisecond have different terms.
 
     Args:
         node: name of this node.
@@ -96,7 +98,7 @@ class Tenure:
 
     def take_over(self, why: str, *, unix_ms: Callable[[], int] = lambda: time.time_ns() // 1_000_000) -> None:
         """This node answers from now on, in a new term."""
-        self.term = max(self.term + 1, unix_ms())
+        self.term = max(self.term + 1, 1000 * unix_ms() + zlib.crc32(self.node.encode()) % 1000)
         self.role, self.leader = "answers", self.node
         log.warning("answers the stream", stream=self.stream, term=self.term, why=why)
 

@@ -97,7 +97,10 @@ def report(consumer, driver, streams, model, changes):
         starts = [one.estimate.start_us for one in got]
         doubled, broken = len(starts) - len(set(starts)), gaps(starts, WINDOW_US)
         wanted = driver.reference(stream, model)
-        wrong = sum(one.estimate.twists != twists_of(wanted[one.estimate.start_us]) for one in got)
+        unequal = [one.estimate for one in got if one.estimate.twists != twists_of(wanted[one.estimate.start_us])]
+        wrong = len(unequal)
+        for one in unequal[:1]:
+            print(f"{stream}: the first that is not equal begins at {one.start_us} us, from {one.node}: {one.flags}")
         again = consumer.dropped.get(stream, [])
         print(f"{stream}: {len(got)} windows, {doubled} doubled, {len(broken)} gaps, {wrong} not equal; ", end="")
         print(f"{len(again)} of an earlier term or published twice, dropped by the rule")
