@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from neurove_core.engine import array_plain, sparse_int8_kernels, sparse_kernels
 from neurove_core.engine.array_folding import ArrayLayer
-from neurove_core.engine.spike_lists import SPARE, SpikeList, empty_list, fill_spikes, in_groups, output_shape
+from neurove_core.engine.spike_lists import SpikeList, empty_list, fill_spikes, in_groups, list_of, output_shape
 from neurove_core.engine.tiles import tile_of
 from neurove_core.engine.vectors import cells_tile, has_byte_products, list_tile
 from neurove_core.networks import tables
@@ -263,17 +263,6 @@ def fits(layers: Sequence[ArrayLayer], projection: ArrayLayer) -> bool:
         and all(_largest_sum(layer) < 1 << 31 for layer in layers)
         and _largest_sum(projection) < 1 << 31
     )
-
-
-def list_of(maps: NDArray[np.bool_]) -> SpikeList:
-    """The spike list of maps (R, H, W, C)."""
-    flat = maps.reshape(maps.shape[0], -1)
-    found = np.nonzero(flat)[1]
-    indices = np.zeros(found.size + SPARE, np.int32)
-    indices[: found.size] = found
-    cells = np.count_nonzero(maps.reshape(-1, maps.shape[3]), axis=1)
-    starts = np.concatenate([[0], np.cumsum(cells)]).astype(np.int32)
-    return SpikeList(indices, starts, maps.shape, found.size)
 
 
 def _largest_sum(layer: ArrayLayer) -> int:
