@@ -262,7 +262,9 @@ class Transport:
         thread.start()
         self._answering.append((queryable, desk, thread))
 
-    def ask(self, key: str, request: bytes, timeout_s: float, *, bulk: bool = False) -> list[Reply]:
+    def ask(
+        self, key: str, request: bytes, timeout_s: float, *, bulk: bool = False, urgent: bool = False
+    ) -> list[Reply]:
         """Query a key expression and wait for all replies.
 
         Args:
@@ -270,6 +272,7 @@ class Transport:
             request: payload of the query.
             timeout_s: replies after this time are ignored [s].
             bulk: the reply is large and not urgent: query and reply have a lower priority than all other data.
+            urgent: query and reply overtake all data, and are dropped where a peer that hangs has filled its link.
 
         Returns:
             replies in order of arrival; empty if no peer answered in time.
@@ -278,7 +281,10 @@ class Transport:
             PeerError: a peer refused; it has the code and the reason of the peer.
         """
         priority = zenoh.Priority.DATA_LOW if bulk else zenoh.Priority.DATA
-        return list(_query(self.session, key, request, timeout_s, priority, zenoh.ConsolidationMode.AUTO))
+        congestion = zenoh.CongestionControl.BLOCK
+        if urgent:
+            priority, congestion = zenoh.Priority.INTERACTIVE_HIGH, zenoh.CongestionControl.DROP
+        return list(_query(self.session, key, request, timeout_s, priority, zenoh.ConsolidationMode.AUTO, congestion))
 
     def ask_streaming(self, key: str, request: bytes, timeout_s: float) -> Iterator[Reply]:
         """Query one node and yield every reply as it arrives; replies with PROGRESS_SCHEMA precede the last one.
@@ -338,6 +344,7 @@ def _query(
     timeout_s: float,
     priority: zenoh.Priority,
     mode: zenoh.ConsolidationMode,
+    congestion: zenoh.CongestionControl = zenoh.CongestionControl.BLOCK,
 ) -> Iterator[Reply]:
     channel: Any = zenoh.handlers.FifoChannel(64)
     replies = session.get(
@@ -347,7 +354,7 @@ def _query(
         timeout=timeout_s,
         priority=priority,
         consolidation=mode,
-        congestion_control=zenoh.CongestionControl.BLOCK,
+        congestion_control=congestion,
     )
     for reply in replies:
         if reply.ok is not None:
