@@ -84,9 +84,10 @@ def _network(config: ModelConfig) -> None:
     }
     cells = (2, *config.window_shape)
     counts = (rng.random(cells) < _FIRING).astype(np.uint8) * rng.integers(1, 4, cells, dtype=np.uint8)
-    given: Any = Weights(config, tensors), np.zeros(6, np.float32), np.ones(6, np.float32)
+    weights: Any = Weights(config, tensors)  # and arrays where tensors are declared: see Bundle
+    offset: Any = np.zeros(6, np.float32)
     golden = Golden(counts, np.zeros((2, config.window.bins, 6), np.float32))
-    runner = runner_of(Bundle("compiling", False, "", config, *given, golden=golden))
+    runner = runner_of(Bundle("compiling", False, "", config, weights, offset, offset + 1, golden=golden))
     runner.run([with_history(counts[0], (), config)], [runner.initial_state()])
 
 
@@ -100,7 +101,9 @@ def _events(config: ModelConfig) -> None:
 
 def _refinement(config: ModelConfig) -> None:
     camera = warm_camera(_sensor(config))
-    compile_refinement(View.of(camera), camera)
+    view = View.of(camera)
+    if view is not None:
+        compile_refinement(view, camera)
 
 
 def _sensor(config: ModelConfig) -> Sensor:
