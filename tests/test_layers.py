@@ -92,8 +92,8 @@ MAY_IMPORT = {
     ),
     "neurove_service.ros2": "core:extras core:geometry core:io core:io.formats clock_offset guard logs transport",
     "neurove_service.node": (
-        "core:files core:geometry core:models logs guard lifecycle latency endpoints config transport streams models "
-        "metrics"
+        "core:compiled core:files core:geometry core:models logs guard lifecycle latency endpoints config transport "
+        "streams models metrics"
     ),
     "neurove_service.fleet": "core:files logs config labels transport clients",
     "neurove_service.page": "logs config guard transport clients",
