@@ -20,7 +20,7 @@ from neurove_core.io.recording import Recording
 from neurove_core.models.bounds import UNSET, Bounds
 from neurove_core.models.bundle import PER_HEIGHT, Bundle, LinearUnit
 from neurove_core.networks.arrays import Runner, State
-from neurove_core.refine import errors, ground
+from neurove_core.refine import errors, ground, standing
 from neurove_core.refine.ground import GroundState
 from neurove_core.refine.rotation import Filter, Given, Rate, refine
 from neurove_core.refine.rotation import Refined as RotationFound
@@ -218,6 +218,7 @@ class Estimator:
             estimate: the network's.
             state: of the stream.
         """
+        estimate, state = _held(window, estimate, state)
         if window.sample is None or state.view is None or estimate.covariance is None:
             return estimate, state
         height_m = (state.camera.height_m if state.camera else None) or 1.0
@@ -343,6 +344,21 @@ def _is_finite(estimator: Estimator, state: StreamState) -> bool:
     return True
 
 
+def _held(window: Window, estimate: WindowEstimate, state: StreamState) -> Refined:
+    """The network's estimate by what is known of a stop too, see `refine.standing`."""
+    if window.sample is None or state.view is None or state.camera is None or estimate.covariance is None:
+        return estimate, state
+    if state.camera.height_m is None:
+        return estimate, state
+    share = (window.events - window.outside) / max(state.low_activity_below, 1.0)
+    about = estimate.end_us, share, state.camera.height_m, state.ground.standing
+    found = standing.hold(estimate.twists, estimate.covariance, *about)
+    state = state._replace(ground=state.ground._replace(standing=found.standing))
+    if found.standing.sigma_m_s is None:
+        return estimate, state
+    return estimate._replace(twists=found.twists, covariance=found.covariance, source="refined"), state
+
+
 def _turned(estimate: WindowEstimate, found: RotationFound) -> WindowEstimate:
     """The estimate with the angular part of the refinement by rotation."""
     if estimate.covariance is None:
@@ -384,7 +400,8 @@ def _over_ground(
     events = ground.events_of(state.view, window.sample, window.start_us)
     sigma = np.sqrt(np.diagonal(estimate.covariance)[3:]) if sigma_rad_s is None else sigma_rad_s
     known = estimate.twists.mean(axis=0), sigma, state.ground
-    measured = estimate.covariance[3:, 3:] if estimate.source == "refined" else None
+    turned = estimate.source == "refined" and not estimate.low_activity
+    measured = estimate.covariance[3:, 3:] if turned else None
     answer = ground.refine(events, estimate.start_us, estimate.end_us, state.camera, *known, measured)
     state = state._replace(ground=answer.state)
     if answer.outcome not in ("accepted", "turning") or answer.motion is None:
