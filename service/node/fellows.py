@@ -149,7 +149,7 @@ class Fellows:
     def _ask(self, key: str, request: Message, reply: type[MessageT], timeout_s: float) -> list[MessageT]:
         """The replies of the nodes; one that refuses, or whose reply cannot be read, costs itself."""
         try:
-            answers = self._transport.ask(key, request.encode(), timeout_s, urgent=reply is DutyReply)
+            answers = self._transport.ask(key, request.encode(), timeout_s, "urgent" if reply is DutyReply else "usual")
         except NeuroVEError as error:  # a node refused
             log.debug("no answer", key=key, why=error.message)
             return []

@@ -201,13 +201,16 @@ class Sync:
         self._asked: deque[_Asked] = deque()
         self._end_us: int | None = None  # of the state that was fetched last
 
-    def ask(self, digest: str, timeout_s: float, wake: Callable[[], None]) -> Found | None:
+    def ask(self, node: str, digest: str, timeout_s: float, wake: Callable[[], None]) -> StateReply | None:
         """The state of this node for the model with this digest; called on another thread."""
         asked = _Asked(digest, [], threading.Event())
         self._asked.append(asked)
         wake()
         asked.done.wait(timeout_s)
-        return asked.found[0] if asked.found else None
+        if not asked.found:
+            return None
+        end_us, data = asked.found[0]
+        return StateReply(node=node, stream=self._stream, digest=digest, end_us=end_us, data=data)
 
     def serve(self, stream: Stream) -> None:
         """Answer the other threads."""

@@ -57,13 +57,12 @@ class Pair:
         on_close: Callable[["Pair"], None] = lambda _: None,
     ) -> None:
         self._tenure, self._peers, self._wake, self._now_ns, self._on_close = tenure, peers, wake, now_ns, on_close
-        self._stream = tenure.stream
+        self._stream, self._asking = tenure.stream, Asking(tenure, peers, now_ns)
         self._following, self._sync = Following(), Sync(tenure.stream)
-        self._asking = Asking(tenure, peers, now_ns)
         self._calls: deque[Callable[[], None]] = deque()  # from other threads, for the worker
         self._turned_ns = self._answered_ns = now_ns()
         self._pause_ns, self._window_ns = 0, 50_000_000  # longest pause of the worker since the last answer
-        self._last: TwistEstimate | None = None  # published last
+        self._last_us: int | None = None  # start of the window that was published last
         self._renewed = False  # since an estimate was heard
 
     @property
@@ -119,9 +118,7 @@ class Pair:
 
     def state(self, digest: str, timeout_s: float) -> StateReply | None:
         """The state of the stream for a follower; None if this node has no such state, or is stuck."""
-        found = self._sync.ask(digest, timeout_s, self._wake)
-        about = {"node": self._tenure.node, "stream": self._stream, "digest": digest}
-        return StateReply.model_validate(about | found._asdict()) if found else None
+        return self._sync.ask(self._tenure.node, digest, timeout_s, self._wake)
 
     def status(self) -> StandbyStatus:
         """For the status of the stream."""
@@ -163,11 +160,7 @@ class Pair:
         self._note_pause()
         self._run_calls()
         self._sync.serve(stream)
-        leader, used = self._tenure.leader, self._sync.is_used(stream)
-        if self._tenure.role == "follows" and self._following.wants_state(self._now_ns(), used=used):
-            asked = self._sync.fetch(stream, lambda digest: self._peers.state(self._stream, leader, digest))
-            self._following.took(asked)
-            self._note_pause()
+        self._take_state(stream)
         return [] if self._tenure.answers else self._due()
 
     def wait_s(self, most_s: float) -> float:
@@ -198,11 +191,6 @@ class Pair:
         self._run_calls()
 
     @property
-    def _last_us(self) -> int | None:
-        """Start of the window that this node published last."""
-        return self._last.start_us if self._last else None
-
-    @property
     def _due_in_s(self) -> float:
         """When this node takes over, unless another estimate is heard; infinite if nothing is kept [s]."""
         since_ns = self._following.since_ns
@@ -218,15 +206,20 @@ class Pair:
             self._renewed = True
             self._following.renew(self._now_ns(), doubt=is_long(late_ns, self._window_ns))
             return []
-        tenure.take_over("no other node answers" if tenure.role == "listens" else f"{tenure.leader} is late")
+        tenure.take_over(f"{tenure.leader} is late" if tenure.leader else "no other node answers")
         if self._following.other_model:
             log.warning("another model than before answers", stream=self._stream, before=self._following.other_model)
         return [self._stamped(estimate) for estimate in self._following.release()]
 
     def _stamped(self, estimate: TwistEstimate) -> TwistEstimate:
-        seq = self._following.seq_of(estimate)
-        self._last = estimate.model_copy(update={"seq": seq, "term": self._tenure.term})
-        return self._last
+        self._last_us = estimate.start_us
+        return estimate.model_copy(update={"seq": self._following.seq_of(estimate), "term": self._tenure.term})
+
+    def _take_state(self, stream: Stream) -> None:
+        ask, leader = self._peers.state, self._tenure.leader if self._tenure.role == "follows" else ""
+        if leader and self._following.wants_state(self._now_ns(), used=self._sync.is_used(stream)):
+            self._following.took(self._sync.fetch(stream, lambda digest: ask(self._stream, leader, digest)))
+            self._note_pause()
 
     def _hear(self, estimate: TwistEstimate) -> None:
         if self._tenure.hear(estimate.node or "", estimate.term or 0, self._now_ns()):
