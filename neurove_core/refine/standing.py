@@ -1,9 +1,10 @@
 """Standing: a vehicle that came to a stop is known by the events that it no longer makes.
 
 After a stop, the few events of noise that are left tell the network nothing, and its state goes on with a speed of its
-own. But moving edges make events: a camera whose window is `low_activity`, and whose last motion over the ground was
-slow, hardly moves. So the network's twist gets a second measurement, of zero, and both are fused by their covariances.
-Its sigma is proportional to the events. When they grow again, it is also at most what a vehicle gains since it stood.
+own. But moving edges make events: a camera whose last motion over the ground was slow, and whose window has a fraction
+of the events of `low_activity`, hardly moves. So the network's twist gets a second measurement, of zero, and both are
+fused by their covariances. Its sigma is proportional to the events. When they grow again, it is also at most what a
+vehicle gains since it stood.
 
 Few events alone do not tell a stop: dark ground or lost data look alike. A vehicle cannot stop at once, so the motion
 over the ground has to have become slow before.
@@ -19,9 +20,12 @@ Array = NDArray[np.float64]
 SLOW: Final = 0.5
 """Greatest speed over the height of the camera of a slow motion [1/s]."""
 
-SPEED: Final = 0.5
+FEW: Final = 0.25
+"""Greatest number of events at a stop, over that below which a window is `low_activity`."""
+
+SPEED: Final = 1.0
 """Sigma of the speed over the height of the camera, where the events are just as many as low activity asks [1/s].
-Streets make so many at 0.1 to 0.16 (own seeds, see decision 135)."""
+Streets make so many at 0.3 (own seeds, see decision 135)."""
 
 RATE: Final = 0.1
 """The same of the angular velocity [rad/s]."""
@@ -32,8 +36,8 @@ SPEED_FLOOR: Final = 0.02
 RATE_FLOOR: Final = 0.005
 """The same of the angular velocity [rad/s]."""
 
-ACCELERATION_M_S2: Final = 3.0
-"""Of a vehicle that starts."""
+ACCELERATION_M_S2: Final = 1.5
+"""Sigma of the acceleration of a vehicle that starts."""
 
 TURN_RAD_S2: Final = 0.5
 """The same for its angular velocity."""
@@ -47,7 +51,7 @@ class Standing(NamedTuple):
 
     slow_us: int | None = None  # end of the newest window with a slow motion over the ground, or at a stop
     stood_us: int | None = None  # end of the newest window at a stop
-    low: bool = False  # whether the newest window is `low_activity`
+    few: bool = False  # whether the newest window has FEW events
     sigma_m_s: float | None = None  # of the speed in the newest window; None if no stop is known
 
 
@@ -71,19 +75,20 @@ def hold(twists: Array, covariance: Array, end_us: int, share: float, height_m: 
         before: what was known.
     """
     slow_us, stood_us = (None if one is None or end_us - one > KEPT_US else one for one in before[:2])
-    if share < 1 and slow_us is not None:
+    few = share < FEW
+    if few and slow_us is not None:
         slow_us, stood_us = end_us, end_us
     if stood_us is None:
-        return Held(twists, covariance, Standing(slow_us, None, share < 1))
+        return Held(twists, covariance, Standing(slow_us, None, few))
     speed_m_s, rate_rad_s = height_m * SPEED * share, RATE * share
-    if share >= 1:
+    if not few:
         since_s = (end_us - stood_us) / 1e6
         speed_m_s, rate_rad_s = min(speed_m_s, ACCELERATION_M_S2 * since_s), min(rate_rad_s, TURN_RAD_S2 * since_s)
     sigma = [max(speed_m_s, SPEED_FLOOR * height_m)] * 3 + [max(rate_rad_s, RATE_FLOOR)] * 3
     stands = np.diag(np.square(sigma))
     both = np.linalg.inv(covariance + stands)
     fused = stands @ both @ covariance
-    return Held(twists @ both @ stands, (fused + fused.T) / 2, Standing(slow_us, stood_us, share < 1, sigma[0]))
+    return Held(twists @ both @ stands, (fused + fused.T) / 2, Standing(slow_us, stood_us, few, sigma[0]))
 
 
 def outweighs(standing: Standing, sigma_m_s: float) -> bool:
@@ -94,5 +99,5 @@ def outweighs(standing: Standing, sigma_m_s: float) -> bool:
 def answered(standing: Standing, end_us: int, speed: float) -> Standing:
     """What is known of a stop after a motion over the ground was accepted, with this speed over the height [1/s]."""
     if speed > SLOW:
-        return Standing(low=standing.low)
-    return standing._replace(slow_us=end_us, stood_us=standing.stood_us if standing.low else None)
+        return Standing(few=standing.few)
+    return standing._replace(slow_us=end_us, stood_us=standing.stood_us if standing.few else None)

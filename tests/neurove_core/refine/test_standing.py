@@ -51,13 +51,17 @@ def test_a_stop_lasts_while_there_are_few_events():
 
 
 def test_the_more_events_the_less_a_stop_counts():
-    speeds = [speed(share, slow()) for share in (0.05, 0.3, 0.9)]
+    speeds = [speed(share, slow()) for share in (0.02, 0.1, 0.24)]
     assert speeds == sorted(speeds)
     assert speeds[-1] > 5 * speeds[0]
 
 
+def test_a_slow_motion_with_its_events_is_no_stop():
+    assert speed(0.4, slow()) == 2.0
+
+
 def test_a_vehicle_that_starts_gains_speed_no_faster_than_vehicles_do():
-    standing = hold(NETWORK, COVARIANCE, WINDOW_US, 0.5, 1.0, slow()).standing
+    standing = hold(NETWORK, COVARIANCE, WINDOW_US, 0.24, 1.0, slow()).standing
     speeds = []
     for count in range(1, 20):
         found = hold(NETWORK, COVARIANCE, (1 + count) * WINDOW_US, 5.0, 1.0, standing)
@@ -69,12 +73,12 @@ def test_a_vehicle_that_starts_gains_speed_no_faster_than_vehicles_do():
 
 
 def test_a_motion_over_the_ground_counts_where_it_is_more_certain():
-    standing = hold(NETWORK, COVARIANCE, WINDOW_US, 0.5, 1.0, slow()).standing
+    standing = hold(NETWORK, COVARIANCE, WINDOW_US, 0.24, 1.0, slow()).standing
     assert outweighs(standing, 0.5)
-    assert not outweighs(standing, 0.1)
+    assert not outweighs(standing, 0.2)
 
 
 def test_a_motion_that_is_found_ends_the_stop():
-    standing = hold(NETWORK, COVARIANCE, WINDOW_US, 0.5, 1.0, slow()).standing
+    standing = hold(NETWORK, COVARIANCE, WINDOW_US, 0.24, 1.0, slow()).standing
     moving = hold(NETWORK, COVARIANCE, 2 * WINDOW_US, 2.0, 1.0, standing).standing
     assert speed(2.0, answered(moving, 2 * WINDOW_US, 0.2), 3 * WINDOW_US) == 2.0
