@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import Any, Final, NamedTuple, Self
+from typing import Any, Final, Literal, NamedTuple, Self
 
 import zenoh
 
@@ -42,6 +42,9 @@ TIMESTAMPS: Final = {"timestamping/enabled": True}  # messages carry the time of
 SMALL_BATCHES: Final = {"transport/link/tx/batch_size": 1 << 14}  # a packet that waits holds the buffer of its batch
 _RETRY_S = 0.5
 _SENT = struct.Struct("<q")  # the attachment of a packet: time of sending [us]
+Haste = Literal["bulk", "usual", "urgent"]
+_P = zenoh.Priority
+_PRIORITIES: dict[Haste, zenoh.Priority] = {"bulk": _P.DATA_LOW, "usual": _P.DATA, "urgent": _P.INTERACTIVE_HIGH}
 
 OnSample = Callable[[str, bytes, int], None]
 """Key, payload, and time of reception (monotonic) [ns]. Runs on Zenoh's thread: it must only append and return."""
@@ -151,12 +154,11 @@ class Transport:
             schema: Zenoh Encoding of its messages.
             urgent: for estimates: sent before ordinary data and never batched.
         """
-        priority = zenoh.Priority.DATA_HIGH if urgent else zenoh.Priority.DATA
         declared = self.session.declare_publisher(
             key,
             encoding=zenoh.Encoding(schema),
             congestion_control=zenoh.CongestionControl.DROP,
-            priority=priority,
+            priority=zenoh.Priority.DATA_HIGH if urgent else zenoh.Priority.DATA,
             express=urgent,
         )
         return Publisher(declared)
@@ -263,14 +265,15 @@ class Transport:
         thread.start()
         self._answering.append((queryable, desk, thread))
 
-    def ask(self, key: str, request: bytes, timeout_s: float, *, bulk: bool = False) -> list[Reply]:
+    def ask(self, key: str, request: bytes, timeout_s: float, haste: Haste = "usual") -> list[Reply]:
         """Query a key expression and wait for all replies.
 
         Args:
             key: key expression.
             request: payload of the query.
             timeout_s: replies after this time are ignored [s].
-            bulk: the reply is large and not urgent: query and reply have a lower priority than all other data.
+            haste: `bulk`: query and reply have a lower priority than all other data. `urgent`: they overtake all data,
+                and are dropped where a peer that hangs has filled its link.
 
         Returns:
             replies in order of arrival; empty if no peer answered in time.
@@ -278,8 +281,7 @@ class Transport:
         Raises:
             PeerError: a peer refused; it has the code and the reason of the peer.
         """
-        priority = zenoh.Priority.DATA_LOW if bulk else zenoh.Priority.DATA
-        return list(_query(self.session, key, request, timeout_s, priority, zenoh.ConsolidationMode.AUTO))
+        return list(_query(self.session, key, request, timeout_s, haste, zenoh.ConsolidationMode.AUTO))
 
     def ask_streaming(self, key: str, request: bytes, timeout_s: float) -> Iterator[Reply]:
         """Query one node and yield every reply as it arrives; replies with PROGRESS_SCHEMA precede the last one.
@@ -287,7 +289,7 @@ class Transport:
         Raises:
             PeerError: as ask.
         """
-        return _query(self.session, key, request, timeout_s, zenoh.Priority.DATA, zenoh.ConsolidationMode.NONE)
+        return _query(self.session, key, request, timeout_s, "usual", zenoh.ConsolidationMode.NONE)
 
     def token(self, key: str) -> Callable[[], None]:
         """Declare a liveliness token; call the result to undeclare it."""
@@ -337,7 +339,7 @@ def _query(
     key: str,
     request: bytes,
     timeout_s: float,
-    priority: zenoh.Priority,
+    haste: Haste,
     mode: zenoh.ConsolidationMode,
 ) -> Iterator[Reply]:
     channel: Any = zenoh.handlers.FifoChannel(64)
@@ -346,9 +348,9 @@ def _query(
         channel,
         payload=request,
         timeout=timeout_s,
-        priority=priority,
+        priority=_PRIORITIES[haste],
         consolidation=mode,
-        congestion_control=zenoh.CongestionControl.BLOCK,
+        congestion_control=zenoh.CongestionControl.DROP if haste == "urgent" else zenoh.CongestionControl.BLOCK,
     )
     for reply in replies:
         if reply.ok is not None:
