@@ -24,9 +24,10 @@ from neurove_core.models.bundle import PER_HEIGHT, Bundle, LinearUnit
 from neurove_core.networks.kinds import State
 from neurove_core.networks.neurove import NetworkState, NeuroVE
 from neurove_core.networks.runner import Runner
-from neurove_core.refine import ground
+from neurove_core.refine import ground, scene
+from neurove_core.refine import stages as refining
 from neurove_core.refine.ground import GroundState
-from neurove_core.refine.rotation import Filter, Given, Rate, refine
+from neurove_core.refine.rotation import Given, Rate
 from neurove_core.refine.search import compile_kernels
 from neurove_core.refine.view import View
 from neurove_core.timescales import Answer, Longer, chosen, followed, jobs, slowed
@@ -50,14 +51,14 @@ class StreamState(NamedTuple):
     end_us: int | None = None  # end of the newest window that the network has processed
     low_activity_below: float = 0.0  # a window with fewer visible events is flagged low_activity
     view: View | None = None  # for the refinement; None where estimates are not refined
-    filter: Filter | None = None  # of the refinement
+    stages: refining.State = refining.State()  # of the refinement
     ground: GroundState = GroundState()  # of the refinement of the linear part
     recent: Recent = ()  # counts of earlier windows, for models with a history
     longer: Longer = Longer()  # for models with longer windows
 
     def without_refinement(self) -> "StreamState":
         """The state in which the refinement begins again."""
-        return self._replace(filter=None, ground=GroundState())
+        return self._replace(stages=refining.State(), ground=GroundState())
 
 
 class WindowEstimate(NamedTuple):
@@ -223,12 +224,18 @@ class Estimator:
             return estimate, state
         height_m = (state.camera.height_m if state.camera else None) or 1.0
         about = window.start_us, self.config.window.duration_us, window.sample, state.view, estimate.twists.mean(axis=0)
-        found = refine(Given(*about, estimate.covariance, estimate.low_activity, state.filter, height_m))
-        if found.outcome == "accepted":
-            twists, covariance = _with_rate(estimate.twists, estimate.covariance, found.rate, found.change_rad_s)
+        given = Given(*about, estimate.covariance, estimate.low_activity, None, height_m)
+        found = refining.refine(given, state.stages)
+        turn, state = found.turn, state._replace(stages=found.state)
+        if turn.outcome == "accepted":
+            twists, covariance = _with_rate(estimate.twists, estimate.covariance, turn.rate, turn.change_rad_s)
+            if found.velocity is not None:
+                twists[:, :3], covariance[:3, :3] = found.velocity
             uncertain = self.is_uncertain(twists, covariance)
             estimate = estimate._replace(twists=twists, covariance=covariance, source="refined", uncertain=uncertain)
-        return _over_ground(self, window, estimate, state._replace(filter=found.filter), found.sigma_rad_s)
+        if not found.level:
+            return estimate, state._replace(ground=GroundState())
+        return _over_ground(self, window, estimate, state, turn.sigma_rad_s)
 
     def is_uncertain(self, twists: NDArray[np.float64], covariance: NDArray[np.float64]) -> bool:
         """Whether sigma exceeds the bounds, see `Uncertainty.is_uncertain`; False for a model without uncertainty."""
@@ -338,6 +345,7 @@ def _is_finite(estimator: Estimator, state: StreamState) -> bool:
     """Whether the estimates of some events are finite; this compiles all code."""
     if state.view is not None:
         compile_kernels(state.view.grid)
+        scene.compile_kernels(state.view.grid)
         ground.compile_kernels(_warm_camera(state.sensor))
     for given in _warm_events(state.sensor, estimator.config.window.duration_us):
         answer = estimator.push(given, state._replace(windows=WindowsState()), 0)
