@@ -237,7 +237,7 @@ def _predicted(window: Window, before: Scene | None) -> tuple[Array, Array]:
     known = np.linalg.inv(window.covariance)
     weighted[:3] += known @ window.w_rad_s
     information[:3, :3] += known
-    return np.linalg.solve(information, weighted), information
+    return np.asarray(np.linalg.solve(information, weighted)), np.asarray(information)
 
 
 def _unknown(grid: Grid) -> Array:
@@ -302,4 +302,4 @@ def _basis(x: Array, y: Array, grid: Grid) -> Array:
     for ray, first, size, count in ((x, grid.left, grid.width, COLUMNS), (y, grid.top, grid.height, ROWS)):
         place = np.clip((ray - first) * (grid.focal / size * (count - 1)), 0, count - 1)
         hats.append(np.maximum(1 - np.abs(place[:, None] - np.arange(count)), 0))
-    return (hats[1][:, :, None] * hats[0][:, None, :]).reshape(x.size, -1)
+    return np.asarray((hats[1][:, :, None] * hats[0][:, None, :]).reshape(x.size, -1))
