@@ -155,8 +155,12 @@ class ModelConfig(Config):
         (4.0, 0.5),
         description="Greatest linear (model's unit) and angular [rad/s] speed, times the scale, of a longer window.",
     )
+    scale_floor: tuple[float, float] = Field(
+        (0.25, 0.04),
+        description="Speeds of one window; with less of both the camera may be stationary: no longer window answers.",
+    )
 
-    LATER = ("scales", "scale_bounds")
+    LATER = ("scales", "scale_bounds", "scale_floor")
 
     @model_validator(mode="after")
     def _scales_rise(self) -> Self:
@@ -164,6 +168,8 @@ class ModelConfig(Config):
             raise ValueError(f"scales={self.scales}: must rise, from at least 2 to at most {MAX_HISTORY}")
         if not min(self.scale_bounds) > 0:
             raise ValueError(f"scale_bounds={self.scale_bounds}: both must be above 0")
+        if not min(self.scale_floor) >= 0:
+            raise ValueError(f"scale_floor={self.scale_floor}: both must be at least 0")
         if self.scales and self.network.history:
             raise ValueError(f"scales={self.scales}: a model with network.history={self.network.history} has none")
         return self

@@ -24,13 +24,14 @@ from neurove_core.models.bundle import PER_HEIGHT, Bundle, LinearUnit
 from neurove_core.networks.kinds import State
 from neurove_core.networks.neurove import NetworkState, NeuroVE
 from neurove_core.networks.runner import Runner
-from neurove_core.refine import ground, scene
+from neurove_core.refine import errors, ground, scene
 from neurove_core.refine import stages as refining
 from neurove_core.refine.ground import GroundState
 from neurove_core.refine.rotation import Given, Rate
+from neurove_core.refine.rotation import Refined as RotationFound
 from neurove_core.refine.search import compile_kernels
 from neurove_core.refine.view import View
-from neurove_core.timescales import Answer, Longer, chosen, followed, jobs, slowed
+from neurove_core.timescales import Answer, Longer, chosen, followed, jobs, slowed, watched
 from neurove_protocol import CameraInfo, Events, Sensor
 from neurove_protocol.errors import BadModel
 from neurove_protocol.events import EventPacket, PacketLimits, WireEvents, encode_packet
@@ -226,21 +227,22 @@ class Estimator:
         about = window.start_us, self.config.window.duration_us, window.sample, state.view, estimate.twists.mean(axis=0)
         given = Given(*about, estimate.covariance, estimate.low_activity, None, height_m)
         found = refining.refine(given, state.stages)
-        turn, state = found.turn, state._replace(stages=found.state)
-        if turn.outcome == "accepted":
-            twists, covariance = _with_rate(estimate.twists, estimate.covariance, turn.rate, turn.change_rad_s)
-            if found.velocity is not None:
-                twists[:, :3], covariance[:3, :3] = found.velocity
-            uncertain = self.is_uncertain(twists, covariance)
-            estimate = estimate._replace(twists=twists, covariance=covariance, source="refined", uncertain=uncertain)
-        if not found.level:
-            return estimate, state._replace(ground=GroundState())
-        return _over_ground(self, window, estimate, state, turn.sigma_rad_s)
+        state = state._replace(stages=found.state)
+        if found.turn.outcome == "accepted":
+            estimate = _turned(estimate, found.turn, found.velocity)
+        answer = estimate
+        if found.level:
+            answer, state = _over_ground(window, estimate, state, found.turn.sigma_rad_s)
+        else:
+            state = state._replace(ground=GroundState())
+        if answer is estimate and found.velocity is None:
+            answer = _with_errors(estimate, found.turn, height_m)
+        return answer._replace(uncertain=self.is_uncertain(answer.twists, answer.covariance)), state
 
-    def is_uncertain(self, twists: NDArray[np.float64], covariance: NDArray[np.float64]) -> bool:
+    def is_uncertain(self, twists: NDArray[np.float64], covariance: NDArray[np.float64] | None) -> bool:
         """Whether sigma exceeds the bounds, see `Uncertainty.is_uncertain`; False for a model without uncertainty."""
         unsure = self.bundle.uncertainty
-        return unsure is not None and unsure.is_uncertain(twists, covariance, self._bounds)
+        return unsure is not None and covariance is not None and unsure.is_uncertain(twists, covariance, self._bounds)
 
     def has_same_windows(self, other: "Estimator") -> bool:
         """Whether both models use the same windows and canonical camera, so that one can use the other's windows."""
@@ -264,18 +266,17 @@ class Estimator:
         wanted, longer = jobs(window.counts, stream.state.longer, self.network, self.config)
         runs = self._runner.run([job.counts for job in wanted], [job.state for job in wanted]) if wanted else []
         longer = followed(longer, [(job, state) for job, (_, state) in zip(wanted, runs, strict=True)], self.config)
-        stream.state = stream.state._replace(longer=longer)
+        stream.state = stream.state._replace(longer=watched(longer, answer.twists, self.config))
         answers = [answer]
         for job, (twists, state) in zip(wanted, runs, strict=True):
             answers.append(Answer(slowed(twists * self._scale + self._offset, job.scale), state, job.scale))
-        return chosen(answers, longer.windows, self.config.scale_bounds)
+        return chosen(answers, stream.state.longer, self.config.scale_bounds)
 
     def _reset_after_gap(self, stream: _Progress, window: Window) -> None:
         """Reset the network state where a window does not follow the one before it."""
         if stream.state.end_us not in (None, window.start_us) and not window.bridged:
-            stream.state = stream.state._replace(
-                network=self.network.initial_state(), age=0, recent=(), longer=Longer()
-            )
+            fresh = self.network.initial_state()
+            stream.state = stream.state._replace(network=fresh, age=0, recent=(), longer=Longer())
 
     def _take(self, stream: _Progress, window: Window, twists: NDArray[np.float64], network: State) -> None:
         answer = self._chosen(stream, window, Answer(twists, network))
@@ -318,7 +319,7 @@ class Estimator:
             low_activity=window.events - window.outside < before.low_activity_below,
             saturated=bool(window.counts.max() == 255),
             covariance=covariance,
-            uncertain=covariance is not None and self.is_uncertain(twists, covariance),
+            uncertain=self.is_uncertain(twists, covariance),
         )
 
 
@@ -356,8 +357,28 @@ def _is_finite(estimator: Estimator, state: StreamState) -> bool:
     return True
 
 
+def _turned(estimate: WindowEstimate, found: RotationFound, velocity: refining.Velocity | None) -> WindowEstimate:
+    """The estimate with the angular part of the refinement, and with a linear part where it found one."""
+    if estimate.covariance is None:
+        return estimate
+    twists, covariance = _with_rate(estimate.twists, estimate.covariance, found.rate, found.change_rad_s)
+    if velocity is not None:
+        twists[:, :3], covariance[:3, :3] = velocity
+    return estimate._replace(twists=twists, covariance=covariance, source="refined")
+
+
+def _with_errors(estimate: WindowEstimate, found: RotationFound, height_m: float) -> WindowEstimate:
+    """An estimate without the ground, whose covariance has the terms of `refine.errors`."""
+    if estimate.covariance is None:
+        return estimate
+    covariance = estimate.covariance.copy()
+    if found.errors is not None:
+        covariance[3:, 3:] = (found.errors + found.errors.T) / 2
+    rate_rad_s = float(np.linalg.norm(estimate.twists.mean(axis=0)[3:]))
+    return estimate._replace(covariance=errors.of_unknown_depth(covariance, found.shift, rate_rad_s, height_m))
+
+
 def _over_ground(
-    estimator: Estimator,
     window: Window,
     estimate: WindowEstimate,
     state: StreamState,
@@ -366,15 +387,15 @@ def _over_ground(
     """The estimate with the motion over level ground, where it is accepted; see `refine.ground`.
 
     Args:
-        estimator: made the estimate.
         window: with the sample of its events.
-        estimate: so far.
+        estimate: so far; it stays the same object if the answer is not accepted.
         state: of the stream.
         sigma_rad_s: (3,) of its angular part; None for that of its covariance.
     """
     if window.sample is None or state.view is None or state.camera is None or estimate.covariance is None:
         return estimate, state
-    if state.camera.height_m is None:
+    height_m = state.camera.height_m
+    if height_m is None:
         return estimate, state  # nothing says that the camera looks at level ground
     events = ground.events_of(state.view, window.sample, window.start_us)
     sigma = np.sqrt(np.diagonal(estimate.covariance)[3:]) if sigma_rad_s is None else sigma_rad_s
@@ -384,12 +405,13 @@ def _over_ground(
     state = state._replace(ground=answer.state)
     if answer.outcome not in ("accepted", "turning") or answer.motion is None:
         return estimate, state
-    twists, covariance = np.tile(answer.motion.twist, (len(estimate.twists), 1)), answer.motion.covariance
+    twist, after = answer.motion.twist, answer.state
+    covariance = errors.of_ground(twist, answer.motion.covariance, after.tilt, after.pitch_sigma, height_m)
+    twists = np.tile(twist, (len(estimate.twists), 1))
     if answer.outcome == "turning":
-        rate = Rate(answer.motion.twist[3:], covariance[3:, 3:])
+        rate = Rate(twist[3:], covariance[3:, 3:])
         twists, covariance = _with_rate(estimate.twists, estimate.covariance, rate, np.zeros(3))
-    uncertain = estimator.is_uncertain(twists, covariance)
-    return estimate._replace(twists=twists, covariance=covariance, source="refined", uncertain=uncertain), state
+    return estimate._replace(twists=twists, covariance=covariance, source="refined"), state
 
 
 def _warm_events(sensor: Sensor, duration_us: int) -> tuple[Events, WireEvents]:

@@ -6,6 +6,9 @@ times as long, and its twist is divided by s. This happens in every window, with
 long windows that follow each other. The search begins at the shortest scale: while an estimate, sped up to the next
 scale, stays within `scale_bounds`, the next scale answers instead. A fast motion thus never reaches a scale at which it
 aliases.
+
+The noise of a stationary camera adds up in a long window, where it looks like motion. In one window the network tells
+both apart. So a long window answers only if the network sees a motion in each window that is part of it: `scale_floor`.
 """
 
 from collections.abc import Sequence
@@ -30,6 +33,7 @@ class Longer(NamedTuple):
     states: tuple[
         tuple[State, ...], ...
     ] = ()  # of each scale, one for each of its turns; empty before the first window
+    moving: int = 0  # newest windows in a row in which the network sees a motion
 
 
 class Answer(NamedTuple):
@@ -66,7 +70,7 @@ def jobs(window: Counts, longer: Longer, network: Network, config: ModelConfig) 
         for at, scale in enumerate(scales)
         if len(seen) >= scale
     ]
-    return wanted, Longer(longer.windows + 1, seen[: max(scales) - 1], states)
+    return wanted, Longer(longer.windows + 1, seen[: max(scales) - 1], states, longer.moving)
 
 
 def merged(newest: Sequence[Counts], config: ModelConfig) -> Counts:
@@ -103,19 +107,29 @@ def slowed(twists: NDArray[np.float64], scale: int) -> NDArray[np.float64]:
     return np.tile(newest, (bins, 1))
 
 
-def chosen(answers: Sequence[Answer], windows: int, bounds: tuple[float, float]) -> Answer:
+def watched(longer: Longer, twists: NDArray[np.float64], config: ModelConfig) -> Longer:
+    """The state of a stream after the answer (n, 6) of the network to its newest window alone."""
+    still = _within(twists.mean(axis=0), config.scale_floor)
+    return longer._replace(moving=0 if still else longer.moving + 1)
+
+
+def chosen(answers: Sequence[Answer], longer: Longer, bounds: tuple[float, float]) -> Answer:
     """The answer of the longest scale that the motion allows.
 
     Args:
         answers: by scale, the shortest first.
-        windows: that the stream's longer windows have seen.
+        longer: state of the stream with its newest window.
         bounds: greatest linear and angular speed of a sped-up estimate.
     """
     best = answers[0]
     for answer in answers[1:]:
-        mean = best.twists.mean(axis=0) * answer.scale
-        within = all(np.linalg.norm(part) <= bound for part, bound in zip((mean[:3], mean[3:]), bounds, strict=True))
-        if windows < STEPS * answer.scale or not within:
+        known = longer.windows >= STEPS * answer.scale and longer.moving >= answer.scale
+        if not known or not _within(best.twists.mean(axis=0) * answer.scale, bounds):
             break
         best = answer
     return best
+
+
+def _within(twist: NDArray[np.float64], bounds: tuple[float, float]) -> bool:
+    """Whether a twist (6,) is at most as fast as the linear and the angular bound."""
+    return all(np.linalg.norm(part) <= bound for part, bound in zip((twist[:3], twist[3:]), bounds, strict=True))

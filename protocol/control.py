@@ -28,6 +28,9 @@ LATENCY_BOUNDS_MS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.
 MAX_FLAGS = 64
 """Cap of the flags that a StreamStatus counts."""
 
+MAX_LABELS = 16
+"""Cap of the labels of a node."""
+
 MAX_CHUNK_BYTES = 1 << 20
 MAX_SIGNATURE_BYTES = 1 << 16
 MAX_REQUEST_BYTES = 1 << 17
@@ -41,6 +44,9 @@ Digest = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 
 DigestPrefix = Annotated[str, Field(pattern="^[0-9a-f]{8,64}$")]
 """The first 8 or more digits of a digest."""
+
+Labels = Annotated[dict[Name, Name], Field(max_length=MAX_LABELS)]
+"""Labels of a node: name -> value; both follow the rule of names."""
 
 SignatureState = Literal["unsigned", "unchecked", "trusted", "untrusted"]
 """No signature; a signature, but this node trusts no key; signed by a trusted key; refused by the node."""
@@ -167,6 +173,18 @@ class ImuStatus(Part):
     problem: str  # what is wrong, in one sentence; empty if nothing is
 
 
+class StandbyStatus(Part):
+    """The part of a node in a stream that several nodes can answer."""
+
+    role: Literal["answers", "follows", "listens", "absent"]
+    leader: Name | None  # the node that answers; None if this node knows none
+    term: Count  # of that node
+    equal: bool  # the newest estimates of this node were those of the leader, bit for bit; only of a node that follows
+    other_model: str = ""  # of the newest other leader, where it is another one than that of this node
+    draining: bool = False
+    followers: Count = 0  # other nodes that serve the stream, where this one answers
+
+
 class StreamStatus(Message):
     """The verdict and the counters of one stream on one node, since the stream began."""
 
@@ -197,6 +215,7 @@ class StreamStatus(Message):
     latency_histogram: LatencyHistogram | None = None  # None from an older node
     flag_counts: Annotated[dict[str, Count], Field(max_length=MAX_FLAGS)] = Field(default_factory=dict)  # estimates
     sigma: Annotated[tuple[float, ...], Field(strict=False, min_length=6, max_length=6)] | None = None  # of the newest
+    standby: StandbyStatus | None = None  # None on a node without standby
 
 
 class ModelInfo(Part):
@@ -234,6 +253,7 @@ class HealthReply(Message):
     dropped_log_lines: Count = 0  # not read in time
     missing_streams: Annotated[tuple[Name, ...], Field(strict=False)] = ()  # expected, and without packets now
     namesakes: Count = 0  # other nodes of this name on the network
+    labels: Labels = Field(default_factory=dict)  # of its configuration, such as its site
 
 
 class ModelsReply(Message):

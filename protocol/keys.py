@@ -117,6 +117,22 @@ class Keys:
         """Liveliness token of a node that serves a stream."""
         return self._of_node(node, f"serves/{stream if stream == '*' else check_name('stream', stream)}")
 
+    def duty(self, node: str = "*") -> str:
+        """Queryable: whether a node answers or follows a stream; between nodes that stand by for each other."""
+        return self._of_node(node, "duty/role")
+
+    def state(self, node: str = "*") -> str:
+        """Queryable: the state of a stream that a node answers; for the node that follows it."""
+        return self._of_node(node, "duty/state")
+
+    def take(self, node: str = "*") -> str:
+        """Queryable: ask a node that follows a stream to answer it."""
+        return self._of_node(node, "duty/take")
+
+    def drain(self, node: str = "*") -> str:
+        """Queryable: hand over all streams of a node, before it is stopped."""
+        return self._of_node(node, "drain")
+
     def node_of(self, key: str) -> str:
         """The node that a concrete key below `@node` belongs to.
 
@@ -128,6 +144,20 @@ class Keys:
         if not key.startswith(head) or not leaf:
             raise InvalidField("key", "key", key, f"{head}<node>/<message>")
         return check_name("node", name)
+
+    def served_of(self, key: str) -> str:
+        """The stream of a key from `serves`.
+
+        >>> Keys().served_of("neurove/v1/@node/n1/serves/cam0")
+        'cam0'
+
+        Raises:
+            InvalidField: it is another key.
+        """
+        leaf = key.removeprefix(f"{self.prefix}/@node/{self.node_of(key)}/")
+        if not leaf.startswith("serves/"):
+            raise InvalidField("key", "key", key, f"{self.prefix}/@node/<node>/serves/<stream>")
+        return check_name("stream", leaf.removeprefix("serves/"))
 
     def stream_of(self, key: str) -> str:
         """The stream that a concrete stream key (events, camera, imu, velocity, status) belongs to.

@@ -119,6 +119,7 @@ class TwistEstimate(Message):
     node: Name | None = None  # the node that made the estimate
     host: HostTime | None = None  # None if the driver gives no time to learn from
     source: Source = "network"  # of the angular part
+    term: Count | None = None  # of the node that answers, see README; None from a node that has no standby
 
     @model_validator(mode="after")
     def _one_twist_per_bin(self) -> Self:

@@ -33,6 +33,7 @@ from neurove_protocol.events import MAX_PACKET_BYTES, PacketLimits
 from neurove_protocol.fields import WrongField
 from neurove_protocol.keys import DEFAULT_PREFIX, Keys, check_name
 from neurove_service.endpoints import check_address, check_endpoint
+from neurove_service.labels import check_labels
 
 log = logging.getLogger(__name__)
 
@@ -50,11 +51,30 @@ def _listed(value: object) -> object:
     return [part.strip() for part in value.split(",") if part.strip()] if isinstance(value, str) else value
 
 
+def _pairs(value: object) -> object:
+    """A table from the text of a flag or a variable: `site=hall-2,robot=spot`."""
+    if not isinstance(value, str):
+        return value
+    parts = [part.strip().partition("=") for part in value.split(",") if part.strip()]
+    for name, equals, _ in parts:
+        if not equals:
+            raise ValueError(f"{name!r} has no value: give NAME=VALUE,NAME=VALUE")
+    if len({name.strip() for name, _, _ in parts}) < len(parts):
+        raise ValueError("a name occurs twice")
+    return {name.strip(): text.strip() for name, _, text in parts}
+
+
 def _given(value: object) -> object:
     """A path, or several, that is not empty: an empty one would be the current folder."""
     if isinstance(value, str) and not value.strip():
         raise ValueError("must not be empty; the current folder is '.'")
     return value
+
+
+def _standby(value: object) -> object:
+    """The setting as text; TOML and the environment may also say true or false."""
+    text = str(value).lower()
+    return {"true": "last", "false": "off"}.get(text, value)
 
 
 Endpoints = Annotated[tuple[Annotated[str, AfterValidator(check_endpoint)], ...], NoDecode, BeforeValidator(_listed)]
@@ -113,6 +133,10 @@ class ServiceConfig(_Settings):
     node: Annotated[str, BeforeValidator(lambda value: check_name("node", str(value)))] = Field(
         "edge", description="Name of this node: one key chunk."
     )
+    labels: Annotated[dict[str, str], NoDecode, BeforeValidator(_pairs), AfterValidator(check_labels)] = Field(
+        {},
+        description="Labels of this node for `neurove fleet` and `neurove rollout`, such as site=hall-2,robot=spot.",
+    )
     mode: Literal["peer", "client", "router"] = Field(
         "peer", description="Zenoh mode: peer for direct links, client with a router."
     )
@@ -149,6 +173,11 @@ class ServiceConfig(_Settings):
     expect_streams: Annotated[Names, Field(description="Streams that must be served; health names a missing one.")] = ()
     allow_same_name: bool = Field(
         False, description="Start even if another node of this name is on the network; each estimate comes twice."
+    )
+    standby: Annotated[Literal["off", "lot", "last"], BeforeValidator(_standby)] = Field(
+        "off",
+        description="Stand by for other nodes on the same streams: one answers, the others follow and take over. lot: "
+        "any node may answer first; last or true: the other nodes take precedence; off or false: answer every stream.",
     )
     max_packet_events: int = Field(
         1_000_000,

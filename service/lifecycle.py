@@ -10,6 +10,7 @@ from types import FrameType
 from typing import Final
 
 _PARENT_CHECK_S = 0.5
+_ORPHAN_S: Final = 10.0  # for a clean end
 _ENDING: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _AGAIN_S = 0.001
 _OF_TUPLES: Final = ("namedtuple_", "numba.core.serialize")
@@ -86,6 +87,24 @@ def stop_on_signals(*, with_parent: bool = False, on_hangup: Callable[[], object
 
         threading.Thread(target=watch, name="parent watch", daemon=True).start()
     return stop
+
+
+def end_with_parent() -> None:
+    """End this process when its parent ends, as SIGTERM does, and after 10 s without a clean end at once.
+
+    A process may be deep in a library then, where no handler of Python runs.
+    """
+    parent = os.getppid()
+
+    def watch() -> None:
+        never = threading.Event()
+        while os.getppid() == parent:
+            never.wait(_PARENT_CHECK_S)
+        os.kill(os.getpid(), signal.SIGTERM)
+        never.wait(_ORPHAN_S)
+        os._exit(128 + signal.SIGTERM)
+
+    threading.Thread(target=watch, name="parent watch", daemon=True).start()
 
 
 def _call_on_hangup(on_hangup: Callable[[], object]) -> None:

@@ -168,8 +168,9 @@ class Transport:
         """Receive every message of a key expression until the result is called or the session is closed."""
         return self.subscribe_timed(key, lambda name, payload, received_ns, _: on_sample(name, payload, received_ns))
 
-    def subscribe_timed(self, key: str, on_sample: OnTimedSample) -> Callable[[], None]:
-        """As subscribe, with the time of sending, if the driver attaches it [us]."""
+    def subscribe_timed(self, key: str, on_sample: OnTimedSample, *, remote: bool = False) -> Callable[[], None]:
+        """As subscribe, with the time of sending, if the driver attaches it [us]; `remote`: not of this session."""
+        origin = zenoh.Locality.REMOTE if remote else zenoh.Locality.ANY
 
         def receive(sample: zenoh.Sample) -> None:
             received_ns = time.monotonic_ns()
@@ -178,7 +179,8 @@ class Transport:
             except Exception as error:  # noqa: BLE001  # one message must not end the subscription
                 self._guard.caught("message", error)
 
-        return _keep(self._kept, self.session.declare_subscriber(key, zenoh.handlers.Callback(receive, indirect=False)))
+        handler = zenoh.handlers.Callback(receive, indirect=False)
+        return _keep(self._kept, self.session.declare_subscriber(key, handler, allowed_origin=origin))
 
     def answer(self, key: str, handle: Callable[[bytes], bytes], schema: str = CONTROL_SCHEMA) -> None:
         """Answer the queries of a key on a separate thread; an error of `handle` goes to the caller.

@@ -24,6 +24,8 @@ MAY_IMPORT = {
     "neurove_core.compiled": "",
     "neurove_core.files": "",
     "neurove_core.extras": "",
+    "neurove_core.tasks": "",
+    "neurove_core.cluster": "extras tasks",
     "neurove_core.figures": "files extras",
     "neurove_core.geometry": "config",
     "neurove_core.spiking": "compiled",
@@ -37,25 +39,27 @@ MAY_IMPORT = {
     "neurove_core.estimator": "geometry ingest networks engine models io refine timescales",
     "neurove_core.self_test": "config models estimator",
     "neurove_core.aided": "estimator inertial",
+    "neurove_core.carried": "spiking networks refine estimator timescales",
     "neurove_core.io": "files extras figures geometry",
     "neurove_core.io.formats": "compiled files extras geometry io",
     "neurove_core.sim": "compiled config figures geometry io io.formats",
     "neurove_core.live": "extras io io.formats",
     "neurove_core.sources": "io io.formats live sim",
-    "neurove_core.evaluation": "compiled figures geometry networks models estimator inertial aided io",
+    "neurove_core.series": "files io.formats sources tasks",
+    "neurove_core.evaluation": "compiled figures geometry networks models estimator inertial aided io sources",
     "neurove_core.training": (
         "config files extras figures geometry ingest networks "
-        "engine models estimator self_test io io.formats sim sources timescales"
+        "engine models estimator self_test io io.formats sim sources tasks timescales"
     ),
     "neurove_core.adaptation": (
-        "config files geometry models estimator self_test io io.formats sources evaluation training"
+        "config files geometry models estimator self_test io io.formats sources tasks evaluation training"
     ),
     "neurove_core.bench": (
         "config compiled figures geometry spiking ingest networks engine models refine estimator sim sources"
     ),
     "neurove_core.experiments": (
         "config files extras figures geometry spiking ingest networks engine models estimator io sim sources "
-        "evaluation training"
+        "evaluation training tasks"
     ),
     "neurove_core": "spiking models estimator sources",
     # neurove_service
@@ -67,13 +71,14 @@ MAY_IMPORT = {
     "neurove_service.clock_offset": "",
     "neurove_service.limits": "",
     "neurove_service.endpoints": "",
-    "neurove_service.config": "core:files endpoints",
+    "neurove_service.labels": "",
+    "neurove_service.config": "core:files endpoints labels",
     "neurove_service.guard": "logs",
     "neurove_service.desk": "",
     "neurove_service.transport": "logs guard desk",
     "neurove_service.streams": (
         "core:config core:geometry core:ingest core:networks core:models core:estimator "
-        "core:inertial core:aided logs guard clock_offset"
+        "core:inertial core:aided core:carried logs guard clock_offset"
     ),
     "neurove_service.models": (
         "core:config core:files core:ingest core:networks core:models core:estimator core:self_test logs guard streams"
@@ -88,6 +93,7 @@ MAY_IMPORT = {
         "core:files core:geometry core:models logs guard lifecycle latency endpoints config transport streams models "
         "metrics"
     ),
+    "neurove_service.fleet": "core:files logs config labels transport clients",
     "neurove_service.page": "logs config guard transport clients",
     "neurove_service": "",
     "neurove_service.cli": "*",

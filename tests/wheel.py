@@ -23,7 +23,7 @@ BASE = {
 }
 EXTRAS = {
     "serve", "recordings", "train", "experiments", "carla", "ros2", "camera", "page", "metrics", "foxglove", "docs",
-    "bench", "all", "dev",
+    "cluster", "bench", "all", "dev",
 }  # fmt: skip
 HEAVY = {"torch", "zenoh", "numba"}
 LIGHT_IMPORT = f"import sys, neurove_protocol; print(sorted({HEAVY} & set(sys.modules)))"

@@ -67,6 +67,7 @@ def _rules(role: str, name: str, prefix: str, domain: int) -> list[Rule]:
     results = [f"{prefix}/*/velocity", f"{prefix}/*/status"]
     asked = [f"{node}/health", f"{node}/models"]
     change, chunks = f"{node}/model/**", f"{prefix}/@push/**"
+    duty, drain = f"{node}/duty/**", f"{node}/drain"
     own = f"{prefix}/@node/{name}"
     if role == "driver":  # events, camera and IMU of its own stream
         published = [f"{prefix}/{name}/{kind}" for kind in ("events", "camera", "imu")]
@@ -76,13 +77,16 @@ def _rules(role: str, name: str, prefix: str, domain: int) -> list[Rule]:
         ]
     if role == "node":  # everything that the service does, under its own name
         return [
-            *_hears([events, camera, imu]),
-            *_asks([camera, chunks]),
+            *_hears([events, camera, imu, results[0]]),
+            *_asks([camera, chunks, duty]),  # the nodes that stand by for each other
             *_publishes(results, heard_as=results),
-            *_answers([f"{own}/health", f"{own}/models", f"{own}/model/**"], asked_as=[*asked, change]),
-            (IN, ["reply"], [change]),  # an error reply has the key of the query, maybe for all nodes
-            (IN, ["liveliness_query", "declare_liveliness_subscriber"], [f"{own}/instance/*"]),
-            (OUT, ["liveliness_token"], [f"{own}/instance/*"]),
+            *_answers(
+                [f"{own}/health", f"{own}/models", f"{own}/model/**", f"{own}/duty/**", f"{own}/drain"],
+                asked_as=[*asked, change, duty, drain],
+            ),
+            (IN, ["reply"], [change, duty]),  # an error reply has the key of the query, maybe for all nodes
+            (IN, ["liveliness_query", "declare_liveliness_subscriber"], [f"{own}/instance/*", f"{node}/serves/*"]),
+            (OUT, ["liveliness_token"], [f"{own}/instance/*", f"{node}/serves/*"]),
             (IN, ["liveliness_token"], [f"{own}/alive", f"{own}/serves/*", f"{own}/instance/*"]),
         ]
     if role == "ros":  # a node of ROS 2: everything of its domain, and nothing of ours
@@ -105,7 +109,7 @@ def _rules(role: str, name: str, prefix: str, domain: int) -> list[Rule]:
     if role == "recorder":  # as a consumer, and what drivers publish
         return [*reads, *_hears([events, camera, imu]), *_asks([camera])]
     if role == "operator":  # as a consumer, and model changes
-        return [*reads, *_asks([change]), *_answers([chunks], asked_as=[chunks])]
+        return [*reads, *_asks([change, drain]), *_answers([chunks], asked_as=[chunks])]
     return reads if role == "consumer" else []
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neurove_core import self_test
+from neurove_core import self_test, tasks
 from neurove_core.adaptation import compare
 from neurove_core.adaptation.pieces import Span as Times
 from neurove_core.adaptation.pieces import within
@@ -22,6 +22,7 @@ from neurove_core.estimator import Estimator
 from neurove_core.evaluation.evaluate import Estimates, estimate_recording
 from neurove_core.models import bundle as bundles
 from neurove_core.models.bundle import Bundle
+from neurove_core.tasks import Pool
 from neurove_core.training import calibration, loop, pipeline, validation
 from neurove_core.training import config as configs
 from neurove_core.training.config import DataConfig, TrainingConfig
@@ -160,12 +161,12 @@ def _learned(
 ) -> Bundle:
     """The model after learning from the recordings, with an uncertainty from simulated sequences if one is wanted."""
     data = folder / "data"
-    _simulate(config, data, recipe.workers, on_progress)
+    _simulate(config, data, tasks.local(recipe.workers), on_progress)
     learned = _sequences(prepared, config, data / "learned", lambda one: one.pieces.training, on_progress)
     validating = _sequences(prepared, config, data / "validated", lambda one: one.pieces.validation, on_progress)
     scenes = validation.simulated_config(config) if config.recipe.validation_sequences else None
     if scenes:
-        _simulate(scenes, data, recipe.workers, on_progress)
+        _simulate(scenes, data, tasks.local(recipe.workers), on_progress)
     simulated = Cache(data, scenes).paths() if scenes else []
     held = Held.read([Span(path) for path, _ in validating], simulated, config.recipe)
 
@@ -177,7 +178,9 @@ def _learned(
     path = loop.train(config, folder, data, more=spans, held=held, start=start, on_progress=trained)
     if recipe.calibration_sequences and config.model.kind == "neurove":
         plain = bundles.load(path)
-        pipeline.calibrate(plain, config, data, path, recipe.calibration_sequences, recipe.workers, on_progress)
+        pipeline.calibrate(
+            plain, config, data, path, recipe.calibration_sequences, tasks.local(recipe.workers), on_progress
+        )
     return bundles.load(path)
 
 
@@ -203,9 +206,9 @@ def _pairs(
     ]
 
 
-def _simulate(config: TrainingConfig, folder: Path, workers: int, on_progress: OnProgress) -> None:
+def _simulate(config: TrainingConfig, folder: Path, pool: Pool, on_progress: OnProgress) -> None:
     cache, wanted = Cache(folder, config), config.data.sequences
-    for done, name in enumerate(cache.fill(workers), wanted - len(cache.missing()) + 1):
+    for done, name in enumerate(cache.fill(pool), wanted - len(cache.missing()) + 1):
         on_progress("simulated", done, wanted, name)
 
 

@@ -1,5 +1,6 @@
 """Benchmarks as ratios: our code and a peer in one process, interleaved, on the same inputs, with compared results."""
 
+import random
 import statistics
 import time
 from collections.abc import Callable
@@ -38,14 +39,19 @@ def rows(name: str, times: dict[str, float], equal: dict[str, bool | None], limi
 def interleaved(runs: dict[str, Callable[[], object]], rounds: int, warm_up: int = 2) -> dict[str, float]:
     """Median CPU time [ms] of each function. Every round runs all in turn, so that a busy machine slows all alike.
 
+    Each round has another order, the same in every run, because a function that fills the caches slows the next one.
+
     Args:
         runs: the functions to time, by name.
         rounds: number of timed rounds.
         warm_up: number of rounds before them, not timed.
     """
     times: dict[str, list[float]] = {name: [] for name in runs}
+    order, shuffle = list(runs), random.Random(0).shuffle
     for turn in range(warm_up + rounds):
-        for name, run in runs.items():
+        shuffle(order)
+        for name in order:
+            run = runs[name]
             began = time.thread_time()
             run()
             if turn >= warm_up:

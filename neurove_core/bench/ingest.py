@@ -51,6 +51,7 @@ def ingest(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool
 
 def _counted(count: Callable[..., int], events: Events) -> Callable[[], NDArray[np.uint8]]:
     pixels = np.arange(SENSOR.height * SENSOR.width, dtype=np.int32).reshape(SENSOR.height, SENSOR.width)
+    pixels.setflags(write=False)  # as lookup_table returns it
 
     def run() -> NDArray[np.uint8]:
         into = np.zeros((2 * BINS, SENSOR.height, SENSOR.width), np.uint8)

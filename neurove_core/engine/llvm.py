@@ -52,6 +52,32 @@ def table_entries(context: Any, builder: Any, kind: Any, table: Any, given: Any)
     return builder.select(builder.icmp_signed("<", given, ir.Constant(vector, [0] * BYTES)), high, low)
 
 
+def entry_of_two(builder: Any, halves: list[Any], given: Any) -> Any:  # pragma: no cover (compiler)
+    """Look up entries of a table of two vectors of float32, by the instructions of AVX-512 or AVX2."""
+    kind, numbers = halves[0].type, given.type
+    if kind.count == LANES:
+        signature = ir.FunctionType(kind, [kind, numbers, kind])
+        look_up = function_of(builder.module, signature, "llvm.x86.avx512.vpermi2var.ps.512")
+        return builder.call(look_up, [halves[0], given, halves[1]])
+    look_up = function_of(builder.module, ir.FunctionType(kind, [kind, numbers]), "llvm.x86.avx2.permps")
+    low, high = (builder.call(look_up, [half, given]) for half in halves)  # by the lowest three bits
+    return builder.select(builder.icmp_unsigned("<", given, ir.Constant(numbers, [kind.count] * kind.count)), low, high)
+
+
+def sums_of_pairs(builder: Any, context: Any, a: Any, b: Any) -> Any:  # pragma: no cover (compiler)
+    """Products of int16, each two neighbours added in 32 bits."""
+    kind = ir.VectorType(INT, a.type.count // 2)
+    if has(context, "avx2"):
+        multiply = function_of(builder.module, ir.FunctionType(kind, [a.type] * 2), "llvm.x86.avx2.pmadd.wd")
+        return builder.call(multiply, [a, b])
+    halves = []
+    for first in (0, 1):
+        own = lane_numbers(range(first, a.type.count, 2))
+        pair = [builder.shuffle_vector(one, ir.Constant(one.type, ir.Undefined), own) for one in (a, b)]
+        halves.append(builder.mul(*(builder.sext(one, kind) for one in pair)))
+    return builder.add(*halves)
+
+
 def array_element(context: Any, builder: Any, kind: Any, array: Any, at: Any) -> Any:  # pragma: no cover (compiler)
     """Load array[at] of a flat array."""
     return builder.load(builder.gep(context.make_array(kind)(context, builder, array).data, [at]))
@@ -63,7 +89,60 @@ def vector_address(context: Any, builder: Any, kind: Any, array: Any, at: Any, v
     return builder.bitcast(builder.gep(data, [at]), vector.as_pointer())
 
 
-def compressed(builder: Any, numbers: Any, some: Any) -> Any:  # pragma: no cover (compiler)
+def has(context: Any, feature: str) -> bool:  # pragma: no cover (compiler)
+    """Whether code may use instructions of this name, such as avx512f."""
+    return f"+{feature}" in context.codegen().magic_tuple()[2]
+
+
+def with_appended(
+    builder: Any, context: Any, kind: Any, fired: Any, found: Any, first: Any, some: Any
+) -> Any:  # pragma: no cover (compiler)
+    """Append to an array of int32 the numbers of those lanes that are true.
+
+    Args:
+        builder: LLVM's.
+        context: numba's.
+        kind: numba's type of the array.
+        fired: the array; up to LANES numbers behind the appended ones are overwritten.
+        found: number of entries before.
+        first: int32, added to the lanes.
+        some: LANES truth values.
+
+    Returns:
+        number of entries afterwards.
+    """
+    if has(context, "avx512f"):
+        vector = ir.VectorType(INT, LANES)
+        own = builder.add(in_every_lane(builder, first, LANES), lane_numbers(range(LANES)))
+        builder.store(
+            _compressed(builder, own, some), vector_address(context, builder, kind, fired, found, vector), align=4
+        )
+        return builder.add(found, _count_true(builder, some))
+    table = _lanes_of_a_byte(builder.module)
+    vector, base = ir.VectorType(INT, 8), in_every_lane(builder, first, 8)
+    for start in range(0, LANES, 8):  # other processors have no such instruction: a table has the lanes of eight bits
+        eight = builder.shuffle_vector(
+            some, ir.Constant(some.type, ir.Undefined), lane_numbers(range(start, start + 8))
+        )
+        bits = builder.zext(builder.bitcast(eight, ir.IntType(8)), ir.IntType(64))
+        entry = builder.load(builder.gep(table, [ir.Constant(ir.IntType(64), 0), bits], inbounds=True))
+        lanes = builder.zext(builder.bitcast(entry, ir.VectorType(ir.IntType(8), 8)), vector)
+        lanes = builder.add(lanes, builder.add(base, ir.Constant(vector, [start] * 8)))
+        builder.store(lanes, vector_address(context, builder, kind, fired, found, vector), align=4)
+        found = builder.add(found, builder.zext(builder.ctpop(builder.trunc(bits, ir.IntType(32))), found.type))
+    return found
+
+
+def _lanes_of_a_byte(module: Any) -> Any:  # pragma: no cover (compiler)
+    """A table with the numbers of the bits that are set in each byte, ascending, eight bytes in an integer."""
+    numbers = [[bit for bit in range(8) if byte >> bit & 1] for byte in range(256)]
+    entries = [int.from_bytes(bytes(found).ljust(8, b"\0"), "little") for found in numbers]
+    kind = ir.ArrayType(ir.IntType(64), 256)
+    named: Any = cgutils.global_constant
+    return named(module, "lanes_of_a_byte", ir.Constant(kind, entries))
+
+
+def _compressed(builder: Any, numbers: Any, some: Any) -> Any:  # pragma: no cover (compiler)
     """The selected int32 of a vector, moved to its front; the rest is undefined."""
     kind = numbers.type
     signature = ir.FunctionType(kind, [kind, some.type, kind])
@@ -71,7 +150,7 @@ def compressed(builder: Any, numbers: Any, some: Any) -> Any:  # pragma: no cove
     return builder.call(compress, [numbers, some, ir.Constant(kind, ir.Undefined)])
 
 
-def count_true(builder: Any, some: Any) -> Any:  # pragma: no cover (compiler)
+def _count_true(builder: Any, some: Any) -> Any:  # pragma: no cover (compiler)
     """The number of lanes that are true."""
     kind = ir.IntType(LANES)
     ones = function_of(builder.module, ir.FunctionType(kind, [kind]), f"llvm.ctpop.i{LANES}")

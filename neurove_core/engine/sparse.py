@@ -37,6 +37,7 @@ from neurove_core.engine.spike_lists import (
     to_maps,
 )
 from neurove_core.engine.tiles import LANES, tile_of
+from neurove_core.engine.vectors import cells_tile, list_tile
 from neurove_core.spiking.lif import LIFParams, LIFState
 
 _MANY: Final = 0.4
@@ -78,7 +79,7 @@ class SparseExtractor:
         self._decay, self._v_th = np.float32(lif.decay), np.float32(lif.v_th)
         self._first, self._layers = FirstConvolution(layers[0]), [ListConvolution(layer) for layer in layers[1:]]
         weight, bias = projection
-        self._rows, self._bias, self._tile = weight.T.reshape(-1).numpy(), bias.numpy(), tile_of(bias.numel())
+        self._rows, self._bias, self._tile = weight.T.reshape(-1).numpy(), bias.numpy(), list_tile(bias.numel())
 
     def __call__(
         self, spikes: Tensor | CountInput, membranes: Sequence[LIFState]
@@ -130,7 +131,7 @@ class FirstConvolution:
     def __init__(self, layer: SparseLayer) -> None:
         self._weight, self._bias = _by_input(layer.weight), layer.bias.numpy()
         self._widths = layer.weight.shape[1], layer.weight.shape[0]
-        self._tile, self._firing = tile_of(self._bias.size, most=2), tile_of(self._bias.size)
+        self._tile, self._firing = cells_tile(self._bias.size), tile_of(self._bias.size)
 
     def __call__(self, x: Array | CountMaps, v: Array, decay: np.float32, v_th: np.float32) -> tuple[SpikeList, Array]:
         """Potentials v (B, H', W', C') before the step to spikes and potentials after it."""
@@ -156,7 +157,7 @@ class ListConvolution:
         self._dense = layer.dense
         self._weight, self._bias = _by_input(layer.weight), layer.bias.numpy()
         self._widths = layer.weight.shape[1], layer.weight.shape[0]
-        self._tile = tile_of(self._bias.size)
+        self._tile = list_tile(self._bias.size)
 
     def __call__(self, spikes: SpikeList, v: Array, decay: np.float32, v_th: np.float32) -> tuple[SpikeList, Array]:
         """Potentials v (B, H', W', C') before the step to spikes and potentials after it; dense for many spikes."""

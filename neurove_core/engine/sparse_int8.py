@@ -2,7 +2,8 @@
 
 Weights are added for each spike, in 16 bits over few inputs and in 32 bits over all. Integer sums are exact in any
 order, so the results equal the dense form bit for bit. The first layer reads 8-bit codes. It uses the processor's dot
-product of four codes where there is one, for six output cells at a time, as sparse.FirstConvolution does.
+product of four codes where there is one, else that of two numbers of 16 bits, for six output cells at a time, as
+sparse.FirstConvolution does.
 
 When a model is loaded, each layer is compared with the plain sums. Where one differs, or where a width is no multiple
 of LANES, the dense layers are used.
@@ -12,7 +13,7 @@ This module needs vectors.py: import it only where `fallback.vectors_work()`.
 
 import math
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
@@ -40,7 +41,7 @@ from neurove_core.engine.spike_lists import (
     to_maps,
 )
 from neurove_core.engine.tiles import LANES, tile_of
-from neurove_core.engine.vectors import has_byte_products
+from neurove_core.engine.vectors import cells_tile, has_byte_products, list_tile
 from neurove_core.spiking.lif import LIFParams, LIFState
 
 _MANY: Final = 0.45
@@ -72,7 +73,10 @@ class SparseInt8Extractor:
 
     def __init__(self, layers: Sequence[SparseInt8Layer], lif: LIFParams) -> None:
         self._decay, self._v_th = np.float32(lif.decay), np.float32(lif.v_th)
-        self._first, self._layers = first_convolution(layers[0]), [Int8ListConvolution(layer) for layer in layers[1:]]
+        self._first, self._layers = (
+            Int8FirstConvolution(layers[0]),
+            [Int8ListConvolution(layer) for layer in layers[1:]],
+        )
 
     def __call__(self, codes: Tensor, membranes: Sequence[LIFState]) -> tuple[SpikeList, tuple[LIFState, ...]]:
         """Codes (T * B, 2n, H, W), uint8, to the spikes of the last map, and the potentials after the reset."""
@@ -122,13 +126,10 @@ class Int8FirstConvolution:
 
     def __init__(self, layer: SparseInt8Layer) -> None:
         outputs, inputs = layer.q.shape[:2]
-        fours = -(-inputs // 4)
-        by_input = layer.q.new_zeros(3, fours * 4, 3, outputs)
-        by_input[:, :inputs] = layer.q.permute(2, 1, 3, 0)
-        self._weight = by_input.view(3, fours, 4, 3, outputs).permute(0, 1, 3, 4, 2).reshape(-1).numpy()
+        self._weight = in_groups(layer.q.permute(2, 3, 1, 0).numpy(), 4 if has_byte_products() else 2)
         self._factor, self._offset = layer.factor.numpy(), layer.offset.numpy()
         self._widths = inputs, outputs
-        self._tile = tile_of(outputs, most=2)
+        self._tile = cells_tile(outputs)
 
     def __call__(self, x: Codes, v: Array, decay: np.float32, v_th: np.float32) -> tuple[SpikeList, Array]:
         """Potentials v (B, H', W', C') before the step to spikes and potentials after it."""
@@ -145,9 +146,13 @@ def cells_shape(maps: Codes) -> tuple[int, int, int, int]:
     return count, rows, columns, channels
 
 
-def first_convolution(layer: SparseInt8Layer) -> Int8FirstConvolution | Int8DenseConvolution:
-    """The first layer in the form that suits this processor."""
-    return Int8FirstConvolution(layer) if has_byte_products() else Int8DenseConvolution(layer)
+def in_groups(weight: NDArray[np.int8], group: int) -> NDArray[np.signedinteger[Any]]:
+    """Weights (3, 3, C, C') as (3, groups of channels, 3, C', group), flat: int8 for groups of four, int16 for two."""
+    inputs, outputs = weight.shape[2:]
+    groups = -(-inputs // group)
+    by_input = np.zeros((3, groups * group, 3, outputs), np.int8 if group == 4 else np.int16)
+    by_input[:, :inputs] = weight.transpose(0, 2, 1, 3)
+    return np.ascontiguousarray(by_input.reshape(3, groups, group, 3, outputs).transpose(0, 1, 3, 4, 2)).reshape(-1)
 
 
 class Int8ListConvolution:
@@ -162,7 +167,7 @@ class Int8ListConvolution:
         self._most = 12 * inputs if fits else SHORT
         self._factor, self._offset = layer.factor.numpy(), layer.offset.numpy()
         self._widths = inputs, outputs
-        self._tile = tile_of(outputs)
+        self._tile = list_tile(outputs)
 
     def __call__(self, spikes: SpikeList, v: Array, decay: np.float32, v_th: np.float32) -> tuple[SpikeList, Array]:
         """Potentials v (B, H', W', C') before the step to spikes and potentials after it; dense for many spikes."""
@@ -184,7 +189,7 @@ def project(spikes: SpikeList, rows: NDArray[np.int8], factor: Array, offset: Ar
     maps, height, width, channels = spikes.shape
     currents = np.empty((maps, factor.size), np.float32)
     chunk = max(1, _CHUNK // channels)
-    given = tile_of(factor.size), spikes.indices, spikes.starts, height * width, rows.reshape(-1), factor, offset
+    given = list_tile(factor.size), spikes.indices, spikes.starts, height * width, rows.reshape(-1), factor, offset
     project_list(*given, chunk, currents)
     return currents
 
@@ -214,7 +219,7 @@ def _agrees(layer: SparseInt8Layer, *, first: bool) -> bool:
             v = np.zeros((count, (layer.rows + 1) // 2, (layer.columns + 1) // 2, outputs), np.float32)
             maps = x.permute(0, 3, 1, 2)
             if first:
-                _, found = first_convolution(layer)(maps.contiguous().numpy(), v, *silent)
+                _, found = Int8FirstConvolution(layer)(maps.contiguous().numpy(), v, *silent)
             else:
                 _, found = Int8ListConvolution(layer).over_list(to_list(maps), v, *silent)
             if not torch.equal(channels_first(found), layer.dense(maps) * factor + offset):

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.compiled import compiled
+from neurove_core.engine.byte_vectors import store_interleaved, store_lookup_bytes, store_pairs
 from neurove_core.engine.spike_lists import Array, Indices
 from neurove_core.engine.tiles import BYTES, LANES
 from neurove_core.engine.vectors import (
@@ -21,8 +22,6 @@ from neurove_core.engine.vectors import (
     fire_tile,
     scale_and_offset,
     store,
-    store_interleaved,
-    store_lookup_bytes,
     store_repeated,
     store_row_starts,
     to_float,
@@ -54,7 +53,7 @@ def look_up(counts: Codes, table: Codes, codes: Codes) -> None:  # pragma: no co
 def convolve_codes(
     like: tuple[int, ...],
     x: Codes,
-    weight: NDArray[np.int8],
+    weight: NDArray[np.signedinteger[Any]],
     factor: Array,
     offset: Array,
     before: Array,
@@ -71,7 +70,8 @@ def convolve_codes(
     Args:
         like: tuple whose length is the number of vectors in a tile of six cells.
         x: codes (R, C, H, W).
-        weight: (3, groups of four channels, 3, C', 4), flat; zeros for channels that fill the last group.
+        weight: (3, groups of channels, 3, C', G), flat; zeros for channels that fill the last group. A group has four
+            channels with int8 weights, which needs `vectors.has_byte_products`, and two with int16 weights.
         factor: (C') scale of the integer sums.
         offset: (C') added after scaling.
         before: membrane potentials (B, H', W', C') before the step.
@@ -89,11 +89,12 @@ def convolve_codes(
     batch = before.shape[0]
     n = before.size // batch
     v, v_after, found, cell = before.reshape(-1), after.reshape(-1), 0, 0
-    codes, fours, across = x.reshape(-1), (channels + 3) // 4, (columns + 1) // 2
-    wide = 4 * (2 * (across + SIDE) + 3)  # with zero padding left and right
+    group = 4 // weight.itemsize
+    codes, groups, across = x.reshape(-1), (channels + group - 1) // group, (columns + 1) // 2
+    wide, next_cell = group * (2 * (across + SIDE) + 3), 2 * group  # with zero padding left and right
     lines = np.zeros(
-        3 * fours * wide, np.uint8
-    )  # the kernel's rows, by row number modulo three; four channels for each column
+        3 * groups * wide, weight.dtype
+    )  # the kernel's rows, by row number modulo three; a group of channels for each column
     currents = np.empty(SIDE * outputs, np.float32)
     for r in range(maps):
         if r == batch:
@@ -103,24 +104,24 @@ def convolve_codes(
             top, bottom = max(row, 0), min(row + 3, rows)
             for y in range(top if row < 0 else row + 1, bottom):
                 begin = (r * channels * rows + y) * columns
-                _interleave_row(codes, begin, plane, channels, columns, lines, y % 3 * fours * wide + 4, wide)
+                _interleave_row(codes, begin, plane, channels, columns, lines, y % 3 * groups * wide + group, wide)
             for first in range(0, across, SIDE):
                 for tile in range(0, outputs, width):
                     a, b, c = zeros_int32(like), zeros_int32(like), zeros_int32(like)
                     d, e, f = zeros_int32(like), zeros_int32(like), zeros_int32(like)
                     for y in range(top, bottom):
-                        w = ((y - row) * fours * 3 * outputs + tile) * 4
-                        for q in range(fours):
-                            k = (y % 3 * fours + q) * wide + 8 * first
+                        w = ((y - row) * groups * 3 * outputs + tile) * group
+                        for q in range(groups):
+                            k = (y % 3 * groups + q) * wide + next_cell * first
                             for _ in range(3):
                                 a = add_dot_products(a, lines, k, weight, w)
-                                b = add_dot_products(b, lines, k + 8, weight, w)
-                                c = add_dot_products(c, lines, k + 16, weight, w)
-                                d = add_dot_products(d, lines, k + 24, weight, w)
-                                e = add_dot_products(e, lines, k + 32, weight, w)
-                                f = add_dot_products(f, lines, k + 40, weight, w)
-                                k += 4
-                                w += 4 * outputs
+                                b = add_dot_products(b, lines, k + next_cell, weight, w)
+                                c = add_dot_products(c, lines, k + 2 * next_cell, weight, w)
+                                d = add_dot_products(d, lines, k + 3 * next_cell, weight, w)
+                                e = add_dot_products(e, lines, k + 4 * next_cell, weight, w)
+                                f = add_dot_products(f, lines, k + 5 * next_cell, weight, w)
+                                k += group
+                                w += group * outputs
                     store(scale_and_offset(to_float(a), factor, offset, tile), currents, tile)
                     store(scale_and_offset(to_float(b), factor, offset, tile), currents, outputs + tile)
                     store(scale_and_offset(to_float(c), factor, offset, tile), currents, 2 * outputs + tile)
@@ -140,9 +141,9 @@ def convolve_codes(
 
 @compiled
 def _interleave_row(
-    codes: Codes, begin: int, plane: int, channels: int, columns: int, lines: Codes, into: int, wide: int
+    codes: Codes, begin: int, plane: int, channels: int, columns: int, lines: NDArray[Any], into: int, wide: int
 ) -> None:  # pragma: no cover (machine code)
-    """Copy one row of all channels, four channels interleaved; missing channels hold any value, their weights are 0.
+    """Copy one row of all channels, a group of channels interleaved; missing ones hold any value, their weights are 0.
 
     Args:
         codes: codes of the maps, flat.
@@ -151,21 +152,27 @@ def _interleave_row(
         channels: number of channels of the map.
         columns: number of columns of the row.
         lines: output.
-        into: index in `lines` of the first group of four channels.
+        into: index in `lines` of the first group.
         wide: distance from a group to the next one.
     """
-    for first in range(0, channels, 4):
+    group = 4 // lines.itemsize
+    for first in range(0, channels, group):
         most = channels - 1 - first
         a = begin + first * plane
         b, c, d = a + min(1, most) * plane, a + min(2, most) * plane, a + min(3, most) * plane
         if columns < LANES:
             for i in range(columns):
-                four = lines[into + 4 * i : into + 4 * i + 4]
-                four[0], four[1], four[2], four[3] = codes[a + i], codes[b + i], codes[c + i], codes[d + i]
+                at = into + group * i
+                lines[at], lines[at + 1] = codes[a + i], codes[b + i]
+                if group == 4:
+                    lines[at + 2], lines[at + 3] = codes[c + i], codes[d + i]
         else:
             for column in range(0, columns, LANES):
                 i = min(column, columns - LANES)
-                store_interleaved(codes, a + i, b + i, c + i, d + i, lines, into + 4 * i)
+                if group == 4:
+                    store_interleaved(codes, a + i, b + i, c + i, d + i, lines, into + 4 * i)
+                else:
+                    store_pairs(codes, a + i, b + i, lines, into + 2 * i)
         into += wide
 
 

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.compiled import compiled
+from neurove_core.engine.byte_vectors import store_lookup
 from neurove_core.engine.spike_lists import Array, Indices
 from neurove_core.engine.tiles import LANES
-from neurove_core.engine.vectors import add, add_product, element, fire_tile, store, store_lookup, zeros
+from neurove_core.engine.vectors import add, add_product, element, fire_tile, store, zeros
 
 
 @compiled

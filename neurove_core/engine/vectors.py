@@ -28,17 +28,16 @@ from neurove_core.engine.llvm import (
     INT,
     SHORT,
     array_element,
-    compressed,
     constant_vector,
-    count_true,
     function_of,
     in_every_lane,
     joined_vectors,
     lane_numbers,
-    table_entries,
+    sums_of_pairs,
     vector_address,
+    with_appended,
 )
-from neurove_core.engine.tiles import BYTES, LANES, tile_of
+from neurove_core.engine.tiles import LANES, tile_of
 
 instructions: Any = intrinsic  # for a type checker: compiled code calls the result without the first argument
 
@@ -74,6 +73,21 @@ class _IntegerTileModel(models.PrimitiveModel):
 def has_byte_products() -> bool:
     """Whether numba may use the instruction of `add_dot_products` on this processor (AVX-512 VNNI)."""
     return "+avx512vnni" in cpu_target.target_context.codegen().magic_tuple()[2]
+
+
+def cells_tile(channels: int) -> tuple[int, ...]:
+    """The tile of kernels that compute six cells at a time: their sums fit into the registers of this processor."""
+    return tile_of(channels, most=2 if _wide() else 1)
+
+
+def list_tile(channels: int) -> tuple[int, ...]:
+    """The tile of kernels over spike lists: its sums fill at most half of the registers of this processor."""
+    return tile_of(channels, most=8 if _wide() else 4)
+
+
+def _wide() -> bool:
+    """Whether a vector of LANES numbers is one register; AVX2 needs two, NEON four."""
+    return "+avx512f" in cpu_target.target_context.codegen().magic_tuple()[2]
 
 
 # The functions below emit LLVM instructions. numba calls them while it compiles, not where its cache has the result.
@@ -115,95 +129,6 @@ def add_product(typing, tile, values, i, numbers, at):  # type: ignore[no-untype
         return builder.call(fused, [value, factors, tile])
 
     return tile(tile, values, types.intp, numbers, types.intp), write
-
-
-@instructions
-def store_lookup_bytes(typing, table, numbers, i, out):  # type: ignore[no-untyped-def]  # pragma: no cover (compiler)
-    """Write table[numbers[i]] to out[i], for BYTES numbers from i on; all uint8 and flat, the table of 256."""
-
-    def write(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        table, numbers, i, out = args
-        kind = ir.VectorType(ir.IntType(8), BYTES)
-        given = builder.load(vector_address(context, builder, signature.args[1], numbers, i, kind), align=1)
-        if "+avx512vbmi" in context.codegen().magic_tuple()[2]:
-            found = table_entries(context, builder, signature.args[0], table, given)
-        else:
-            found = ir.Constant(kind, ir.Undefined)
-            for lane in range(BYTES):
-                at = builder.zext(builder.extract_element(given, ir.Constant(INT, lane)), ir.IntType(64))
-                value = array_element(context, builder, signature.args[0], table, at)
-                found = builder.insert_element(found, value, ir.Constant(INT, lane))
-        builder.store(found, vector_address(context, builder, signature.args[3], out, i, kind), align=1)
-        return context.get_dummy_value()
-
-    return types.none(table, numbers, types.intp, out), write
-
-
-@instructions
-def store_lookup(typing, table, numbers, i, out, at):  # type: ignore[no-untyped-def]  # pragma: no cover (compiler)
-    """Write table[numbers[i]] to out[at], for LANES numbers; a flat table of 256 float32, numbers uint8."""
-
-    def write(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        table, numbers, i, out, at = args
-        bytes_, kind = ir.VectorType(ir.IntType(8), LANES), ir.VectorType(FLOAT, LANES)
-        given = builder.load(vector_address(context, builder, signature.args[1], numbers, i, bytes_), align=1)
-        given = builder.zext(given, ir.VectorType(INT, LANES))
-        where = vector_address(context, builder, signature.args[3], out, at, kind)
-
-        def one_by_one() -> None:
-            found = ir.Constant(kind, ir.Undefined)
-            for lane in range(LANES):
-                entry = builder.zext(builder.extract_element(given, ir.Constant(INT, lane)), ir.IntType(64))
-                value = array_element(context, builder, signature.args[0], table, entry)
-                found = builder.insert_element(found, value, ir.Constant(INT, lane))
-            builder.store(found, where, align=4)
-
-        if "+avx512f" not in context.codegen().magic_tuple()[2]:
-            one_by_one()
-            return context.get_dummy_value()
-        few = builder.icmp_unsigned("<", given, ir.Constant(given.type, [2 * LANES] * LANES))
-        whole = ir.IntType(LANES)
-        every = builder.icmp_unsigned("==", builder.bitcast(few, whole), ir.Constant(whole, (1 << LANES) - 1))
-        with builder.if_else(every, likely=True) as (in_two_vectors, otherwise):
-            with in_two_vectors:
-                signature_ = ir.FunctionType(kind, [kind, given.type, kind])
-                look_up = function_of(builder.module, signature_, "llvm.x86.avx512.vpermi2var.ps.512")
-                halves = [
-                    builder.load(
-                        vector_address(
-                            context, builder, signature.args[0], table, ir.Constant(ir.IntType(64), half), kind
-                        ),
-                        align=4,
-                    )
-                    for half in (0, LANES)
-                ]
-                builder.store(builder.call(look_up, [halves[0], given, halves[1]]), where, align=4)
-            with otherwise:
-                one_by_one()
-        return context.get_dummy_value()
-
-    return types.none(table, numbers, types.intp, out, types.intp), write
-
-
-@instructions
-def store_interleaved(typing, numbers, first, second, third, fourth, out, at):  # type: ignore[no-untyped-def]  # pragma: no cover (compiler)
-    """Interleave four rows of LANES uint8, which begin at the given indices, and write them from out[at] on."""
-
-    def write(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        numbers, *begins, out, at = args
-        row, kind = (ir.VectorType(ir.IntType(8), count * LANES) for count in (1, 4))
-        rows = [
-            builder.load(vector_address(context, builder, signature.args[0], numbers, begin, row), align=1)
-            for begin in begins
-        ]
-        order = ir.Constant(ir.VectorType(INT, 4 * LANES), [lane // 4 + lane % 4 * LANES for lane in range(4 * LANES)])
-        joined = joined_vectors(builder, rows)
-        mixed = builder.shuffle_vector(joined, ir.Constant(joined.type, ir.Undefined), order)
-        builder.store(mixed, vector_address(context, builder, signature.args[5], out, at, kind), align=1)
-        return context.get_dummy_value()
-
-    whole = types.intp
-    return types.none(numbers, whole, whole, whole, whole, out, whole), write
 
 
 @instructions
@@ -275,32 +200,38 @@ def add_widened(typing, tile, part):  # type: ignore[no-untyped-def]  # pragma: 
 
 @instructions
 def add_dot_products(typing, tile, values, i, numbers, at):  # type: ignore[no-untyped-def]  # pragma: no cover (compiler)
-    """Add to each lane the dot product of values[i : i + 4] and the lane's own four numbers, from numbers[at] on.
+    """Add to each lane the dot product of a group of values and the lane's own numbers, from numbers[at] on.
+
+    A group has four values from 0 to 255 where values and numbers have 8 bits, two where they have 16 bits.
 
     Args:
         typing: numba's typing context.
         tile: 32-bit integers to add to.
-        values: uint8, flat.
-        i: index of the first of the four values, in any alignment.
-        numbers: int8, flat; four for each lane.
+        values: int8, read as uint8, or int16; flat.
+        i: index of the first value of the group, in any alignment.
+        numbers: int8 or int16, flat; a group for each lane.
         at: index of the first lane's numbers.
     """
 
     def write(context, builder, signature, args):  # type: ignore[no-untyped-def]
         tile, values, i, numbers, at = args
-        four, one = ir.VectorType(INT, 1), ir.VectorType(INT, LANES)
-        where = vector_address(context, builder, signature.args[1], values, i, four)
-        value = in_every_lane(
-            builder, builder.extract_element(builder.load(where, align=1), ir.Constant(INT, 0)), LANES
-        )
-        dots = function_of(builder.module, ir.FunctionType(one, [one] * 3), "llvm.x86.avx512.vpdpbusd.512")
-        parts, bytes_ = [], ir.VectorType(ir.IntType(8), 4 * LANES)
-        for start in range(0, tile.type.count, LANES):
-            own = lane_numbers(range(start, start + LANES))
+        in_bytes = signature.args[3].dtype.bitwidth == 8
+        lanes, group = (LANES, 4) if in_bytes else (LANES // 2, 2)
+        where = vector_address(context, builder, signature.args[1], values, i, ir.VectorType(INT, 1))
+        value = builder.extract_element(builder.load(where, align=1), ir.Constant(INT, 0))
+        value, one = in_every_lane(builder, value, lanes), ir.VectorType(INT, lanes)
+        given = ir.VectorType(ir.IntType(32 // group), group * lanes)
+        parts = []
+        for start in range(0, tile.type.count, lanes):
+            own = lane_numbers(range(start, start + lanes))
             own = builder.shuffle_vector(tile, ir.Constant(tile.type, ir.Undefined), own)
-            first = builder.add(at, ir.Constant(at.type, 4 * start))
-            weights = builder.load(vector_address(context, builder, signature.args[3], numbers, first, bytes_), align=1)
-            parts.append(builder.call(dots, [own, value, builder.bitcast(weights, one)]))
+            first = builder.add(at, ir.Constant(at.type, group * start))
+            weights = builder.load(vector_address(context, builder, signature.args[3], numbers, first, given), align=1)
+            if in_bytes:
+                dots = function_of(builder.module, ir.FunctionType(one, [one] * 3), "llvm.x86.avx512.vpdpbusd.512")
+                parts.append(builder.call(dots, [own, value, builder.bitcast(weights, one)]))
+            else:
+                parts.append(builder.add(own, sums_of_pairs(builder, context, builder.bitcast(value, given), weights)))
         return joined_vectors(builder, parts)
 
     return tile(tile, values, types.intp, numbers, types.intp), write
@@ -399,13 +330,11 @@ def fire_tile(typing, currents, before, after, at, decay, v_th, fired, found, fi
         fires = builder.fcmp_ordered(">=", builder.fsub(u, in_every_lane(builder, v_th, lanes)), none)
         where = vector_address(context, builder, signature.args[2], after, at, current.type)
         builder.store(builder.fmul(u, builder.select(fires, none, one)), where, align=4)
-        indices = in_every_lane(builder, builder.trunc(first, INT), LANES)
         for start in range(0, lanes, LANES):
             own = lane_numbers(range(start, start + LANES))
             some = builder.shuffle_vector(fires, ir.Constant(fires.type, ir.Undefined), own)
-            where = vector_address(context, builder, signature.args[6], fired, found, indices.type)
-            builder.store(compressed(builder, builder.add(indices, own), some), where, align=4)
-            found = builder.add(found, count_true(builder, some))
+            base = builder.add(builder.trunc(first, INT), ir.Constant(INT, start))
+            found = with_appended(builder, context, signature.args[6], fired, found, base, some)
         return found
 
     single = types.float32, types.float32

@@ -41,8 +41,8 @@ def lookup_table(canonical: CanonicalConfig, sensor: Sensor, camera: CameraInfo 
         camera: the lens of the sensor, if known.
 
     Returns:
-        (sensor.height, sensor.width) of (part * height + row) * width + column, or OUTSIDE. Without subcells the part
-        is 0; else it is that of ingest.channels.
+        (sensor.height, sensor.width) of (part * height + row) * width + column, or OUTSIDE; read-only. Without
+        subcells the part is 0; else it is that of ingest.channels.
 
     Raises:
         InvalidField: the camera info describes a sensor of another size.
@@ -50,7 +50,7 @@ def lookup_table(canonical: CanonicalConfig, sensor: Sensor, camera: CameraInfo 
     if camera is None:
         columns = (np.arange(sensor.width) * canonical.fine.width // sensor.width).astype(np.int32)
         rows = (np.arange(sensor.height) * canonical.fine.height // sensor.height).astype(np.int32)
-        return _cell(rows[:, None], columns, canonical).astype(np.int32)
+        return _read_only(_cell(rows[:, None], columns, canonical).astype(np.int32))
     if camera.sensor != sensor:
         raise InvalidField("camera info", "width x height", str(camera.sensor), f"the events' sensor is {sensor}")
     table = np.empty((sensor.height, sensor.width), np.int32)
@@ -60,6 +60,12 @@ def lookup_table(canonical: CanonicalConfig, sensor: Sensor, camera: CameraInfo 
     for piece, steps in zip(pieces, took, strict=True):
         if steps < max(took):  # as many steps everywhere as the slowest pixel needs: the pieces leave no trace
             _fill(table, piece, canonical, camera, max(took))
+    return _read_only(table)
+
+
+def _read_only(table: NDArray[np.int32]) -> NDArray[np.int32]:
+    """The table, which nobody may change from now on: ingest.scaling examines it once."""
+    table.setflags(write=False)
     return table
 
 

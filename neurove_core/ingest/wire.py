@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.compiled import compiled
+from neurove_core.ingest.counting import add_events
+from neurove_core.ingest.scaling import SHIFT, Scale, scale_of
 from neurove_protocol.events import (
     DEFAULT_LIMITS,
     PacketLimits,
@@ -63,7 +65,7 @@ def count_wire(
         number of events whose pixel has no cell.
     """
     t0_us, blob, wide, first, stop = events
-    return _count(blob, wide, first, stop, start_us - t0_us, bin_us, lut, counts)
+    return _count(blob, wide, first, stop, start_us - t0_us, bin_us, lut, scale_of(lut, counts.shape[2]), counts)
 
 
 class _Found(NamedTuple):
@@ -205,16 +207,17 @@ def _count(
     start: int,
     bin_us: int,
     lut: NDArray[np.int32],
+    scale: Scale,
     counts: NDArray[np.uint8],
 ) -> int:  # pragma: no cover (machine code)
     """Count events `first` to `stop` of a blob; `start` is the window's start relative to the packet's t0_us."""
     if wide:
         n = blob.size // 8
         offset, xy = blob[: 4 * n].view(np.uint32)[first:stop], blob[4 * n :].view(np.uint16)
-        return _count_columns(offset, xy[first:stop], xy[n + first : n + stop], start, bin_us, lut, counts)
+        return _count_columns(offset, xy[first:stop], xy[n + first : n + stop], start, bin_us, lut, scale, counts)
     n = blob.size // 6
     short, xy = blob[: 2 * n].view(np.uint16)[first:stop], blob[2 * n :].view(np.uint16)
-    return _count_columns(short, xy[first:stop], xy[n + first : n + stop], start, bin_us, lut, counts)
+    return _count_columns(short, xy[first:stop], xy[n + first : n + stop], start, bin_us, lut, scale, counts)
 
 
 @compiled
@@ -225,12 +228,14 @@ def _count_columns(
     start: int,
     bin_us: int,
     lut: NDArray[np.int32],
+    scale: Scale,
     counts: NDArray[np.uint8],
 ) -> int:  # pragma: no cover (machine code)
     """As counting._count, on columns of the packet's types."""
     pixels, columns, flat = lut.reshape(-1), np.uint32(lut.shape[1]), counts.reshape(-1)
     cells = counts.shape[1] * counts.shape[2]
-    on, rows = np.uint32(cells), np.uint16(0x7FFF)
+    on, rows, shift = np.uint32(cells), np.uint16(0x7FFF), np.uint32(SHIFT)
+    by_row, by_column, width = np.uint32(scale.rows), np.uint32(scale.columns), np.uint32(scale.width)
     found, plane = np.empty(_BLOCK, np.uint32), np.empty(_BLOCK, np.uint32)
     outside, first = 0, 0
     for bin_ in range(counts.shape[0] // 2):
@@ -246,6 +251,12 @@ def _count_columns(
         for i in range(first, last, _BLOCK):
             m = min(_BLOCK, last - i)
             xs, ys = x[i : i + m], y_and_p[i : i + m]
+            if width:
+                for j in range(m):
+                    row, column = np.uint32(ys[j] & rows) * by_row >> shift, np.uint32(xs[j]) * by_column >> shift
+                    found[j] = row * width + column + on * np.uint32(ys[j] >> np.uint16(15))
+                add_events(found, m, pair)
+                continue
             for j in range(m):
                 found[j] = np.uint32(ys[j] & rows) * columns + np.uint32(xs[j])
                 plane[j] = on * np.uint32(ys[j] >> np.uint16(15))

@@ -106,6 +106,7 @@ _TOLERANCE: Final = 0.02  # of a search [sigma]
 _CALIBRATION: Final = np.array([0.6, 0.5, 1.0, 0.42, 0.7, 0.4, 0.7, 0.7, 0.7])  # of sigma
 _PITCH_DRIFT: Final = math.radians(0.2)  # from window to window
 _LEAST_PITCH_SIGMA: Final = math.radians(0.5)
+_TILT_SHARE: Final = 0.1  # of a new window in the mean square rate of pitch and roll
 
 
 class GroundEvents(NamedTuple):
@@ -127,6 +128,7 @@ class GroundState(NamedTuple):
     walls: tuple[float, float] = (_WALL, _WALL)  # inverse distances to the right and to the left [1/m]
     calm_us: int = SPAN_US  # time since the camera last pitched or rolled, at most SPAN_US
     sway: Sway = Sway()
+    tilt: float = 0.0  # mean square rate of pitch and roll before the search [rad^2/s^2]
 
 
 class GroundMotion(NamedTuple):
@@ -202,7 +204,9 @@ def refine(
         recent=(*recent, _kept(new, state.pitch))[-_windows(LONG_SPAN_US, window_us) :], end_us=end_us
     )
     c, s = math.cos(state.pitch), math.sin(state.pitch)
-    if math.hypot(twist[3], c * twist[5] - s * twist[4]) > MAX_TILT_RAD_S:
+    tilt_rad_s = math.hypot(twist[3], c * twist[5] - s * twist[4])
+    state = state._replace(tilt=state.tilt + _TILT_SHARE * (tilt_rad_s**2 - state.tilt))
+    if tilt_rad_s > MAX_TILT_RAD_S:
         state = state._replace(recent=(), last=None, pitch_sigma=PITCH_SIGMA, calm_us=0, sway=Sway())
         return Answer("tilting", None, state)
     state = state._replace(calm_us=min(state.calm_us + window_us, SPAN_US))

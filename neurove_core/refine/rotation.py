@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.ingest.sample import Sample
+from neurove_core.refine import errors
 from neurove_core.refine.alignment import Grid, Rays
 from neurove_core.refine.fast import fast_turn
 from neurove_core.refine.search import Found, Gaussian, agreement, measure, search
@@ -152,6 +153,8 @@ class Refined(NamedTuple):
     sigma_rad_s: Array | None = (
         None  # (3,) of the rate, if the scene has one depth; None if the network's answer stands
     )
+    errors: Array | None = None  # (3, 3) covariance of the rate with the terms of `errors`; None where they are unknown
+    shift: float = 0.0  # translation over depth [1/s]
     motion: Array | None = None  # (6,) what the search found, also where it is not accepted: see Filter.motion
 
 
@@ -208,7 +211,7 @@ def _turned_fast(given: Given, known: Rate, before: Filter | None, rays: Rays) -
     covariance[:3, :3] = turn.covariance
     filtered = Filter(motion, covariance, given.start_us + given.window_us)
     sigma = np.sqrt(np.diagonal(turn.covariance))
-    return Refined(Rate(turn.w_rad_s, turn.covariance), "accepted", filtered, turn.change_rad_s, sigma, motion)
+    return Refined(Rate(turn.w_rad_s, turn.covariance), "accepted", filtered, turn.change_rad_s, sigma, motion=motion)
 
 
 def _searched(given: Given, known: Rate, before: Filter | None, not_accepted: Rate, rays: Rays) -> Refined:
@@ -226,13 +229,13 @@ def _searched(given: Given, known: Rate, before: Filter | None, not_accepted: Ra
     motion, end_us = found.motion / seconds, given.start_us + given.window_us
     change = np.zeros(3) if before is None else _CHANGE_GAIN * (motion[:3] - before.motion[:3])
     rate = Rate(motion[:3], _honest(motion, covariance, before))
-    return Refined(
-        rate, outcome, Filter(motion, covariance, end_us), change, np.sqrt(np.diagonal(covariance)[:3]), motion
-    )
+    sigma, shift = np.sqrt(np.diagonal(covariance)[:3]), float(np.linalg.norm(motion[3:]))
+    wider = errors.of_rotation(motion, covariance, motion if before is None else before.motion, known.w_rad_s)
+    return Refined(rate, outcome, Filter(motion, covariance, end_us), change, sigma, wider, shift, motion)
 
 
 def _honest(motion: Array, covariance: Array, before: Filter | None) -> Array:
-    """Covariance (3, 3) of the angular velocity with the errors that the model of the search does not have.
+    """Covariance (3, 3) of the angular velocity that other answers are compared with.
 
     Args:
         motion: (6,) angular velocity, and translation over depth.

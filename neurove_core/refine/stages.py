@@ -105,7 +105,7 @@ def _turn(given: Given, found: Moved, before: Scene | None) -> Refined:
     covariance = found.covariance[:3, :3] + np.eye(3) * (_DEPTH_ERROR * float(np.linalg.norm(found.shift))) ** 2
     filtered = Filter(motion, found.covariance, end_us)
     rate = Rate(found.w_rad_s, covariance)
-    return Refined(rate, "accepted", filtered, change, np.sqrt(np.diagonal(covariance)), motion)
+    return Refined(rate, "accepted", filtered, change, np.sqrt(np.diagonal(covariance)), motion=motion)
 
 
 def _velocity(given: Given, found: Moved) -> Velocity:

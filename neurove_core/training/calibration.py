@@ -32,7 +32,8 @@ from neurove_core.models.bundle import PER_HEIGHT, Bundle
 from neurove_core.models.uncertainty import LEVEL, LEVELS, Uncertainty, half_width
 from neurove_core.networks.encoding import to_spikes
 from neurove_core.networks.neurove import NetworkState, NeuroVE
-from neurove_core.timescales import Answer, Longer, chosen, followed, jobs, slowed
+from neurove_core.tasks import HERE, Pool
+from neurove_core.timescales import Answer, Longer, chosen, followed, jobs, slowed, watched
 from neurove_core.training.batches import mirrored, stationary, with_gain, with_noise
 from neurove_core.training.config import DataConfig, TrainingConfig
 from neurove_core.training.data import Cache, Sequences
@@ -106,10 +107,10 @@ def calibration_sets(config: TrainingConfig, sequences: int) -> list[tuple[Train
     return made
 
 
-def fill(config: TrainingConfig, folder: Path, sequences: int, workers: int = 1) -> Iterator[str]:
+def fill(config: TrainingConfig, folder: Path, sequences: int, pool: Pool = HERE) -> Iterator[str]:
     """Simulate the missing calibration sequences, and yield the name of each one when it is done."""
     for one, _ in calibration_sets(config, sequences):
-        yield from Cache(folder, one).fill(workers)
+        yield from Cache(folder, one).fill(pool)
 
 
 def calibrate(
@@ -266,9 +267,9 @@ def _served(
         twists, state = run(window, state)
         wanted, longer = jobs(window, longer, probe, config)
         done = [(job, *run(job.counts, cast("NetworkState", job.state))) for job in wanted]
-        longer = followed(longer, [(job, after) for job, _, after in done], config)
+        longer = watched(followed(longer, [(job, after) for job, _, after in done], config), twists, config)
         answers = [Answer(twists, state), *(Answer(slowed(t, job.scale), s, job.scale) for job, t, s in done)]
-        best = chosen(answers, longer.windows, config.scale_bounds)
+        best = chosen(answers, longer, config.scale_bounds)
         potential = probe.log_sigma(cast("NetworkState", best.network))
         assert potential is not None  # the probe has a spread
         inputs.append(potential[0].double().numpy())

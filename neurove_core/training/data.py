@@ -4,11 +4,9 @@ A sequence is simulated once and kept in a safetensors file. The file is mapped 
 the segments that it needs. The windows come from the same `windows.push` and look-up table that the service uses.
 """
 
-import concurrent.futures
 import hashlib
 import json
 import math
-import multiprocessing
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -32,6 +30,7 @@ from neurove_core.sim.render.pixels import PixelConfig
 from neurove_core.sim.simulate import Simulation
 from neurove_core.sim.world.path import CameraPath
 from neurove_core.sim.world.scene import named_scene
+from neurove_core.tasks import HERE, Pool
 from neurove_core.training.config import SINCE, DataConfig, TrainingConfig
 from neurove_core.training.config import Span as Range
 from neurove_protocol.errors import InvalidField
@@ -199,24 +198,25 @@ class Cache:
         """Indices of the sequences that do not exist yet."""
         return [index for index in range(self._config.data.sequences) if not self.path(index).exists()]
 
-    def fill(self, workers: int = 1) -> Iterator[str]:
+    def fill(self, pool: Pool = HERE, share: tuple[int, int] = (0, 1)) -> Iterator[str]:
         """Simulate the missing sequences, and yield the name of each one when it is done.
 
         Several processes and several runs may fill one folder at once, because files are written atomically.
+
+        Args:
+            pool: where the simulations run.
+            share: (i, n): only the i-th of n equal shares of all sequences.
+
+        Raises:
+            FailedTasks: some sequences could not be simulated; all others are there.
         """
         self.folder.mkdir(parents=True, exist_ok=True)
-        jobs = [(self._config, index, self.path(index)) for index in self.missing()]
-        if workers <= 1:
-            yield from map(_make, jobs)
-            return
-        context = multiprocessing.get_context("spawn")  # the threads of torch do not survive a fork
-        with concurrent.futures.ProcessPoolExecutor(workers, mp_context=context) as pool:
-            try:
-                for done in concurrent.futures.as_completed([pool.submit(_make, job) for job in jobs]):
-                    yield done.result()
-            except BaseException:
-                pool.shutdown(cancel_futures=True)  # a full disk or a signal: do not simulate the rest
-                raise
+        missing = [index for index in self.missing() if index % share[1] == share[0]]
+        jobs = {f"sequence {index}": (self._config, index) for index in missing}
+        paths = {f"sequence {index}": self.path(index) for index in missing}
+        for task, (name, content) in pool.run(_simulated, jobs):
+            write_atomically(paths[task], content)
+            yield name
 
     def open(self) -> "Sequences":
         """Open all simulated sequences of the configuration.
@@ -231,19 +231,23 @@ class Cache:
         return [self.path(index) for index in range(self._config.data.sequences)]
 
 
-def _make(job: tuple[TrainingConfig, int, Path]) -> str:
-    config, index, path = job
+def _simulated(job: tuple[TrainingConfig, int]) -> tuple[str, bytes]:
+    """Name and content of a sequence of a configuration."""
+    config, index = job
     sequence = sequence_of(draw_simulation(config.data, index), config.model, stored_grid(config))
-    save(sequence, path, sparse=config.data.subcells > 1)
-    return sequence.name
+    return sequence.name, to_bytes(sequence, sparse=config.data.subcells > 1)
 
 
 def save(sequence: Sequence, path: Path, *, sparse: bool = False) -> None:
-    """Write a sequence to a file, atomically.
+    """Write a sequence to a file, atomically; see `to_bytes`."""
+    write_atomically(path, to_bytes(sequence, sparse=sparse))
+
+
+def to_bytes(sequence: Sequence, *, sparse: bool = False) -> bytes:
+    """The content of the file of a sequence.
 
     Args:
         sequence: to write.
-        path: of the file.
         sparse: store only counts above 0: `cells`, their flat index in a window, `values`, and `starts` (T + 1), the
             first of each window. A fine grid, where few cells have events, takes about a tenth of the space.
     """
@@ -255,7 +259,7 @@ def save(sequence: Sequence, path: Path, *, sparse: bool = False) -> None:
         starts = np.searchsorted(window, np.arange(len(flat) + 1)).astype(np.int64)
         arrays |= {"cells": cells.astype(np.uint32), "values": flat[window, cells], "starts": starts}
         metadata["shape"] = json.dumps(sequence.counts.shape)
-    write_atomically(path, safetensors.numpy.save(arrays, metadata))
+    return safetensors.numpy.save(arrays, metadata)
 
 
 class Span(NamedTuple):

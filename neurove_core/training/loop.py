@@ -6,6 +6,7 @@ Source: research/velocity.md, recipe L.
 import json
 import math
 import subprocess
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -33,9 +34,9 @@ from neurove_core.training.config import RecipeConfig, TrainingConfig
 from neurove_core.training.curve import Scalars, draw_curve
 from neurove_core.training.data import Cache, Sequences, Span
 from neurove_core.training.loss import group_loss, scaled_sum
-from neurove_core.training.ranks import Ranks, process_group
+from neurove_core.training.ranks import ALONE, Ranks
 from neurove_core.training.recorded import RecordedSequences
-from neurove_core.training.run import TrainingRun
+from neurove_core.training.run import TrainingRun, checkpoint_step
 from neurove_core.training.validation import Held
 
 CHECKPOINT: Final = "checkpoint.safetensors"
@@ -90,8 +91,7 @@ def train(
     held: Held | None = None,
     resume: bool = False,
     start: Bundle | None = None,
-    devices: int = 1,
-    device: str = "cpu",
+    ranks: Ranks = ALONE,
     on_progress: Callable[[Progress], None] = lambda _: None,
 ) -> Path:
     """Train a network on existing sequences, and write its bundle without an uncertainty; see `pipeline.train`.
@@ -103,58 +103,61 @@ def train(
         more: files of further sequences, as `data.save` writes them, or spans of their windows.
         held: windows that validate the run; without them it is not validated and not stopped early. With them, the
             held-out parts of the recordings are not trained on; see `RecordedSequences.split`.
-        resume: continue from the checkpoint in `out`, if it exists.
+        resume: continue from the checkpoint in `out`, if it exists; with several ranks, from the newest of theirs.
         start: model whose weights the run begins from; ignored if the run continues from a checkpoint.
-        devices: number of processes that share each batch, each with its own device.
-        device: `cpu`, `cuda` or `auto`; see `ranks.device_of`.
+        ranks: this process and the others of the run, which call this function too; see `joining.joined`.
         on_progress: called after each segment.
 
     Returns:
-        the path of the bundle.
+        the path of the bundle, which the first rank has written.
 
     Raises:
         BrokenRecording: a sequence is missing or broken.
         BadModel: the checkpoint does not fit the configuration, or `start` has another network.
-        InvalidField: the batch does not split over the devices, or a device is missing.
+        InvalidField: the batch does not split over the ranks.
         LostRank: one of the processes ended early.
     """
-    out.mkdir(parents=True, exist_ok=True)
-    resume = resume and (out / CHECKPOINT).exists()
+    if ranks.first:
+        out.mkdir(parents=True, exist_ok=True)
     recorded = RecordedSequences(data, config)
-    parts = recorded.split()[0] if held else recorded.paths()
+    validates = ranks.gather(held is not None)[0]  # only the first rank has the windows that validate
+    parts = recorded.split()[0] if validates else recorded.paths()
     sequences = Sequences([*Cache(data, config).paths(), *parts, *more])
-    how = Start(resume, start)
-    begin_run(config, out, sequences, how, Ranks(count=devices))  # one process raises the errors of the arguments
-    with process_group(devices, device, train_rank, (config, out, sequences.paths, how)) as ranks:
-        run = begin_run(config, out, sequences, how, ranks)
-        with Scalars(out, run.step) as scalars:
-            train_to_end(run, sequences, out, on_progress, scalars.add, held)
-    draw_curve(run.curve, out, f"{config.name}: {run.step} updates", run.validation)
+    run = begin_run(config, out, sequences, ranks, start, resume=resume)
     path = out / f"{config.name}{bundle.SUFFIX}"
+    if not ranks.first:
+        train_to_end(run, sequences, out)
+        return path
+    with Scalars(out, run.step) as scalars:
+        train_to_end(run, sequences, out, on_progress, scalars.add, held)
+    draw_curve(run.curve, out, f"{config.name}: {run.step} updates", run.validation)
     made = run.bundle(provenance(run, len(more)), metadata_of(run), best=kept_step(run) < run.step)
     test = self_test.record(Estimator(made), golden_windows(sequences, config.model.canonical))
     bundle.save(replace(made, golden=test), path)
     return path
 
 
-class Start(NamedTuple):
-    """Origin of the first weights of a run: a checkpoint, a model, or the seed of the recipe."""
+def begin_run(
+    config: TrainingConfig, out: Path, sequences: Sequences, ranks: Ranks, start: Bundle | None, *, resume: bool
+) -> TrainingRun:
+    """The run of a rank, at its first update or at that of the newest checkpoint of all ranks.
 
-    resume: bool
-    start: Bundle | None
-
-
-def begin_run(config: TrainingConfig, out: Path, sequences: Sequences, how: Start, ranks: Ranks) -> TrainingRun:
-    """The run of a rank, at its first update or at the update of the checkpoint."""
-    if how.resume:
-        return TrainingRun.restore(out / CHECKPOINT, config, ranks)
-    return TrainingRun.begin(config, sequences, ranks, how.start)
-
-
-def train_rank(config: TrainingConfig, out: Path, paths: list[Path | Span], how: Start, ranks: Ranks) -> None:
-    """Main function of every rank except the first: train, and write nothing."""
-    sequences = Sequences(paths)
-    train_to_end(begin_run(config, out, sequences, how, ranks), sequences, out)
+    The folder of the first rank need not be the one that has the checkpoint, because a launcher may number the
+    machines anew when it starts their processes again.
+    """
+    path = out / CHECKPOINT
+    steps = ranks.gather(checkpoint_step(path) if resume else -1)
+    newest = max(steps)
+    if newest < 0:
+        return TrainingRun.begin(config, sequences, ranks, start)
+    if min(steps) == newest:
+        return TrainingRun.restore(path, config, ranks)
+    source = steps.index(newest)
+    content = ranks.from_rank(source, path.read_bytes() if ranks.rank == source else b"")
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder, CHECKPOINT)
+        copy.write_bytes(content)
+        return TrainingRun.restore(copy, config, ranks)
 
 
 def train_to_end(

@@ -2,39 +2,35 @@
 
 Every rank computes on its own device. Everything that depends on the whole batch is averaged over all ranks: the
 statistics of the norms, the losses of the dynamic scaling, and the gradient. N devices therefore take the step that one
-device would take on the same batch.
+device would take on the same batch. `joining` makes the group of ranks, `launch` starts the ranks of one machine.
 """
 
-import contextlib
-import multiprocessing
-import os
-import signal
-import socket
-import sys
-import tempfile
-from collections.abc import Callable, Iterable, Iterator
+import re
+import threading
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
-from datetime import timedelta
-from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, Generic, TypeVar
 
 import torch
 import torch.distributed as dist
 from torch import Tensor, nn
 
-from neurove_protocol.errors import InvalidField, NeuroVEError
+from neurove_protocol.errors import EXIT_FAILURE, InvalidField, NeuroVEError
 
-_TIMEOUT: Final = timedelta(minutes=10)  # of one exchange; the end of a rank is detected at once
+T = TypeVar("T")
+
+_IN_TOUCH_S: Final = 1.0  # interval of the messages of ranks that wait for others
 
 
 class LostRank(NeuroVEError):
-    """A process of a distributed run ended early."""
+    """A process of a distributed run ended early, or cannot be reached any more."""
 
     code = "lost_rank"
+    exit_code = EXIT_FAILURE
 
-    def __init__(self, rank: int, exit_code: int | None) -> None:
-        why = f"process {rank} of the run ended with code {exit_code}: continue with --resume"
-        super().__init__(why, rank=rank, exit_code=exit_code)
+    def __init__(self, rank: int, why: str) -> None:
+        sentence = f"process {rank} of the run {why}; if no launcher starts it again, continue with --resume"
+        super().__init__(sentence, rank=rank, why=why)
 
 
 @dataclass(frozen=True)
@@ -44,17 +40,26 @@ class Ranks:
     rank: int = 0
     count: int = 1
     device: torch.device = field(default_factory=lambda: torch.device("cpu"))
+    local_rank: int = 0  # number among the ranks of this machine
+    machine: int = 0
+    machines: int = 1
+    tensors: Any = None  # group of torch that exchanges tensors of the device; None: the default group
 
     @property
     def first(self) -> bool:
         """Whether this rank writes the files."""
         return self.rank == 0
 
+    @property
+    def leads(self) -> bool:
+        """Whether this rank makes the sequences of its machine."""
+        return self.local_rank == 0
+
     def mean(self, value: Tensor) -> Tensor:
         """Mean of a tensor over all ranks, with the same bits on each; gradients flow into the tensor of every rank."""
         if self.count == 1:
             return value
-        mean: Tensor = _Mean.apply(value, self.count)  # type: ignore[no-untyped-call]  # torch's own
+        mean: Tensor = _Mean.apply(value, self)  # type: ignore[no-untyped-call]  # torch's own
         return mean
 
     def average_gradients(self, parameters: Iterable[nn.Parameter]) -> None:
@@ -67,35 +72,136 @@ class Ranks:
             gradient.copy_(mean.view_as(gradient))
 
     def gather(self, value: Any) -> list[Any]:
-        """The value of each rank, in the order of the ranks."""
+        """The value of each rank, in the order of the ranks.
+
+        Raises:
+            LostRank: another rank has ended or cannot be reached.
+        """
         if self.count == 1:
             return [value]
         values: list[Any] = [None] * self.count
-        dist.all_gather_object(values, value)
+        try:
+            dist.all_gather_object(values, value)
+        except RuntimeError as error:  # torch and gloo have no class of their own for a closed connection
+            raise self.lost(error) from error
         return values
+
+    def from_rank(self, rank: int, data: bytes) -> bytes:
+        """The bytes of one rank on every rank.
+
+        Raises:
+            LostRank: another rank has ended or cannot be reached.
+        """
+        size = self.gather(len(data))[rank]
+        if self.count == 1 or not size:
+            return data if self.rank == rank else b""
+        buffer = (
+            torch.frombuffer(bytearray(data), dtype=torch.uint8)
+            if self.rank == rank
+            else torch.empty(size, dtype=torch.uint8)
+        )
+        try:
+            dist.broadcast(buffer, rank)
+        except RuntimeError as error:
+            raise self.lost(error) from error
+        return buffer.numpy().tobytes()
+
+    def agree(self, what: str, value: Any) -> None:
+        """Check that a value is the same on every rank.
+
+        Raises:
+            InvalidField: another rank has another value.
+        """
+        for rank, other in enumerate(self.gather(value)):
+            if other != value:
+                raise InvalidField("training", what, value, f"process {rank} of the run has {other}")
+
+    def together(self, work: Callable[[], T]) -> T:
+        """Do long work while the ranks stay in touch, until every rank has done its own; a lost rank is noticed.
+
+        Args:
+            work: of this rank; its exceptions are those of this function.
+
+        Raises:
+            LostRank: another rank failed, has ended or cannot be reached.
+        """
+        if self.count == 1:
+            return work()
+        doing = _Work(work)
+        while True:
+            doing.ended.wait(_IN_TOUCH_S)
+            states = self.gather((doing.ended.is_set(), doing.failed))
+            if doing.failed and states[self.rank][1]:
+                return doing.result()
+            for rank, (_, failed) in enumerate(states):
+                if failed:
+                    raise LostRank(rank, f"failed: {failed}")
+            if all(ended for ended, _ in states):
+                return doing.result()
+
+    def lost(self, error: RuntimeError) -> LostRank:
+        """The error for an exchange that failed on this rank."""
+        return LostRank(self.rank, f"lost the connection to another one ({first_words(error)})")
+
+
+def first_words(error: Exception) -> str:
+    """The first sentence of an error of torch, without the place in its sources.
+
+    >>> first_words(RuntimeError("[/gloo/pair.cc:553] Connection closed by peer [127.0.0.1]:11657. This is typical."))
+    'Connection closed by peer [127.0.0.1]:11657'
+    """
+    line = (str(error).splitlines() or [type(error).__name__])[0]
+    return re.sub(r"^\[/[^]]*\] ", "", line).partition(". ")[0][:200]
 
 
 ALONE: Final = Ranks()
 """A run of one process on the CPU."""
 
 
+class _Work(Generic[T]):
+    """Work on a thread of its own. The thread does not keep the process alive."""
+
+    def __init__(self, work: Callable[[], T]) -> None:
+        self.ended, self.failed = threading.Event(), ""
+        self._error: Exception | None = None
+        self._result: T
+
+        def run() -> None:
+            try:
+                self._result = work()
+            except Exception as error:  # noqa: BLE001 (raised by `result`)
+                self._error, self.failed = error, str(error) or type(error).__name__
+            self.ended.set()
+
+        threading.Thread(target=run, name="work of the rank", daemon=True).start()
+
+    def result(self) -> T:
+        """The result of the work, or its exception."""
+        if self._error is not None:
+            raise self._error
+        return self._result
+
+
 class _Mean(torch.autograd.Function):
     """Mean over all ranks; backward it averages too, because the loss of each rank depends on the values of all."""
 
     @staticmethod
-    def forward(ctx: Any, value: Tensor, count: int) -> Tensor:
-        ctx.count = count
-        return _averaged(value, count)
+    def forward(ctx: Any, value: Tensor, ranks: Ranks) -> Tensor:
+        ctx.ranks = ranks
+        return _averaged(value, ranks)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
-        return _averaged(gradients[0], ctx.count), None
+        return _averaged(gradients[0], ctx.ranks), None
 
 
-def _averaged(value: Tensor, count: int) -> Tensor:
+def _averaged(value: Tensor, ranks: Ranks) -> Tensor:
     total = value.detach().clone(memory_format=torch.contiguous_format)
-    dist.all_reduce(total)
-    return total / count
+    try:
+        dist.all_reduce(total, group=ranks.tensors)
+    except RuntimeError as error:
+        raise ranks.lost(error) from error
+    return total / ranks.count
 
 
 class SharedNorm(nn.Module):
@@ -160,109 +266,3 @@ def device_of(wanted: str, rank: int = 0, devices: int = 1) -> torch.device:
     if wanted == "cuda" and available < devices:
         raise InvalidField("training", "device", wanted, f"{devices} GPUs are needed, torch sees {available}")
     return torch.device("cpu" if wanted == "cpu" or available < devices else f"cuda:{rank}")
-
-
-@contextlib.contextmanager
-def process_group(devices: int, device: str, work: Callable[..., Any], arguments: tuple[Any, ...]) -> Iterator[Ranks]:
-    """Run `devices` processes on this machine as one group; the caller is the first rank.
-
-    Args:
-        devices: number of processes, at least 1; with 1 no process is started.
-        device: see `device_of`.
-        work: function of a module that every other rank calls with `arguments` and its Ranks.
-        arguments: must be picklable.
-
-    Raises:
-        InvalidField: as `device_of`. LostRank: another process ended before this one.
-    """
-    if devices == 1:
-        yield Ranks(device=device_of(device))
-        return
-    first = Ranks(0, devices, device_of(device, 0, devices))
-    context = multiprocessing.get_context("spawn")  # the threads of torch and CUDA do not survive a fork
-    others: list[_Other] = []
-    with tempfile.TemporaryDirectory() as meeting, contextlib.ExitStack() as ends:
-        store, threads = str(Path(meeting) / "ranks"), torch.get_num_threads()
-        for rank in range(1, devices):
-            ready, started = context.Pipe(duplex=False)
-            own = Ranks(rank, devices, device_of(device, rank, devices))
-            other = context.Process(target=_run_rank, args=(own, store, threads, started, work, arguments), daemon=True)
-            other.start()
-            started.close()
-            others.append(_Other(rank, other, ready))
-            ends.callback(others[-1].end)
-        for each in others:
-            each.wait()
-        with _group(first, store):
-            try:
-                yield first
-            except BaseException as error:
-                lost = (
-                    next((each for each in others if each.ended()), None) if isinstance(error, RuntimeError) else None
-                )
-                for each in others:
-                    each.process.kill()  # before the group ends; otherwise each logs that the first rank is gone
-                if lost is None:
-                    raise
-                raise lost.error() from error  # torch reports only that a connection was closed
-
-
-class _Other(NamedTuple):
-    """Another process of the run, as the first rank handles it."""
-
-    rank: int
-    process: Any
-    ready: Any  # a pipe that reports when the process has started
-
-    def wait(self) -> None:
-        """Wait until the process has started; joining a group with a missing member would take the whole timeout."""
-        try:
-            self.ready.recv()
-        except EOFError:  # it ended during its start
-            self.process.join()
-            raise self.error() from None
-
-    def ended(self) -> bool:
-        self.process.join(1.0)  # its connections close shortly before it ends
-        return self.process.exitcode is not None
-
-    def error(self) -> LostRank:
-        return LostRank(self.rank, self.process.exitcode)
-
-    def end(self) -> None:
-        self.ready.close()
-        if sys.exc_info()[0] is None:
-            self.process.join(60)  # it has done the last exchange and ends by itself
-        self.process.kill()
-        self.process.join()
-
-
-def _run_rank(ranks: Ranks, store: str, threads: int, started: Any, work: Callable[..., Any], arguments: Any) -> None:
-    """Main function of the other processes."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches all processes; the first rank ends the others
-    torch.set_num_threads(threads)
-    started.send(True)
-    with _group(ranks, store):
-        work(*arguments, ranks)
-
-
-@contextlib.contextmanager
-def _group(ranks: Ranks, store: str) -> Iterator[None]:
-    """Create the group of all ranks, and destroy it at the end."""
-    if ranks.device.type == "cuda":
-        torch.cuda.set_device(ranks.device)
-    else:
-        loopback = next((name for _, name in socket.if_nameindex() if name.startswith("lo")), None)
-        if loopback:  # otherwise the port would be open to the network
-            os.environ.setdefault("GLOO_SOCKET_IFNAME", loopback)
-    dist.init_process_group(
-        "nccl" if ranks.device.type == "cuda" else "gloo",
-        init_method=f"file://{store}",
-        rank=ranks.rank,
-        world_size=ranks.count,
-        timeout=_TIMEOUT,
-    )
-    try:
-        yield
-    finally:
-        dist.destroy_process_group()

@@ -74,6 +74,7 @@ class TrainingRun:
         if start is not None:
             check_start(start, config)
         scaling = output_scaling(sequences) if start is None else (start.offset, start.scale)
+        scaling = ranks.gather(scaling)[0]  # the sequences of another machine may differ in their last bits
         offset, scale = (one.to(ranks.device, copy=True) for one in scaling)
         network, optimiser = _network(config, ranks)
         if start is not None:
@@ -166,6 +167,21 @@ class TrainingRun:
         return run
 
 
+def checkpoint_step(path: Path) -> int:
+    """The update of a checkpoint; -1 without one.
+
+    Raises:
+        BadModel: the file is broken.
+    """
+    if not path.exists():
+        return -1
+    try:
+        with safetensors.safe_open(path, "pt") as file:
+            return int(json.loads(file.metadata()[_KEY])["step"])
+    except (OSError, KeyError, TypeError, ValueError, safetensors.SafetensorError) as error:
+        raise BadModel(path.name, f"not a usable checkpoint: {error}") from None
+
+
 def output_scaling(sequences: Sequences) -> tuple[Tensor, Tensor]:
     """Compute offset and scale (6) of a network's outputs: the mean of the truth, and one spread per group of three.
 
@@ -196,10 +212,19 @@ def _balance(ranks: Ranks) -> Balance:
     return Balance(*(mean.to(ranks.device) for mean in Balance.initial()))
 
 
-def _network(config: TrainingConfig, ranks: Ranks) -> tuple[Network, torch.optim.Adam]:
-    if ranks.count < 1 or config.recipe.batch % ranks.count:
+def check_split(config: TrainingConfig, devices: int) -> None:
+    """Check that the batch splits over a number of devices.
+
+    Raises:
+        InvalidField: it does not.
+    """
+    if devices < 1 or config.recipe.batch % devices:
         bound = f"recipe.batch={config.recipe.batch} does not split into this many equal parts"
-        raise InvalidField("training", "devices", ranks.count, bound)
+        raise InvalidField("training", "devices", devices, bound)
+
+
+def _network(config: TrainingConfig, ranks: Ranks) -> tuple[Network, torch.optim.Adam]:
+    check_split(config, ranks.count)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.recipe.seed)
         network = kinds.make(config.model)

@@ -107,7 +107,7 @@ def _add_settings(
 
 def _default_text(value: object) -> str:
     """A default as people write it."""
-    if value is None or value == ():
+    if value is None or value in ((), {}):
         return "none"
     return ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
 

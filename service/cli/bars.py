@@ -10,8 +10,15 @@ _EACH_STEP = ("simulated", "split into windows")
 
 
 @contextlib.contextmanager
-def progress() -> Iterator[Callable[[str, int, int, str], None]]:
-    """Yield a function that shows the progress of a task: (task, steps done, of how many, detail)."""
+def progress(*, shown: bool = True) -> Iterator[Callable[[str, int, int, str], None]]:
+    """Yield a function that shows the progress of a task: (task, steps done, of how many, detail).
+
+    Args:
+        shown: show nothing if it is false.
+    """
+    if not shown:
+        yield lambda *_: None
+        return
     if not sys.stderr.isatty():
         yield _print_line
         return

@@ -6,7 +6,7 @@ import os
 import platform
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,6 +32,9 @@ ALL = (
     "narrow",
 )
 
+FIGURES = "figures"
+"""The name under which all benchmarks of `neurove_core.bench.figures` run, with its table at the end."""
+
 NARROW = {"ONEDNN_MAX_CPU_ISA": "AVX2", "ATEN_CPU_CAPABILITY": "avx2", "NUMBA_CPU_NAME": "haswell"}
 """Variables that restrict an x86-64 machine to AVX2; the libraries read them when they are loaded."""
 
@@ -40,7 +43,7 @@ def bench(args: argparse.Namespace) -> int:
     """Measure our speed and the peers' in one process: same input, interleaved runs, answers compared."""
     import torch
 
-    from neurove_core.bench import chart, machine
+    from neurove_core.bench import chart, figures, machine
 
     torch.set_num_threads(1)
     for suffix in (".png", ".svg") if args.plot else ():
@@ -49,11 +52,17 @@ def bench(args: argparse.Namespace) -> int:
     print(stamp, file=sys.stderr)
     rows: list[Row] = []
     missing: list[str] = []
-    for name in args.what or ALL:
+    asked: Sequence[str] = args.what or ALL
+    wants_table = FIGURES in asked
+    if wants_table:
+        asked = list(dict.fromkeys(name for one in asked for name in (figures.BENCHMARKS if one == FIGURES else [one])))
+    for name in asked:
         for row in _rows(name, args, missing):
             rows.append(row)
             if not args.json:
                 print(_sentence(row), flush=True)
+    if wants_table and not args.json:
+        print(f"\n{figures.table(rows)}")
     if missing:
         print(f"not measured: {'; '.join(dict.fromkeys(missing))}", file=sys.stderr)
     if args.json:
@@ -124,7 +133,8 @@ def add_bench(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `neurove bench`."""
     command(parser, bench)
     names = ", ".join(ALL)
-    parser.add_argument("what", nargs="*", type=_benchmark, metavar="WHAT", help=f"any of {names}; default: all")
+    about = f"any of {names}; default: all. 'figures' runs what the table of speed figures needs, and prints it"
+    parser.add_argument("what", nargs="*", type=_benchmark, metavar="WHAT", help=about)
     parser.add_argument("--peers", action="store_true", help="measure the peers of the extra 'bench' too")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw a chart as FILE.png and FILE.svg")
     add_force(parser, "FILE.png and FILE.svg")
@@ -134,6 +144,6 @@ def add_bench(parser: argparse.ArgumentParser) -> None:
 
 
 def _benchmark(text: str) -> str:
-    if text not in ALL:
-        raise argparse.ArgumentTypeError(f"unknown benchmark {text!r}; known are {', '.join(ALL)}")
+    if text not in (*ALL, FIGURES):
+        raise argparse.ArgumentTypeError(f"unknown benchmark {text!r}; known are {', '.join((*ALL, FIGURES))}")
     return text

@@ -155,7 +155,8 @@ def _name(model: ModelInfo) -> str:
     return f"{model.name} ({model.digest[:12]})"
 
 
-def _digest_prefix(text: str) -> str:
+def digest_prefix(text: str) -> str:
+    """The first 8 or more digits of a digest."""
     if not 8 <= len(text) <= 64 or text.strip("0123456789abcdef"):
         raise argparse.ArgumentTypeError(f"{text!r}: give the first 8 or more digits of a digest from `neurove models`")
     return text
@@ -212,4 +213,4 @@ def _add_force(parser: argparse.ArgumentParser) -> None:
 
 def _add_expect(parser: argparse.ArgumentParser) -> None:
     about = "change the node only if this model is active"
-    parser.add_argument("--expect", type=_digest_prefix, metavar="DIGEST", help=about)
+    parser.add_argument("--expect", type=digest_prefix, metavar="DIGEST", help=about)

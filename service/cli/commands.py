@@ -41,6 +41,11 @@ COMMANDS = (
     Command("push", "Send a bundle to a running node.", "changing"),
     Command("activate", "Change the model of a running node.", "changing"),
     Command("rollback", "Activate the previous model of a running node again.", "changing"),
+    Command("drain", "Hand over the streams of a node to the nodes that follow them.", "draining"),
+    Command(
+        "fleet", "List the nodes of a deployment, with their labels and models, and those that do not answer.", "fleet"
+    ),
+    Command("rollout", "Change the model of many nodes step by step, and stop or go back if one fails.", "rollout"),
     Command("bundle", "Make, inspect, sign and verify bundles: files that hold a model.", "bundles", "serve"),
     Command("record", "Record the packets that drivers publish, until Ctrl-C.", "recordings", "recordings"),
     Command("info", "Show what a recording holds: sensor, counts, rates, IMU and truth.", "recordings", "recordings"),

@@ -11,6 +11,7 @@ from neurove_protocol.errors import EXIT_FAILURE, InvalidField
 from neurove_service.cli.arguments import add_refine_flag, check_folder, commit, count, seed, subcommand
 from neurove_service.cli.bars import progress
 from neurove_service.cli.parser import Parser
+from neurove_service.cli.pools import add_pool_flags, pool_of
 
 
 def reproduce_firing(args: argparse.Namespace) -> int:
@@ -81,7 +82,8 @@ def reproduce_sine(args: argparse.Namespace) -> int:
     models, seeds = args.models.split(","), range(args.seed, args.seed + args.seeds)
     command_line, made_by = shlex.join(["neurove", *sys.argv[1:]]), commit()
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console(stderr=True), disable=not sys.stderr.isatty()) as bar:
+    bars = Progress(*columns, console=console(stderr=True), disable=not sys.stderr.isatty())
+    with pool_of(args) as pool, bars as bar:
         tasks: dict[tuple[str, int], Any] = {}
 
         def progress(model: str, seed: int, update: int, updates: int, mse: float) -> None:
@@ -92,7 +94,9 @@ def reproduce_sine(args: argparse.Namespace) -> int:
 
         runs: list[report.SineRun] = []
         files: dict[Path, None] = {}
-        for run in report.reproduce(models, seeds, changes=dict(args.set), quick=args.quick, progress=progress):
+        for run in report.reproduce(
+            models, seeds, changes=dict(args.set), quick=args.quick, progress=progress, pool=pool
+        ):
             runs.append(run)
             if args.out:
                 files |= dict.fromkeys(report.save_run(runs, args.out, command=command_line, commit=made_by))
@@ -135,8 +139,8 @@ def reproduce_motion(args: argparse.Namespace) -> int:
         _check_out(folder)
     torch.set_num_threads(1)
     estimator = Estimator(models.find(args.model), refine=args.refine == "auto")
-    with progress() as show:
-        found = run.run(estimator, groups, args.recordings, args.data, show, quick=args.quick)
+    with pool_of(args) as pool, progress() as show:
+        found = run.run(estimator, groups, args.recordings, args.data, show, quick=args.quick, pool=pool)
     results = {"model": estimator.bundle.info.model_dump()} | _made_by() | {"quick": args.quick} | found
     print(json.dumps(results) + "\n" if args.json else run.markdown(results), end="")
     for file in run.save(results, args.out) if args.out else []:
@@ -187,8 +191,8 @@ def reproduce_velocity(args: argparse.Namespace) -> int:
     for path in (out, folder):
         _check_out(path)
     found = []
-    with progress() as show:
-        for one in run.reproduce(experiment, folder, out, show, args.workers):
+    with pool_of(args) as pool, progress() as show:
+        for one in run.reproduce(experiment, folder, out, show, pool):
             found.append(one)
             show(
                 "evaluated",
@@ -260,6 +264,7 @@ def _add_motion(parser: argparse.ArgumentParser) -> None:
     about = "one second of one recording per set through a tiny camera, to check that the command works"
     parser.add_argument("--quick", action="store_true", help=about)
     add_refine_flag(parser)
+    add_pool_flags(parser, "simulate")
     _add_out(parser, "folder for motion.json and motion.md")
 
 
@@ -292,6 +297,7 @@ def _add_sine(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--set", type=_assignment, action="append", default=[], metavar="FIELD=VALUE", help=about)
     about = "a few updates, to check that the command works; its figures mean nothing"
     parser.add_argument("--quick", action="store_true", help=about)
+    add_pool_flags(parser, "train one model from one seed each")
     _add_out(parser, "folder for figures, tables, pictures and networks")
 
 
@@ -316,8 +322,7 @@ def _add_velocity(parser: argparse.ArgumentParser) -> None:
     about = "folder with MVSEC's poses, for Table III"
     parser.add_argument("--recordings", type=Path, metavar="DIR", help=about)
     _add_out(parser, "folder for methods, tables and figures; default runs/velocity")
-    about = "number of processes that simulate; default 1"
-    parser.add_argument("--workers", type=count, default=1, metavar="N", help=about)
+    add_pool_flags(parser, "simulate")
     parser.add_argument("--threads", type=count, default=1, metavar="N", help="threads that train; default 1")
     about = "tiny networks and sequences, to check that the command works; its figures mean nothing"
     parser.add_argument("--quick", action="store_true", help=about)

@@ -17,6 +17,7 @@ EXTRAS: Final[dict[str, tuple[str, ...]]] = {
     "page": ("PIL", "starlette", "uvicorn"),
     "foxglove": ("foxglove",),
     "ros2": ("xxhash",),
+    "cluster": ("dask", "distributed"),
 }
 """Modules that an extra installs itself; some extras also include others, see `_DEPENDS` and pyproject.toml."""
 

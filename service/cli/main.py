@@ -62,6 +62,7 @@ def _command(words: list[str], chosen: str) -> int:
     parser = build_parser({chosen})
     parser.check_words(words)
     args = parser.parse_args(words)
+    args.words = words  # a command may start itself again, on other devices
     code: int = args.run(args)
     return code
 

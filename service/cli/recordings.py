@@ -13,19 +13,23 @@ from typing import TYPE_CHECKING, Any, Final
 
 from neurove_protocol.errors import EXIT_FAILURE, InvalidField, NeuroVEError
 from neurove_protocol.keys import check_name
+from neurove_service.cli import bars
 from neurove_service.cli.arguments import (
     add_client_flags,
     add_force,
     add_lens_flags,
     add_recording_flags,
+    check_folder,
     client_config,
     command,
+    count,
     duration,
     refuse_existing,
     seconds,
     tell_faults,
 )
 from neurove_service.cli.bars import event_count
+from neurove_service.cli.pools import add_pool_flags, pool_of
 from neurove_service.cli.waiting import Wait, add_wait
 from neurove_service.lifecycle import stop_on_signals
 
@@ -231,13 +235,36 @@ def simulate(args: argparse.Namespace) -> int:
     if args.scene == "carla":
         refuse_existing("simulate", "--out", path, None, force=args.force)
         return _simulate_carla(args)
+    if args.count is not None:
+        return _simulate_series(args)
     if path.suffix not in WRITERS:
         raise InvalidField("simulate", "--out", str(path), f"its name must end in {' or '.join(WRITERS)}")
     refuse_existing("simulate", "--out", path, None, force=args.force)
-    query = {name: getattr(args, name) for name in ("trajectory", "camera", "height", "pitch", "seed", "seconds")}
-    given = {name: value for name, value in query.items() if value is not None}
-    recording = open_source(f"sim://{args.scene}?{urllib.parse.urlencode(given)}")
+    recording = open_source(f"sim://{args.scene}?{urllib.parse.urlencode(_query(args) | {'seed': args.seed})}")
     return _write(recording, path, as_json=args.json)
+
+
+def _query(args: argparse.Namespace) -> dict[str, Any]:
+    """What the user gives of a simulation, without its seed."""
+    query = {name: getattr(args, name) for name in ("trajectory", "camera", "height", "pitch", "seconds")}
+    return {name: value for name, value in query.items() if value is not None}
+
+
+def _simulate_series(args: argparse.Namespace) -> int:
+    """Record one simulation for each of several seeds into a folder."""
+    from neurove_core import series
+
+    check_folder("simulate", "--out", args.out)
+    files, new = [], 0
+    with pool_of(args) as pool, bars.progress() as show:
+        seeds = range(args.seed, args.seed + args.count)
+        for path, simulated in series.simulate(args.scene, seeds, _query(args), args.out, pool):
+            files.append(str(path))
+            new += simulated
+            show("simulated", len(files), args.count, path.name)
+    summary = {"files": sorted(files), "simulated": new}
+    print(json.dumps(summary) if args.json else f"{args.out}: {len(files)} recordings, {new} of them new")
+    return 0
 
 
 def _simulate_carla(args: argparse.Namespace) -> int:
@@ -296,7 +323,7 @@ def add_simulate(parser: argparse.ArgumentParser) -> None:
     command(parser, simulate)
     scenes = "street, bare-street, corridor, room, plain-room or wall; carla: record from a CARLA server"
     parser.add_argument("scene", metavar="SCENE", help=scenes)
-    about = "file to write: .mcap (packet log) or .h5 (DSEC); .npz for carla"
+    about = "file to write: .mcap (packet log) or .h5 (DSEC); .npz for carla; with --count a folder"
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help=about)
     add_force(parser, "FILE")
     parser.add_argument("--seconds", type=seconds, default=10.0, metavar="S", help="seconds to simulate; default 10 s")
@@ -304,6 +331,9 @@ def add_simulate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, metavar="N", help=about)
     about = "driving, handheld, still, rotation?wy=1, a file of poses, ...; default: that of the scene"
     parser.add_argument("--trajectory", metavar="T", help=about)
+    about = "simulate N recordings with the seeds from --seed on, as packet logs; those in the folder are kept"
+    parser.add_argument("--count", type=count, metavar="N", help=about)
+    add_pool_flags(parser, "simulate one recording of --count each")
     about = "davis346-half, davis346, davis240c, prophesee, ...; default davis346-half"
     parser.add_argument("--camera", metavar="C", help=about)
     parser.add_argument("--height", metavar="M", help="height of the camera above the ground [m]; default 1.5")

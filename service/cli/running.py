@@ -295,8 +295,14 @@ def show_config(args: argparse.Namespace) -> int:
         return 0
     for name, value in values.items():
         comment = f"  # {origin[name]}" if args.origin else ""
-        print(f"{'# ' if value is None else ''}{name} = {json.dumps(value)}{comment}")
+        print(f"{'# ' if value is None else ''}{name} = {_toml(value)}{comment}")
     return 0
+
+
+def _toml(value: object) -> str:
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{json.dumps(name)} = {json.dumps(text)}" for name, text in value.items()) + "}"
+    return json.dumps(value)
 
 
 def add_demo(parser: argparse.ArgumentParser) -> None:

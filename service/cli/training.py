@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neurove_protocol.errors import InvalidField
+from neurove_protocol.errors import EXIT_PARTIAL, InvalidField
 from neurove_service.cli.arguments import (
     add_force,
     add_lens_flags,
@@ -21,10 +21,16 @@ from neurove_service.cli.arguments import (
     tell_faults,
 )
 from neurove_service.cli.bars import event_count, progress
+from neurove_service.cli.pools import add_pool_flags, pool_of
+from neurove_service.lifecycle import end_with_parent
 
 if TYPE_CHECKING:
+    from neurove_core.estimator import Estimator
+    from neurove_core.evaluation.evaluate import Estimates
     from neurove_core.geometry.motion import Twists
     from neurove_core.io import Recording
+    from neurove_core.tasks import FailedTasks, Pool
+    from neurove_core.training.config import TrainingConfig
 
 _CALIBRATION_SEQUENCES = 96
 
@@ -36,30 +42,62 @@ def train(args: argparse.Namespace) -> int:
     from neurove_core import models
     from neurove_core.models import bundle
     from neurove_core.training import config as configs
-    from neurove_core.training import loop, pipeline
+    from neurove_core.training import joining, loop, pipeline
 
     torch.set_num_threads(args.threads)
     config = configs.load(args.config)
     out: Path = args.out or Path("runs") / config.name
+    started = joining.launched()  # by torchrun, which starts the same command again after a failure
     if not args.resume:
-        _refuse_run(out, (out / loop.CHECKPOINT, out / f"{config.name}{bundle.SUFFIX}"), force=args.force)
-    with progress() as show:
+        results = (out / f"{config.name}{bundle.SUFFIX}", *([] if started else [out / loop.CHECKPOINT]))
+        if not (started and (out / loop.CHECKPOINT).exists()):
+            _refuse_run(out, results, force=args.force)
+    if args.devices > 1 and not started:
+        return _launch(args, config, out)
+    if started:
+        end_with_parent()
+    start = models.find(args.start) if args.start else None
+    with joining.joined(args.device) as ranks, pool_of(args) as pool, progress(shown=ranks.leads) as show:
+        if args.devices not in (1, ranks.count):
+            bound = f"the launcher started {ranks.count} processes; leave the flag out, or give that number"
+            raise InvalidField("training", "--devices", args.devices, bound)
         path = pipeline.train(
             config,
             out,
             data=args.data,
-            start=models.find(args.start) if args.start else None,
-            resume=args.resume,
-            devices=args.devices,
-            device=args.device,
-            workers=args.workers,
+            start=start,
+            resume=args.resume or started,
+            ranks=ranks,
+            pool=pool,
             calibration_sequences=args.calibration_sequences,
             on_progress=show,
         )
+    if not ranks.first:
+        return 0
     size, told = path.stat().st_size, json.loads((out / loop.RUN_JSON).read_bytes())["validated"]
     summary = {"bundle": str(path), "bytes": size, "run": str(out / loop.RUN_JSON), "validated": told}
     print(json.dumps(summary) if args.json else "\n".join([*told, f"wrote {path}, {size:,} bytes"]))
     return 0
+
+
+def _launch(args: argparse.Namespace, config: "TrainingConfig", out: Path) -> int:
+    """Start this command once for each device, through the launcher of torch; errors of the arguments come first."""
+    from neurove_core import models
+    from neurove_core.training import launch, loop, pipeline
+    from neurove_core.training.ranks import device_of
+
+    device_of(args.device, devices=args.devices)
+    pipeline.check(
+        config,
+        out,
+        models.find(args.start) if args.start else None,
+        resume=args.resume,
+        devices=args.devices,
+        calibration_sequences=args.calibration_sequences,
+    )
+    if not args.resume:  # the processes continue from a checkpoint, if there is one
+        (out / loop.CHECKPOINT).unlink(missing_ok=True)
+    return launch.launch(args.devices, "neurove_service.cli", args.words)
 
 
 def _refuse_run(out: Path, results: tuple[Path, ...], *, force: bool) -> None:
@@ -85,8 +123,8 @@ def calibrate(args: argparse.Namespace) -> int:
     out: Path = args.out or Path(f"{model.name}{bundle.SUFFIX}")
     refuse_existing("calibrate", "--out", out, None, force=args.force)
     data: Path = args.data or Path("runs") / config.name / "data"
-    with progress() as show:
-        report = pipeline.calibrate(model, config, data, out, args.calibration_sequences, args.workers, show, bounds)
+    with pool_of(args) as pool, progress() as show:
+        report = pipeline.calibrate(model, config, data, out, args.calibration_sequences, pool, show, bounds)
     if args.json:
         print(json.dumps({"bundle": str(out), **report}))
         return 0
@@ -117,13 +155,11 @@ def evaluate(args: argparse.Namespace) -> int:
     opened = [(source, open_source(source, args.sensor, args.topic, args.time_unit)) for source in args.recordings]
     sources = [(source, with_lens(one, args.calibration, args.height)) for source, one in opened]
     truths = [given or _truth(source, recording) for source, recording in sources]
-    estimator.warm_up()
-    evaluated = []
-    for (_, recording), truth in zip(sources, truths, strict=True):
-        with event_count(recording.name) as show:
-            estimates = evaluation.estimate_recording(estimator, recording, on_events=show, inertial=not args.no_imu)
-        evaluated.append(evaluation.evaluate(estimates, truth))
-        tell_faults(recording)
+    with pool_of(args) as pool:
+        estimates, failed = _estimates(args, estimator, [one for _, one in sources], pool)
+    if failed and not estimates:
+        raise failed
+    evaluated = [evaluation.evaluate(found, truths[number]) for number, found in sorted(estimates.items())]
     report = {"model": estimator.bundle.info.model_dump(), **evaluation.report(evaluated)}
     print(json.dumps(report) if args.json else "\n".join(_table(report)))
     if args.plot:
@@ -134,7 +170,42 @@ def evaluate(args: argparse.Namespace) -> int:
             files += plot_reliability(report["uncertainty"], args.plot)
         for file in files:
             print(f"wrote {file}", file=sys.stderr)
-    return 0
+    if failed:
+        print(f"neurove: {failed.message}; the figures are those of the others", file=sys.stderr)
+    return EXIT_PARTIAL if failed else 0
+
+
+def _estimates(
+    args: argparse.Namespace, estimator: "Estimator", recordings: "list[Recording]", pool: "Pool"
+) -> "tuple[dict[int, Estimates], FailedTasks | None]":
+    """The estimates for each recording, by its number, and the error that names the recordings that failed."""
+    from neurove_core.evaluation.evaluate import estimate_recording
+    from neurove_core.tasks import HERE, FailedTasks
+
+    found: dict[int, Estimates] = {}
+    if pool is HERE:
+        estimator.warm_up()
+        for number, recording in enumerate(recordings):
+            with event_count(recording.name) as show:
+                found[number] = estimate_recording(estimator, recording, on_events=show, inertial=not args.no_imu)
+            tell_faults(recording)
+        return found, None
+    from neurove_core.evaluation.jobs import EvaluationJob, estimates_of
+
+    model, refine = estimator.bundle.to_bytes(), args.refine == "auto"
+    how: tuple[Any, ...] = (args.sensor, args.topic, args.time_unit, args.calibration, args.height, not args.no_imu)
+    names = {f"{number + 1} {source}": number for number, source in enumerate(args.recordings)}
+    jobs = {name: EvaluationJob(model, refine, args.recordings[number], *how) for name, number in names.items()}
+    with progress() as show_task:
+        try:
+            for name, (estimates, faults) in pool.run(estimates_of, jobs):
+                found[names[name]] = estimates
+                show_task("evaluated", len(found), len(jobs), name)
+                for fault in faults:
+                    print(f"neurove: {fault}", file=sys.stderr)
+        except FailedTasks as failed:
+            return found, failed
+    return found, None
 
 
 def _truth(source: str, recording: "Recording") -> "Twists":
@@ -207,11 +278,11 @@ def add_train(parser: argparse.ArgumentParser) -> None:
     add_force(parser, "a run in OUT")
     about = "initialise weights from BUNDLE, a file or `default`, instead of randomly"
     parser.add_argument("--start", metavar="BUNDLE", help=about)
-    about = "number of devices that share each batch; default 1"
+    about = "number of processes of this machine that share each batch, one GPU each if there are any; default 1"
     parser.add_argument("--devices", type=count, default=1, metavar="N", help=about)
     about = "auto, cpu or cuda; default auto: GPUs if there are any"
     parser.add_argument("--device", default="auto", metavar="KIND", help=about)
-    _add_workers(parser)
+    add_pool_flags(parser, "simulate")
     about = "threads of each device's process; default 1"
     parser.add_argument("--threads", type=count, default=1, metavar="N", help=about)
     _add_calibration(parser, "; 0: no uncertainty")
@@ -225,7 +296,7 @@ def add_calibrate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", default="default", metavar="CONFIG", help=about)
     parser.add_argument("--data", type=Path, metavar="DIR", help="folder for the sequences; default runs/CONFIG/data")
     _add_calibration(parser, "")
-    _add_workers(parser)
+    add_pool_flags(parser, "simulate")
     parser.add_argument("--out", type=Path, metavar="FILE", help="bundle to write; default NAME.safetensors")
     add_force(parser, "FILE")
     about = "estimates with a smaller linear sigma are never `uncertain` [m/s]; default: the node decides"
@@ -247,11 +318,7 @@ def add_evaluate(parser: argparse.ArgumentParser) -> None:
     add_refine_flag(parser)
     parser.add_argument("--no-imu", action="store_true", help="use the events alone, not the inertial samples")
     parser.add_argument("--plot", type=Path, metavar="DIR", help="draw truth and estimate over time into this folder")
-
-
-def _add_workers(parser: argparse.ArgumentParser) -> None:
-    about = "number of processes that simulate; default 1"
-    parser.add_argument("--workers", type=count, default=1, metavar="N", help=about)
+    add_pool_flags(parser, "run the model on one recording each")
 
 
 def _add_calibration(parser: argparse.ArgumentParser, none: str) -> None:

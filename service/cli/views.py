@@ -1,6 +1,8 @@
 """Tables for people: health, models, recordings; drawn with rich. The live table is in `board`."""
 
 import math
+from collections.abc import Mapping, Sequence
+from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Group, RenderableType
@@ -154,3 +156,36 @@ def models_table(replies: list[ModelsReply]) -> RenderableType:
         )
         parts.extend(Text(f"{name}: {why}", style="yellow") for name, why in reply.unreadable.items())
     return Group(*parts)
+
+
+def fleet_table(rows: Sequence[Mapping[str, Any]], now: datetime) -> RenderableType:
+    """The nodes of a fleet, one a line, in fixed columns; rows as `neurove fleet list --json` prints them."""
+    columns = ("node", "labels", "version", "model", "digest", "release", "verdict", "last seen", "why")
+    table = Table(*columns, **_PLAIN)
+    for column in table.columns[:-1]:
+        column.no_wrap = True
+    for row in rows:
+        verdict = "silent" if not row["answered"] else "ok" if row["ok"] else "not-ok"
+        table.add_row(
+            row["node"],
+            ",".join(f"{name}={value}" for name, value in row["labels"].items()) or "-",
+            *(
+                ("-",) * 4
+                if not row["answered"]
+                else (row["version"], row["model"], row["digest"][:12], str(row["release"]))
+            ),
+            Text(verdict, style="bold green" if verdict == "ok" else "bold red"),
+            _seen_text(row, now),
+            row["why"],
+        )
+    return table
+
+
+def _seen_text(row: Mapping[str, Any], now: datetime) -> str:
+    if row["answered"]:
+        return "now"
+    if row["last_seen"] is None:
+        return "-"
+    seen = datetime.fromisoformat(row["last_seen"])
+    age_s = (now - seen).total_seconds()
+    return age_text(max(0.0, age_s)) if age_s < 3 * 86_400 else f"{seen:%Y-%m-%d}"

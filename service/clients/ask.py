@@ -1,6 +1,7 @@
 """Queries to nodes and what nodes publish: health, models, model changes with progress, live estimates."""
 
 import threading
+from collections import defaultdict
 from collections.abc import Callable
 from typing import TypeVar
 
@@ -22,6 +23,7 @@ from neurove_protocol.control import (
     RollbackRequest,
     StreamStatus,
 )
+from neurove_protocol.duty import DrainReply, DrainRequest, Newest
 from neurove_protocol.errors import EXIT_FAILURE, NeuroVEError
 from neurove_service import logs
 from neurove_service.clients.transit import Transit
@@ -169,6 +171,24 @@ def rollback(
     return _change(transport, config.keys.rollback(node), node, request, ActivateReply, CHANGE_S, on_progress)
 
 
+def drain(transport: Transport, config: ClientConfig, node: str, *, resume: bool = False) -> DrainReply:
+    """Let a node hand over its streams to the nodes that follow them.
+
+    Args:
+        transport: an open session.
+        config: the deployment's prefix.
+        node: name of the node.
+        resume: instead, end the draining.
+
+    Raises:
+        NoService: the node does not answer, or it has no standby.
+    """
+    answers = transport.ask(config.keys.drain(node), DrainRequest(resume=resume).encode(), CHANGE_S)
+    if not answers:
+        raise NoService(f"{node}: it does not answer, or its setting standby is off, so no node can follow it")
+    return DrainReply.decode(answers[0].payload)
+
+
 def push(
     transport: Transport,
     config: ClientConfig,
@@ -252,6 +272,7 @@ def listen(
 ) -> None:
     """Receive every estimate and status; a message that cannot be decoded is logged and ignored.
 
+    Where several nodes can answer a stream, each window comes once: see `duty.Newest`.
     An estimate that waited on its way is flagged `late`, and its `host.age_ns` counts until its arrival: see `Transit`.
 
     Args:
@@ -260,7 +281,11 @@ def listen(
         on_estimate: called on Zenoh's thread.
         on_status: called on Zenoh's thread.
     """
-    transit = Transit()
+    transit, rules = Transit(), defaultdict[str, Newest](Newest)
+
+    def take(estimate: TwistEstimate, at_ns: int) -> None:
+        if rules[estimate.stream].takes(estimate.term, estimate.start_us, at_ns):
+            on_estimate(transit.arrived(estimate, at_ns))
 
     def decoded(kind: type[ReplyT], use: Callable[[ReplyT, int], None]) -> Callable[[str, bytes, int], None]:
         def on_sample(key: str, payload: bytes, received_ns: int) -> None:
@@ -271,7 +296,5 @@ def listen(
 
         return on_sample
 
-    transport.subscribe(
-        config.keys.velocity(), decoded(TwistEstimate, lambda one, at_ns: on_estimate(transit.arrived(one, at_ns)))
-    )
+    transport.subscribe(config.keys.velocity(), decoded(TwistEstimate, take))
     transport.subscribe(config.keys.status(), decoded(StreamStatus, lambda one, _: on_status(one)))

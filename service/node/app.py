@@ -21,6 +21,7 @@ from neurove_service.models.slot import ModelSlot
 from neurove_service.models.store import ModelStore
 from neurove_service.node import memory
 from neurove_service.node.condition import Watch
+from neurove_service.node.fellows import Fellows
 from neurove_service.node.folders import check_folders
 from neurove_service.node.handlers import Handlers
 from neurove_service.node.housekeeping import Housekeeping
@@ -29,6 +30,7 @@ from neurove_service.node.outlets import open_outlet, route
 from neurove_service.node.snapshot import Snapshot
 from neurove_service.node.watchdog import Watchdog
 from neurove_service.streams.comparison import TrialLimits
+from neurove_service.streams.duty import alone
 from neurove_service.streams.history import RingSize
 from neurove_service.streams.registry import StreamRegistry, StreamSettings
 from neurove_service.transport import EndpointError, Report, Transport, open_transport
@@ -39,6 +41,7 @@ if TYPE_CHECKING:
 log = logs.get(__name__)
 
 _CHUNK_S = 10.0
+_LEAVE_S = 0.1  # for each reply of the node that takes over a stream
 _ROUTER_PATIENCE_S = 365 * 86_400.0
 
 
@@ -75,6 +78,25 @@ def _monitor(config: ServiceConfig, guard: Guard) -> "Monitor | None":
     return Monitor(config.node, config.metrics, guard)
 
 
+def _fellows(config: ServiceConfig, transport: Transport) -> Fellows | None:
+    """The other nodes that answer the same streams, if the settings ask for a standby."""
+    if config.standby == "off":
+        return None
+    return Fellows(transport, config.keys, config.node, reluctant=config.standby == "last")
+
+
+def _housekeeping(
+    config: ServiceConfig, transport: Transport, registry: StreamRegistry, watch: Watch, guard: Guard
+) -> Housekeeping:
+    return Housekeeping(
+        registry,
+        watch.statuses,
+        lambda stream: transport.publisher(config.keys.status(stream), STATUS_SCHEMA),
+        config.status_period_s,
+        guard,
+    )
+
+
 class Service:
     """A node: serves every stream whose packets it receives.
 
@@ -93,8 +115,7 @@ class Service:
         check_folders(config)
         TABLES.max_bytes = config.tables_mib << 20
         self._guard = Guard()
-        self._monitor = _monitor(config, self._guard)
-        self._keys = config.keys
+        self._monitor, self._keys = _monitor(config, self._guard), config.keys
         self._active_file = ActiveFile(config.state_folder)
         self._store = ModelStore(
             config.state_folder, config.models_dir, config.store_mib << 20, verifier(config.trusted_keys)
@@ -138,21 +159,24 @@ class Service:
                 return
             raise
         with opened as transport:
-            settings = _stream_settings(self._config)
+            fellows = _fellows(self._config, transport)
             registry = StreamRegistry(
                 self._slot,
-                settings,
+                _stream_settings(self._config),
                 lambda name: open_outlet(transport, self._keys, self._config.node, name),
                 self._guard,
+                fellows.open_duty if fellows else alone,
             )
             namesakes = Namesakes(transport, self._keys, self._config.node)
             namesakes.join(self._stop, allowed=self._config.allow_same_name)
             watch = Watch(
                 self._config.node, registry, self._guard, self._config.expect_streams, lambda: namesakes.count
             )
+            if fellows:
+                fellows.join()
             handlers = self._declare(transport, registry, watch)
             self._log_ready()
-            housekeeping = self._housekeeping(transport, registry, watch)
+            housekeeping = _housekeeping(self._config, transport, registry, watch, self._guard)
             if self._monitor is not None:
                 self._monitor.attach(handlers.report, registry.stuck, lambda: housekeeping.beat_s)
             Watchdog(lambda: housekeeping.beat_s, self._guard).start(self._stop)
@@ -160,6 +184,8 @@ class Service:
                 housekeeping.run(self._stop)
             finally:
                 notify("STOPPING=1")
+                if fellows:
+                    fellows.drain(patience_s=_LEAVE_S)
                 self._slot.close()
                 registry.close()
         log.info("stopped", node=self._config.node)
@@ -188,6 +214,7 @@ class Service:
             self._store,
             self._active_file,
             lambda: not self._stop.is_set() and registry.alive(),
+            self._config.labels,
         )
         transport.subscribe_timed(keys.camera(), route(keys, registry, registry.put_camera))
         transport.subscribe_timed(keys.imu(), route(keys, registry, registry.put_imu))
@@ -214,15 +241,6 @@ class Service:
             return answers[0].payload if answers else None
 
         return lambda request, report: handlers.push(request, report, pull, self._stop)
-
-    def _housekeeping(self, transport: Transport, registry: StreamRegistry, watch: Watch) -> Housekeeping:
-        return Housekeeping(
-            registry,
-            watch.statuses,
-            lambda stream: transport.publisher(self._keys.status(stream), STATUS_SCHEMA),
-            self._config.status_period_s,
-            self._guard,
-        )
 
     def _log_ready(self) -> None:
         config, model = self._config, self._slot.active.estimator.bundle

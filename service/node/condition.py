@@ -24,6 +24,7 @@ class Condition(NamedTuple):
 
     missing_streams: tuple[str, ...] = ()  # expected, and without packets now
     namesakes: int = 0  # other nodes of this name on the network
+    other_models: Mapping[str, str] = MappingProxyType({})  # stream -> model of the node that answers it, or did before
 
     def reasons(self) -> list[str]:
         """Why the node is not ok, each as the part of a sentence."""
@@ -34,6 +35,10 @@ class Condition(NamedTuple):
         reasons += [f"expected stream {name} is missing" for name in self.missing_streams]
         if self.namesakes:
             reasons.append(f"{self.namesakes} other nodes of this name on the network: every estimate comes twice")
+        reasons += [
+            f"the standby of stream {stream} is not warm: the other node has the model {model}, this one another"
+            for stream, model in self.other_models.items()
+        ]
         if self.refused_streams:
             reasons.append(f"{self.refused_streams} streams refused: max_streams reached")
         return reasons
@@ -66,7 +71,7 @@ class Watch:
         statuses = []
         for stream in self._registry.streams():
             with self._guard.at("stream status", stream=stream.name):
-                statuses.append(stream_status(self._node, stream))
+                statuses.append(stream_status(self._node, stream, standby=self._registry.standby_of(stream.name)))
         return statuses
 
     def condition(self) -> Condition:
@@ -83,4 +88,9 @@ class Watch:
             stuck_streams=tuple(self._registry.stuck()),
             missing_streams=tuple(name for name in self._expected if name not in present),
             namesakes=self._namesakes(),
+            other_models={
+                stream.name: standby.other_model
+                for stream in self._registry.streams()
+                if (standby := self._registry.standby_of(stream.name)) is not None and standby.other_model
+            },
         )

@@ -7,7 +7,8 @@ import contextlib
 import importlib.metadata
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from types import MappingProxyType
 
 from neurove_core.models import manifest
 from neurove_core.models.bundle import Bundle
@@ -52,6 +53,7 @@ class Handlers:
         store: the models that were pushed to it.
         active_file: what it saves for a restart.
         ready: whether the next packet gets its estimate: the model is warm, and no worker is stuck.
+        labels: of the node, for its health.
     """
 
     def __init__(
@@ -63,11 +65,12 @@ class Handlers:
         store: ModelStore | None = None,
         active_file: ActiveFile | None = None,
         ready: Callable[[], bool] = lambda: True,
+        labels: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         self._node, self._slot = node, slot
         self._streams, self._condition, self._ready = streams, condition, ready
         self._store, self._active_file = store or ModelStore(None), active_file or ActiveFile(None)
-        self._began = time.monotonic()
+        self._began, self._labels = time.monotonic(), dict(labels)
 
     def health(self, request: bytes) -> bytes:
         """Health of this node and its streams."""
@@ -97,6 +100,7 @@ class Handlers:
             ready=self._ready(),
             change=self._slot.last_change,
             rollbacks=self._slot.rollbacks,
+            labels=self._labels,
         )
 
     def models(self, request: bytes) -> bytes:

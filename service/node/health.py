@@ -3,12 +3,14 @@
 import time
 from collections.abc import Sequence
 
-from neurove_protocol.control import StreamStatus
+from neurove_protocol.control import StandbyStatus, StreamStatus
 from neurove_service.latency import latency
 from neurove_service.streams.stream import Stream
 
 
-def stream_status(node: str, stream: Stream, now_ns: int | None = None) -> StreamStatus:
+def stream_status(
+    node: str, stream: Stream, now_ns: int | None = None, standby: StandbyStatus | None = None
+) -> StreamStatus:
     """Status of one stream; safe to call from any thread."""
     now_ns = time.monotonic_ns() if now_ns is None else now_ns
     verdict, why = stream.verdicts.at(now_ns)
@@ -40,6 +42,7 @@ def stream_status(node: str, stream: Stream, now_ns: int | None = None) -> Strea
         latency_histogram=stream.activity.latency_histogram(),
         flag_counts={name: count for name, count in stream.activity.flag_counts.items() if count},
         sigma=newest.sigma if newest is not None else None,
+        standby=standby,
     )
 
 

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from neurove_core.carried import Carried
 from neurove_core.estimator import Estimator, StreamState, WindowEstimate
 from neurove_core.ingest.windows import Window
 from neurove_core.networks.neurove import NetworkState
@@ -66,6 +67,7 @@ class Lane:
         self.serving, self.state = serving, state
         self._complete_from_us = complete_from_us
         self._answers_from_us: int | None = None
+        self._adopted: tuple[int, Carried] | None = None
 
     @property
     def estimator(self) -> Estimator:
@@ -97,6 +99,17 @@ class Lane:
         """Whether this lane answers a window that begins here."""
         return self._answers_from_us is None or start_us >= self._answers_from_us
 
+    def adopt(self, start_us: int, state: Carried) -> None:
+        """Go on with the state of another node from the window that begins here; dropped if there is no such window."""
+        self._adopted = start_us, state
+
+    def _adopt_at(self, start_us: int) -> None:
+        if self._adopted is not None and start_us >= self._adopted[0]:
+            if start_us == self._adopted[0]:
+                self.state = self._adopted[1].into(self.state)
+                self._complete_from_us = None
+            self._adopted = None
+
     def follow(self, windows: list[Window], *, checked: bool = False) -> list[TimedEstimate]:
         """Answer windows in order; if an error is raised, the state stays as before the call.
 
@@ -107,6 +120,8 @@ class Lane:
         Raises:
             NotFinite: a value is not finite.
         """
+        if windows:
+            self._adopt_at(windows[0].start_us)
         state, answers = self.state, []
         for window in windows:
             if not self.has_all_events(window):

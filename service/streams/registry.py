@@ -6,9 +6,11 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
+from neurove_protocol.control import StandbyStatus
 from neurove_protocol.events import PacketLimits
 from neurove_service import logs
 from neurove_service.guard import Guard
+from neurove_service.streams.duty import OpenDuty, alone
 from neurove_service.streams.history import RingSize
 from neurove_service.streams.model_source import ModelSource
 from neurove_service.streams.stream import Stream
@@ -47,6 +49,7 @@ class StreamRegistry:
         settings: bounds of every stream.
         open_outlet: opens the outlet of a stream, by its name; called on the thread of the worker.
         guard: counts internal errors.
+        open_duty: opens the duty of a stream.
     """
 
     def __init__(
@@ -55,8 +58,9 @@ class StreamRegistry:
         settings: StreamSettings,
         open_outlet: Callable[[str], Outlet],
         guard: Guard | None = None,
+        open_duty: OpenDuty = alone,
     ) -> None:
-        self._models, self._settings, self._open_outlet = models, settings, open_outlet
+        self._models, self._settings, self._open_outlet, self._open_duty = models, settings, open_outlet, open_duty
         self._guard = guard or Guard()
         self._workers: dict[str, StreamWorker] = {}
         self._slots = Slots(len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
@@ -99,6 +103,12 @@ class StreamRegistry:
         """The streams that are served now."""
         with self._lock:
             return [worker.stream for worker in self._workers.values()]
+
+    def standby_of(self, name: str) -> StandbyStatus | None:
+        """The part of this node in a stream that several nodes can answer."""
+        with self._lock:
+            worker = self._workers.get(name)
+        return worker.duty.status() if worker is not None else None
 
     def evict_idle(self) -> list[str]:
         """End the workers of idle streams; return their names."""
@@ -157,6 +167,7 @@ class StreamRegistry:
             settings.limits,
             self._slots,
             self._guard,
+            lambda wake: self._open_duty(name, wake),
         )
         self._workers[name] = worker
         return worker

@@ -16,6 +16,7 @@ from neurove_protocol.velocity import TwistEstimate
 from neurove_service import logs
 from neurove_service.guard import Guard
 from neurove_service.streams.cameras import Cameras
+from neurove_service.streams.duty import Alone, Duty
 from neurove_service.streams.intake import Arrival
 from neurove_service.streams.overload import Overload, newest_whole_window
 from neurove_service.streams.runs import MAX_RUN, SMALL_BYTES
@@ -71,6 +72,7 @@ class Inbox:
         self._imu: deque[Sample] = deque()
         self._imu_bytes = self._imu_dropped = 0
         self._bytes = self._dropped = 0
+        self._woken = False
         self._changed = threading.Condition()
 
     def put_camera(self, sample: Sample) -> bool:
@@ -115,15 +117,17 @@ class Inbox:
             return samples, dropped
 
     def wake(self) -> None:
-        """Let a waiting `take` return."""
+        """Let a waiting `take_all`, or else the next one, return at once."""
         with self._changed:
+            self._woken = True
             self._changed.notify_all()
 
     def take_all(self, timeout_s: float) -> tuple[deque[Sample], int]:
         """All samples, oldest first, or none after the timeout; and how many were dropped since the last call."""
         with self._changed:
-            if not self._samples and not self._cameras:
+            if not self._samples and not self._cameras and not self._woken:
                 self._changed.wait(timeout_s)
+            self._woken = False
             dropped, self._dropped = self._dropped, 0
             samples, self._samples = self._samples, deque()
             for before, camera in reversed(self._cameras):
@@ -151,6 +155,7 @@ class StreamWorker:
         limits: limits of packets.
         slots: limit how many workers of the node work at once.
         guard: counts internal errors.
+        open_duty: given what wakes this worker.
     """
 
     def __init__(
@@ -161,19 +166,17 @@ class StreamWorker:
         limits: PacketLimits,
         slots: Slots | None = None,
         guard: Guard | None = None,
+        open_duty: Callable[[Callable[[], None]], Duty] = lambda _: Alone(),
     ) -> None:
-        self.stream = stream
-        self.beat_ns = time.monotonic_ns()
-        self._inbox = inbox
+        self.stream, self.duty = stream, open_duty(inbox.wake)
+        self._inbox, self.beat_ns = inbox, time.monotonic_ns()
         self._open_outlet, self._limits = open_outlet, limits
-        self._slots = slots or Slots()
-        self._guard = guard or Guard()
+        self._slots, self._guard = slots or Slots(), guard or Guard()
         self._pause_until = 0.0  # a time, not a duration: packets that arrive in a pause must not extend it
         self._pending: deque[Sample] = deque()  # taken out of the queue, not yet processed
         self._cameras = Cameras(stream, inbox.wake, self._guard)
         self._taken_ns = 0  # when the queue was last emptied
-        self._overload = Overload(inbox.max_age_s)
-        self._stopping = threading.Event()
+        self._overload, self._stopping = Overload(inbox.max_age_s), threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"stream {stream.name}", daemon=True)
         self._thread.start()
 
@@ -218,6 +221,7 @@ class StreamWorker:
             self._stopping.wait(_REST_S)
         with self._guard.at("end of a stream", stream=self.stream.name):
             outlet.close()
+        self.duty.close()
 
     def _opened(self) -> Outlet | None:
         """The outlet; after a failure it is opened again until the worker stops."""
@@ -231,11 +235,12 @@ class StreamWorker:
     def _turn(self, outlet: Outlet) -> None:
         """Process the oldest samples, or else a step of the standby model."""
         self._cameras.turn()
+        _put(self.duty.turn(self.stream), outlet)
         if not self._pending:
             if time.monotonic_ns() - self._taken_ns < _SOON_NS:
                 self._stopping.wait(_GATHER_S)
             pause_s = max(0.0, self._pause_until - time.monotonic())
-            self._take(pause_s if self.stream.lanes.has_backlog else _IDLE_BEAT_S)
+            self._take(self.duty.wait_s(pause_s if self.stream.lanes.has_backlog else _IDLE_BEAT_S))
         if self._pending:
             with self._slots.serving:
                 self._work_next(outlet)
@@ -337,7 +342,16 @@ class StreamWorker:
             log.warning("packet refused", stream=self.stream.name, why=error.message, total=total)
 
     def _publish(self, estimate: TwistEstimate, outlet: Outlet) -> None:
-        trace = estimate.trace.model_copy(update={"published_ns": time.monotonic_ns()})
-        stamped = estimate.model_copy(update={"trace": trace})
-        outlet.publish(stamped.encode())
-        self.stream.activity.published(stamped)
+        done = _published_now(estimate)
+        _put(self.duty.answer(done), outlet)
+        self.stream.activity.published(done)
+
+
+def _put(estimates: list[TwistEstimate], outlet: Outlet) -> None:
+    for one in estimates:
+        outlet.publish(_published_now(one).encode())
+
+
+def _published_now(estimate: TwistEstimate) -> TwistEstimate:
+    trace = estimate.trace.model_copy(update={"published_ns": time.monotonic_ns()})
+    return estimate.model_copy(update={"trace": trace})

@@ -29,6 +29,15 @@ from neurove_protocol.control import (
     RollbackRequest,
     StreamStatus,
 )
+from neurove_protocol.duty import (
+    DrainReply,
+    DrainRequest,
+    DutyReply,
+    DutyRequest,
+    StateReply,
+    StateRequest,
+    TakeRequest,
+)
 from neurove_protocol.events import decode_packet, encode_packet
 from neurove_protocol.imu import MAX_ACCEL_M_S2, MAX_GYRO_RAD_S, Imu, ImuPacket, decode_imu, encode_imu
 
@@ -112,6 +121,15 @@ STATUS: Fields = {
     "latency_histogram": {"counts": [0, 1, 70, 7, 1, 0, 0, 0, 0, 0, 0], "sum_ms": 280.5},
     "flag_counts": {"gap": 2, "settling": 20},
     "sigma": [0.25, 0.25, 0.5, 0.125, 0.0625, 0.125],
+    "standby": {
+        "role": "follows",
+        "leader": "rover-2",
+        "term": 7,
+        "equal": True,
+        "other_model": "",
+        "draining": False,
+        "followers": 0,
+    },
 }
 EXAMPLES: dict[str, Fields] = {
     "EventPacket": {
@@ -166,6 +184,7 @@ EXAMPLES: dict[str, Fields] = {
         "node": "rover-1",
         "host": {"end_ns": 1_700_000_000_000_000_000, "uncertainty_ns": 200_000, "age_ns": 4_000_000},
         "source": "refined",
+        "term": 7,
     },
     "StreamStatus": STATUS,
     "HealthRequest": {"v": 1},
@@ -187,6 +206,7 @@ EXAMPLES: dict[str, Fields] = {
         "dropped_log_lines": 3,
         "missing_streams": ["cam1"],
         "namesakes": 1,
+        "labels": {"site": "hall-2"},
     },
     "ModelsRequest": {"v": 1},
     "ModelsReply": {
@@ -214,6 +234,30 @@ EXAMPLES: dict[str, Fields] = {
     },
     "RollbackRequest": {"v": 1, "expect": "5e5e5e5e"},
     "ActivateReply": {"v": 1, "node": "rover-1", "active": MODEL, "previous": MODEL, "epoch": 3, "changed": True},
+    "DutyRequest": {"v": 1, "stream": "cam0"},
+    "DutyReply": {
+        "v": 1,
+        "node": "rover-2",
+        "stream": "cam0",
+        "role": "follows",
+        "term": 7,
+        "leader": "rover-1",
+        "equal": True,
+        "draining": False,
+        "digest": "5e" * 32,
+    },
+    "StateRequest": {"v": 1, "stream": "cam0", "digest": "5e" * 32},
+    "StateReply": {
+        "v": 1,
+        "node": "rover-1",
+        "stream": "cam0",
+        "digest": "5e" * 32,
+        "end_us": 50_000,
+        "data": b"\x97\xc0",
+    },
+    "TakeRequest": {"v": 1, "stream": "cam0", "node": "rover-1", "term": 7, "start_us": -50_000},
+    "DrainRequest": {"v": 1, "resume": True},
+    "DrainReply": {"v": 1, "node": "rover-1", "handed": {"cam0": "rover-2"}, "kept": {"cam1": "no other node"}},
     "ErrorReply": {
         "v": 1,
         "code": "unknown_model",
@@ -265,6 +309,13 @@ MODELS: tuple[type[Message], ...] = (
     ActivateRequest,
     ActivateReply,
     RollbackRequest,
+    DutyRequest,
+    DutyReply,
+    StateRequest,
+    StateReply,
+    TakeRequest,
+    DrainRequest,
+    DrainReply,
     ErrorReply,
 )
 EVENT_PACKET = Kind("EventPacket", decode_packet, encode_packet, strict=False, optional=frozenset())
@@ -344,6 +395,18 @@ inertial_units = st.fixed_dictionaries(
         "problem": sentences,
     }
 )
+roles = st.sampled_from(["answers", "follows", "listens", "absent"])
+standbys = st.fixed_dictionaries(
+    {
+        "role": roles,
+        "leader": st.none() | names,
+        "term": counts,
+        "equal": st.booleans(),
+        "other_model": sentences,
+        "draining": st.booleans(),
+        "followers": counts,
+    }
+)
 statuses = st.fixed_dictionaries(
     {
         "node": names,
@@ -362,6 +425,7 @@ statuses = st.fixed_dictionaries(
         ),
         "flag_counts": st.dictionaries(sentences, counts, max_size=3),
         "sigma": st.none() | st.lists(floats, min_size=6, max_size=6),
+        "standby": st.none() | standbys,
         **{name: counts for name, value in STATUS.items() if type(value) is int and name != "v"},
     }
 )
@@ -416,6 +480,7 @@ def estimates(draw: st.DrawFn) -> Fields:
         "node": draw(st.none() | names),
         "host": draw(st.none() | st.fixed_dictionaries({"end_ns": int64s, "uncertainty_ns": counts, "age_ns": counts})),
         "source": draw(st.sampled_from(["network", "refined", "gyro"])),
+        "term": draw(st.none() | counts),
     }
 
 
@@ -442,6 +507,7 @@ ANY: dict[str, st.SearchStrategy[Fields]] = {
             "dropped_log_lines": counts,
             "missing_streams": st.lists(names, max_size=2),
             "namesakes": counts,
+            "labels": st.dictionaries(names, names, max_size=3),
         }
     ),
     "ModelsRequest": st.just({}),
@@ -480,6 +546,34 @@ ANY: dict[str, st.SearchStrategy[Fields]] = {
     "RollbackRequest": st.fixed_dictionaries({"expect": st.none() | prefixes}),
     "ActivateReply": st.fixed_dictionaries(
         {"node": names, "active": models, "previous": models, "epoch": counts, "changed": st.booleans()}
+    ),
+    "DutyRequest": st.fixed_dictionaries({"stream": names}),
+    "DutyReply": st.fixed_dictionaries(
+        {
+            "node": names,
+            "stream": names,
+            "role": roles,
+            "term": counts,
+            "leader": st.none() | names,
+            "equal": st.booleans(),
+            "draining": st.booleans(),
+            "digest": sentences,
+        }
+    ),
+    "StateRequest": st.fixed_dictionaries({"stream": names, "digest": digests}),
+    "StateReply": st.fixed_dictionaries(
+        {"node": names, "stream": names, "digest": digests, "end_us": int64s, "data": st.binary(max_size=40)}
+    ),
+    "TakeRequest": st.fixed_dictionaries(
+        {"stream": names, "node": names, "term": counts, "start_us": st.none() | int64s}
+    ),
+    "DrainRequest": st.fixed_dictionaries({"resume": st.booleans()}),
+    "DrainReply": st.fixed_dictionaries(
+        {
+            "node": names,
+            "handed": st.dictionaries(sentences, sentences, max_size=2),
+            "kept": st.dictionaries(sentences, sentences, max_size=2),
+        }
     ),
     "ErrorReply": st.fixed_dictionaries(
         {

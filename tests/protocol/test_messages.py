@@ -42,11 +42,14 @@ NULLABLE = {
     ("TwistEstimate", "covariance"),
     ("TwistEstimate", "node"),
     ("TwistEstimate", "host"),
+    ("TwistEstimate", "term"),
+    ("DutyReply", "leader"),
+    ("TakeRequest", "start_us"),
     ("CameraInfo", "height_m"),
     *(
         (kind, name)
         for kind in ("StreamStatus", "HealthReply")
-        for name in ("latency_ms", "imu", "bias_rad_s", "offset_ms", "latency_histogram", "sigma")
+        for name in ("latency_ms", "imu", "bias_rad_s", "offset_ms", "latency_histogram", "sigma", "standby", "leader")
     ),
     ("ModelsReply", "previous"),
     ("PushRequest", "signature"),
@@ -54,7 +57,17 @@ NULLABLE = {
     ("ActivateRequest", "force"),
     ("RollbackRequest", "expect"),
 }
-FREE_MAPS = ("details", "unreadable", "figures", "partial", "internal_errors", "flag_counts")
+FREE_MAPS = (
+    "details",
+    "unreadable",
+    "figures",
+    "partial",
+    "internal_errors",
+    "flag_counts",
+    "labels",
+    "handed",
+    "kept",
+)
 DEFAULTED = {"release", "figures", "signature"}  # of a ModelInfo
 DEFAULTED |= {
     "recovered_packets",
@@ -66,6 +79,10 @@ DEFAULTED |= {
     "latency_histogram",
     "flag_counts",
     "sigma",
+    "standby",
+    "other_model",
+    "draining",
+    "followers",
 }  # of a StreamStatus
 OUT_OF_BOUND: dict[str, dict[str, tuple[Any, ...]]] = {
     "EventPacket": {
@@ -138,6 +155,7 @@ OUT_OF_BOUND: dict[str, dict[str, tuple[Any, ...]]] = {
         "model.parameters": (-1,),
         "streams.0.lost.late_events": (-1,),
         "streams.0.stream": ("a/b",),
+        "labels": ({"a/b": "c"}, {"site": ""}, {f"label{i}": "x" for i in range(17)}),
     },
     "ModelsReply": {"node": ("",), "epoch": (-1,), "available.0.parameters": (-1,), "staged.0.release": (-1,)},
     "PushRequest": {

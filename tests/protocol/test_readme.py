@@ -38,7 +38,16 @@ from neurove_protocol import (
     velocity,
 )
 from neurove_protocol.codec import PROTOCOL_VERSION
-from neurove_protocol.control import LATENCY_BOUNDS_MS, ImuStatus, Latency, LatencyHistogram, Losses, ModelInfo, Verdict
+from neurove_protocol.control import (
+    LATENCY_BOUNDS_MS,
+    ImuStatus,
+    Latency,
+    LatencyHistogram,
+    Losses,
+    ModelInfo,
+    StandbyStatus,
+    Verdict,
+)
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import DEFAULT_LIMITS, FORMATS, PacketLimits, decode_packet, encode_packet
 from neurove_protocol.imu import decode_imu, encode_imu
@@ -162,9 +171,10 @@ def test_the_table_of_a_message_has_its_fields_and_says_which_have_a_default(mod
         ("`latency_ms`", Latency),
         ("`latency_histogram`", LatencyHistogram),
         ("`imu`", ImuStatus),
+        ("`standby`", StandbyStatus),
         ("ModelInfo", ModelInfo),
     ],
-    ids=["trace", "host", "lost", "latency", "histogram", "imu", "model"],
+    ids=["trace", "host", "lost", "latency", "histogram", "imu", "standby", "model"],
 )
 def test_the_table_of_a_part_has_its_fields_and_says_which_have_a_default(heading: str, part: type[BaseModel]) -> None:
     assert_fields(table(f"field of {heading}"), part)
@@ -182,7 +192,7 @@ def test_the_table_of_keys_has_all_keys_and_no_other() -> None:
     told = {re.sub(r"<(\w+)>", lambda part: names[part[1]], key) for key in column(table("key"))}
     built = set()
     for name, _ in inspect.getmembers(Keys, inspect.isfunction):  # of the class: Python 3.11.2 fails on a Keys()
-        if not name.startswith("_") and name not in ("stream_of", "node_of"):
+        if not name.startswith("_") and name not in ("stream_of", "node_of", "served_of"):
             build = getattr(Keys(), name)
             built.add(build(**{part: names[part] for part in inspect.signature(build).parameters}))
     assert told == built

@@ -91,6 +91,32 @@ def test_a_wrong_address_of_metrics_is_explained(given):
         load(ServiceConfig, {"metrics": given})
 
 
+def test_labels_are_a_table_of_the_file_or_the_text_of_a_flag(tmp_path):
+    file = tmp_path / "neurove.toml"
+    file.write_text('labels = {site = "hall-2", robot = "spot"}\n')
+    assert load(ServiceConfig, {}, file)[0].labels == {"site": "hall-2", "robot": "spot"}
+    assert load(ServiceConfig, {"labels": "site=hall-3, robot=spot"}, file)[0].labels["site"] == "hall-3"
+    assert load(ServiceConfig, {})[0].labels == {}
+
+
+@pytest.mark.parametrize(
+    ("labels", "words"),
+    [
+        ("site", "'site' has no value"),
+        ("a=1,a=2", "a name occurs twice"),
+        ("model=x", "label 'model': this name is reserved"),
+        ("site=hall 2", "its value 'hall 2' is not valid: 1 to 64 characters"),
+        ("a/b=c", "its name 'a/b' is not valid"),
+        (",".join(f"l{i}=x" for i in range(17)), "17 labels, at most 16"),
+        ({"site": 3}, "valid string"),
+    ],
+)
+def test_a_wrong_label_is_explained(labels, words):
+    with pytest.raises(ConfigError, match="labels.*from flag") as raised:
+        load(ServiceConfig, {"labels": labels})
+    assert words in raised.value.message
+
+
 @pytest.mark.parametrize("field", ["models_dir", "state_dir", "zenoh_config", "trusted_keys"])
 def test_an_empty_path_is_refused_not_the_current_folder(field, tmp_path):
     with pytest.raises(ConfigError, match=f"{field}='' .from flag.: .*must not be empty"):

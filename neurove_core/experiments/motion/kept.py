@@ -15,6 +15,7 @@ from neurove_core.files import atomic_path
 from neurove_core.geometry.motion import Twists
 from neurove_core.io.recording import CHUNK_EVENTS, EventsOnly
 from neurove_core.sim.simulate import Simulation
+from neurove_core.tasks import HERE, Pool
 from neurove_protocol import CameraInfo, Events, Sensor
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.imu import Imu
@@ -71,6 +72,23 @@ class KeptRecording(EventsOnly):
             yield Events.from_columns(t, pixel % self.sensor.width, pixel // self.sensor.width, p)
 
 
+def fill(items: list[Item], folder: Path, pool: Pool = HERE) -> Iterator[str]:
+    """Simulate the items whose events are not in the folder, and yield the name of each one when it is done.
+
+    Args:
+        items: what is wanted.
+        folder: holds the events.
+        pool: where the simulations run.
+
+    Raises:
+        InvalidField: a file cannot be written.
+    """
+    missing = {f"{one.group}: {one.name}": one for one in items if not _file(one.simulation, folder).exists()}
+    for name, rows in pool.run(_rows_of, {name: one.simulation for name, one in missing.items()}):
+        _write(rows, _file(missing[name].simulation, folder))
+        yield name
+
+
 def kept(item: Item, folder: Path) -> KeptRecording:
     """The recording of an item; it is simulated and written into the folder if it is not there.
 
@@ -80,20 +98,33 @@ def kept(item: Item, folder: Path) -> KeptRecording:
     Raises:
         InvalidField: the file cannot be written.
     """
-    file = folder / f"{_key(item.simulation)}.npy"
+    file = _file(item.simulation, folder)
     if not file.exists():
-        width = item.simulation.sensor.width
-        parts = [np.zeros((0, 2), np.uint32)]
-        for events in item.simulation.chunks():
-            place = (events.y.astype(np.uint32) * width + events.x) * 2 + events.p
-            parts.append(np.stack([events.t.astype(np.uint32), place], axis=1))
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            with atomic_path(file) as part, part.open("wb") as stream:
-                np.save(stream, np.concatenate(parts))
-        except OSError as error:
-            raise InvalidField("reproduce", "data", str(folder), error.strerror or str(error)) from None
+        _write(_rows_of(item.simulation), file)
     return KeptRecording(item.simulation, file)
+
+
+def _rows_of(simulation: Simulation) -> NDArray[np.uint32]:
+    """The events (N, 2) as the file has them."""
+    width = simulation.sensor.width
+    parts = [np.zeros((0, 2), np.uint32)]
+    for events in simulation.chunks():
+        place = (events.y.astype(np.uint32) * width + events.x) * 2 + events.p
+        parts.append(np.stack([events.t.astype(np.uint32), place], axis=1))
+    return np.concatenate(parts)
+
+
+def _write(rows: NDArray[np.uint32], file: Path) -> None:
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_path(file) as part, part.open("wb") as stream:
+            np.save(stream, rows)
+    except OSError as error:
+        raise InvalidField("reproduce", "data", str(file.parent), error.strerror or str(error)) from None
+
+
+def _file(simulation: Simulation, folder: Path) -> Path:
+    return folder / f"{_key(simulation)}.npy"
 
 
 def _key(simulation: Simulation) -> str:

@@ -14,7 +14,8 @@ from neurove_core.evaluation.metrics import figures, relative_error
 from neurove_core.experiments import real, save_text
 from neurove_core.experiments.motion import goals, sets
 from neurove_core.experiments.motion.goals import Goal, row
-from neurove_core.experiments.motion.kept import kept
+from neurove_core.experiments.motion.kept import fill, kept
+from neurove_core.tasks import HERE, Pool
 from neurove_protocol.velocity import AXES
 
 Show = Callable[[str, int, int, str], None]
@@ -28,7 +29,14 @@ Found = dict[str, list[tuple[str, Evaluation]]]
 
 
 def run(
-    estimator: Estimator, groups: Sequence[str], recordings: Path | None, data: Path, show: Show, *, quick: bool = False
+    estimator: Estimator,
+    groups: Sequence[str],
+    recordings: Path | None,
+    data: Path,
+    show: Show,
+    *,
+    quick: bool = False,
+    pool: Pool = HERE,
 ) -> dict[str, Any]:
     """Evaluate a model.
 
@@ -39,6 +47,7 @@ def run(
         data: folder for the simulated events.
         show: receives the progress.
         quick: see `sets.items`.
+        pool: where the simulations run; the model runs in this process.
 
     Returns:
         `rows` as of `goals.row`; `coverage` and `uncertain_share` by set, None for a model without uncertainty; and
@@ -48,6 +57,9 @@ def run(
         InvalidField: a set is unknown, or the folder cannot be written.
     """
     items = sets.items(groups, recordings, quick=quick)
+    if pool is not HERE:
+        for done, name in enumerate(fill(items, data, pool), 1):
+            show("simulated ahead", done, len(items), name)
     found: Found = {}
     for done, item in enumerate(items, 1):
         show("simulated", done, len(items), f"{item.group}: {item.name}")

@@ -18,6 +18,7 @@ from neurove_core.experiments.sine.training import Trained, train
 from neurove_core.extras import MissingExtra
 from neurove_core.figures import blank_figure, save_figure
 from neurove_core.spiking.fused.recurrence import Array
+from neurove_core.tasks import HERE, Pool
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.fields import WrongField
 
@@ -79,15 +80,17 @@ def reproduce(
     changes: Mapping[str, str] | None = None,
     quick: bool = False,
     progress: Progress | None = None,
+    pool: Pool = HERE,
 ) -> Iterator[SineRun]:
-    """Train and evaluate every model from every seed, one after another.
+    """Train and evaluate every model from every seed.
 
     Args:
         models: keys of RECIPES.
         seeds: of weights and batches.
         changes: fields of Recipe to change from RECIPES, as texts, for a trial.
         quick: train for a few updates only, to test that everything runs.
-        progress: is called after each update.
+        progress: is called after each update of a training in this process.
+        pool: where the trainings run.
 
     Yields:
         the runs, all seeds of the first model first.
@@ -101,9 +104,24 @@ def reproduce(
         if model not in RECIPES:
             raise InvalidField("reproduce sine", "models", model, f"known are {', '.join(RECIPES)}")
     recipes = {model: changed(RECIPES[model], changes or {}) for model in models}
-    for model, recipe in recipes.items():
-        for seed in seeds:
-            yield _run(model, seed, recipe.model_copy(update=QUICK) if quick else recipe, progress)
+    made = {model: recipe.model_copy(update=QUICK) if quick else recipe for model, recipe in recipes.items()}
+    wanted = {f"{model} seed {seed}": (model, seed, recipe) for model, recipe in made.items() for seed in seeds}
+    if pool is HERE:
+        for one in wanted.values():
+            yield _run(*one, progress)
+        return
+    done: dict[str, SineRun] = {}
+    order = iter(wanted)
+    awaited = next(order, None)
+    for name, run in pool.run(_run_of, wanted):
+        done[name] = run
+        while awaited in done:
+            yield done[awaited]
+            awaited = next(order, None)
+
+
+def _run_of(job: tuple[str, int, Recipe]) -> SineRun:
+    return _run(*job, None)
 
 
 def changed(recipe: Recipe, changes: Mapping[str, str]) -> Recipe:

@@ -20,7 +20,8 @@ from neurove_core.sim.motion.trajectory import Trajectory, driving, hand_held, p
 from neurove_core.sim.render.camera import named_camera
 from neurove_core.sim.render.pixels import USUAL, PixelConfig
 from neurove_core.sim.simulate import Simulation, simulate
-from neurove_core.training.data import DRIVE_S, FORMAT, Part, log_uniform, save, sequence_of, turning_part
+from neurove_core.tasks import HERE, Pool
+from neurove_core.training.data import DRIVE_S, FORMAT, Part, log_uniform, sequence_of, to_bytes, turning_part
 from neurove_protocol.errors import InvalidField
 from neurove_protocol.events import Events
 
@@ -204,16 +205,29 @@ class HeldOutCache:
         """The file with the estimates of contrast maximisation for a scenario."""
         return self._folder / f"{self._key(scenario)}.turning.json"
 
-    def fill(self, wanted: list[Scenario]) -> Iterator[Scenario]:
-        """Simulate the missing scenarios, and yield each scenario when its files exist."""
+    def fill(self, wanted: list[Scenario], pool: Pool = HERE) -> Iterator[Scenario]:
+        """Simulate the missing scenarios, and yield each scenario when its files exist.
+
+        Args:
+            wanted: scenarios.
+            pool: where the simulations run.
+        """
         self._folder.mkdir(parents=True, exist_ok=True)
-        for scenario in wanted:
-            if not self.path(scenario).exists():
-                save(sequence_of(scenario.simulation, self._config), self.path(scenario))
-            if scenario.group in CONTRAST_GROUPS and not self.contrast_path(scenario).exists():
-                instants = list(_contrast_rates(scenario.simulation))
-                write_atomically(self.contrast_path(scenario), json.dumps(instants).encode())
-            yield scenario
+        named = {f"{number} {scenario.group} {scenario.name}": scenario for number, scenario in enumerate(wanted)}
+        jobs = {}
+        for name, scenario in named.items():
+            sequence = not self.path(scenario).exists()
+            contrast = scenario.group in CONTRAST_GROUPS and not self.contrast_path(scenario).exists()
+            if sequence or contrast:
+                jobs[name] = _Missing(scenario.simulation, self._config, sequence, contrast)
+            else:
+                yield scenario
+        for name, (sequence_file, contrast_file) in pool.run(_simulated, jobs):
+            if sequence_file:
+                write_atomically(self.path(named[name]), sequence_file)
+            if contrast_file:
+                write_atomically(self.contrast_path(named[name]), contrast_file)
+            yield named[name]
 
     def _key(self, scenario: Scenario) -> str:
         simulation = scenario.simulation
@@ -231,6 +245,22 @@ class HeldOutCache:
         position_m, _ = simulation.trajectory.pose(np.linspace(0, simulation.duration_s, _KEY_POINTS))
         kind += position_m.round(6).tolist()  # the name of a trajectory does not define it
         return hashlib.sha256(json.dumps(kind, sort_keys=True).encode()).hexdigest()[:16]
+
+
+class _Missing(NamedTuple):
+    """Which files of a scenario are missing."""
+
+    simulation: Simulation
+    config: ModelConfig
+    sequence: bool
+    contrast: bool
+
+
+def _simulated(missing: _Missing) -> tuple[bytes, bytes]:
+    """The files of the sequence and of the contrast maximisation; empty where it is there."""
+    sequence = to_bytes(sequence_of(missing.simulation, missing.config)) if missing.sequence else b""
+    contrast = json.dumps(list(_contrast_rates(missing.simulation))).encode() if missing.contrast else b""
+    return sequence, contrast
 
 
 def _contrast_rates(simulation: Simulation) -> Iterator[dict[str, Any]]:

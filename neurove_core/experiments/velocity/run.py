@@ -23,6 +23,7 @@ from neurove_core.experiments.velocity.tracks import Track, blind_predictors, fo
 from neurove_core.models import bundle
 from neurove_core.models.bundle import Bundle
 from neurove_core.networks.snn_ang import CHANNELS
+from neurove_core.tasks import HERE, Pool
 from neurove_core.training import config as configs
 from neurove_core.training import data
 from neurove_core.training.config import TrainingConfig
@@ -108,7 +109,7 @@ def base_config(source: str | None = None, steps: int | None = None, *, quick: b
     return found.model_copy(update={"recipe": found.recipe.model_copy(update={"steps": steps, "cycles": 1})})
 
 
-def reproduce(experiment: Experiment, folder: Path, out: Path, show: Show, workers: int = 1) -> Iterator[VelocityRun]:
+def reproduce(experiment: Experiment, folder: Path, out: Path, show: Show, pool: Pool = HERE) -> Iterator[VelocityRun]:
     """Simulate the sequences, then train and evaluate each method from each seed; reuse finished sequences and methods.
 
     Args:
@@ -116,7 +117,7 @@ def reproduce(experiment: Experiment, folder: Path, out: Path, show: Show, worke
         folder: holds the simulated sequences.
         out: holds one folder per trained method.
         show: receives the progress.
-        workers: number of processes that simulate the sequences of the configuration.
+        pool: where the simulations run.
 
     Yields:
         the runs, all methods of the first seed first.
@@ -133,11 +134,11 @@ def reproduce(experiment: Experiment, folder: Path, out: Path, show: Show, worke
     ]
     sequences = data.Cache(folder, experiment.config)
     total = experiment.config.data.sequences
-    for done, name in enumerate(sequences.fill(workers), total - len(sequences.missing()) + 1):
+    for done, name in enumerate(sequences.fill(pool), total - len(sequences.missing()) + 1):
         show("simulated", done, total, name)
     drives, scenarios = experiment.drives(), experiment.scenarios()
     cache = HeldOutCache(folder, experiment.config.model)
-    for done, scenario in enumerate(cache.fill([*drives, *scenarios]), 1):
+    for done, scenario in enumerate(cache.fill([*drives, *scenarios], pool), 1):
         show("held out", done, len(drives) + len(scenarios), f"{scenario.group} {scenario.name}")
     more = [cache.path(drive) for drive in drives]
     for method, config in wanted:

@@ -13,9 +13,9 @@ from neurove_core.engine.fallback import forget_warnings
 from neurove_core.engine.int8 import Int8Layer, Int8Projection, int8_convolution, plain_int8_convolution
 from neurove_core.engine.sparse_int8 import (
     Int8DenseConvolution,
+    Int8FirstConvolution,
     Int8ListConvolution,
     SparseInt8Layer,
-    first_convolution,
     sparse_int8_extractor,
 )
 from neurove_core.models import bundle
@@ -97,7 +97,7 @@ def test_a_layer_over_a_spike_list_fires_as_the_plain_one_bit_for_bit(inputs, ou
 @torch.inference_mode()
 def test_the_first_layer_fires_as_the_plain_one_bit_for_bit(inputs, outputs, rows, columns, share, how):
     layer = layer_of(inputs, outputs, rows, columns, top=255)
-    over = Int8DenseConvolution(layer) if how == "dense" else first_convolution(layer)
+    over = Int8DenseConvolution(layer) if how == "dense" else Int8FirstConvolution(layer)
     for steps, batch in ((1, 1), (3, 1), (1, 3), (2, 2)):
         maps = maps_of(steps * batch, inputs, rows, columns, share, top=255, seed=steps)
         v = torch.rand(batch, outputs, (rows + 1) // 2, (columns + 1) // 2) - 0.3
@@ -112,7 +112,7 @@ def test_the_largest_sums_are_exact(inputs, sign):
     """All weights are maximal and all neurons fire: from 29 channels on the sums exceed 16 bits."""
     q = torch.full((16, inputs, 3, 3), sign * 127, dtype=torch.int8)
     v = np.zeros((2, 4, 3, 16), np.float32)
-    for top, over in ((1, Int8ListConvolution), (255, first_convolution)):
+    for top, over in ((1, Int8ListConvolution), (255, Int8FirstConvolution)):
         if 9 * inputs * 127 * top >= 1 << 24:
             continue
         layer = layer_of(inputs, 16, 7, 5, top, q=q)

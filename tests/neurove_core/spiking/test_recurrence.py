@@ -21,6 +21,8 @@ from neurove_core.spiking.ltc import LTCParams, LTCState, ltc_step
 from neurove_core.spiking.readout import readout_step
 from neurove_core.spiking.slstm import SLSTMParams, SLSTMState, slstm_step
 
+pytestmark = pytest.mark.xdist_group("recurrence")  # one process compiles the kernels for all of them
+
 STEPS, BATCH, HIDDEN = 40, 5, 7
 CONSTANTS = Constants(alpha=0.5, width=0.5, damping=0.25)
 GRAD_S = (0.02, -0.03)  # gradient of the loss with respect to each spike of a layer

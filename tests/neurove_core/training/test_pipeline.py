@@ -13,34 +13,14 @@ from neurove_core.training import pipeline
 from neurove_core.training.loop import RUN_JSON
 from neurove_protocol.errors import BadModel, InvalidField
 from neurove_service.cli import main
-
-TOML = """
-name = "tiny"
-[model.canonical]
-width = 22
-height = 16
-[model.network]
-channels = [4, 8]
-features = 16
-hidden = 16
-[data]
-sequences = 2
-seconds = 0.5
-[data.cameras]
-"pinhole:24x18" = 1.0
-[recipe]
-steps = 8
-batch = 2
-segment_windows = 4
-chunk_windows = 2
-"""
+from tests import tiny
 
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """Folder of a run that was called from Python, and all progress that it reported."""
     folder, reported = tmp_path_factory.mktemp("pipeline"), []
-    (folder / "tiny.toml").write_text(TOML)
+    (folder / "tiny.toml").write_text(tiny.toml())
     config = configs.load(str(folder / "tiny.toml"))
     path = pipeline.train(
         config, folder / "out", calibration_sequences=16, on_progress=lambda *step: reported.append(step)
@@ -101,11 +81,11 @@ def test_existing_sequences_are_not_simulated_again(trained):
 
 
 def test_wrong_arguments_are_refused_before_anything_is_simulated(tmp_path):
-    (tmp_path / "tiny.toml").write_text(TOML)
+    (tmp_path / "tiny.toml").write_text(tiny.toml())
     config = configs.load(str(tmp_path / "tiny.toml"))
     start = replace(bundle.untrained(), linear_unit=bundle.PER_HEIGHT)
     with pytest.raises(BadModel, match="the configuration has"):
         pipeline.train(config, tmp_path / "out", start=start)
-    with pytest.raises(InvalidField, match="auto, cpu or cuda"):
-        pipeline.train(config, tmp_path / "out", device="tpu")
+    with pytest.raises(InvalidField, match=r"devices=3: recipe.batch=2 does not split"):
+        pipeline.check(config, tmp_path / "out", devices=3)
     assert not (tmp_path / "out").exists()

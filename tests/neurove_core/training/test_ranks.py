@@ -2,8 +2,12 @@
 
 import copy
 import json
-import multiprocessing
-import shutil
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -15,23 +19,32 @@ from torch import nn
 from neurove_core.models import bundle
 from neurove_core.networks.encoding import to_spikes
 from neurove_core.networks.state import detached
-from neurove_core.training import data
-from neurove_core.training.batches import Segment, draw
+from neurove_core.training import data, pipeline
+from neurove_core.training.batches import draw
 from neurove_core.training.config import TrainingConfig
-from neurove_core.training.loop import CHECKPOINT, RUN_JSON, learning_rate, losses, train, train_segment, train_to_end
+from neurove_core.training.loop import CHECKPOINT, RUN_JSON, learning_rate, losses, train, train_segment
 from neurove_core.training.loss import scaled_sum
-from neurove_core.training.ranks import ALONE, LostRank, SharedNorm, device_of, process_group
+from neurove_core.training.ranks import ALONE, SharedNorm, device_of
 from neurove_core.training.run import TrainingRun
 from neurove_protocol.errors import BadModel, InvalidField
-from tests.neurove_core.training.test_training import TINY
+from tests import tiny
+from tests.live.conftest import wait_until
+from tests.neurove_core.training.rank_worker import one_update
 
-CONFIG, RECIPE = TINY, TINY.recipe
+ROOT = Path(__file__).parents[3]
+TOML = tiny.toml(sequences=3, steps=60, batch=4, warm_up_steps=2, checkpoint_s=0, validation_sequences=0)
+CONFIG = TrainingConfig.model_validate(tomllib.loads(TOML))
+AGAIN = "if no launcher starts it again, continue with --resume"
 
 
-@pytest.fixture(autouse=True)
-def _tests_can_be_imported(monkeypatch):
-    """Started processes import this file, because it contains their function; they get the path of this process."""
-    monkeypatch.syspath_prepend(str(Path(__file__).parents[3]))
+def free_port():
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return one.getsockname()[1]
+
+
+def children_of(pid):
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
 
 
 @pytest.fixture(scope="module")
@@ -52,35 +65,28 @@ def sequences(folder):
     return data.Cache(folder, CONFIG).open()
 
 
-def one_update(config: TrainingConfig) -> TrainingConfig:
-    recipe = config.recipe.model_copy(update={"segment_windows": 4, "chunk_windows": 4})
-    return config.model_copy(update={"recipe": recipe})
+@pytest.fixture(scope="module")
+def two(folder, tmp_path_factory):
+    """Results of two processes that two agents of torchrun started; see rank_worker.py."""
+    out, port = tmp_path_factory.mktemp("two"), free_port()
+    (out / "config.json").write_text(CONFIG.model_dump_json())
+    agents = [torchrun(port, "tests.neurove_core.training.rank_worker", str(folder), str(out)) for _ in range(2)]
+    for agent in agents:
+        _, errors = agent.communicate(timeout=300)
+        assert agent.returncode == 0, errors
+    return out
 
 
-def part(segment: Segment, first: int, stop: int) -> Segment:
-    return Segment(segment.counts[:, first:stop], segment.twists[:, first:stop], segment.height_m[first:stop])
+def torchrun(port, module, *words):
+    """An agent of torchrun with one process, on the loopback."""
+    meeting = ["--rdzv-backend", "c10d", "--rdzv-endpoint", f"127.0.0.1:{port}", "--rdzv-id", f"test-{port}"]
+    places = ["--nnodes", "2", "--nproc-per-node", "1", "--local-addr", "127.0.0.1"]
+    command = [sys.executable, "-m", "torch.distributed.run", *places, *meeting, "-m", module, *words]
+    return subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
 
 
-def train_as_rank(config, paths, out, ranks):
-    """Main function of each rank in the test below: an update on its half of a batch, then a complete run."""
-    sequences = data.Sequences(paths)
-    run = TrainingRun.begin(one_update(config), sequences, ranks)
-    batch = draw(np.random.default_rng(5), sequences, run.config.recipe)
-    train_segment(run, part(batch, 2 * ranks.rank, 2 * ranks.rank + 2))
-    kept = {f"gradient.{name}": tensor.grad for name, tensor in run.network.named_parameters()}
-    kept |= {f"once.{name}": tensor.clone() for name, tensor in run.network.state_dict().items()}
-    run = TrainingRun.begin(config, sequences, ranks)
-    train_to_end(run, sequences, out)
-    kept |= run.network.state_dict() | {"curve": torch.tensor([list(point.values())[:4] for point in run.curve])}
-    kept = {name: tensor.contiguous() for name, tensor in kept.items()}
-    safetensors.torch.save_file(kept, out / f"rank-{ranks.rank}.safetensors")
-
-
-def test_two_processes_take_the_same_step_as_one_and_end_with_the_same_bits(sequences, tmp_path):
-    arguments = (CONFIG, sequences.paths, tmp_path)
-    with process_group(2, "cpu", train_as_rank, arguments) as ranks:
-        train_as_rank(*arguments, ranks)
-    one, other = (safetensors.torch.load_file(tmp_path / f"rank-{rank}.safetensors") for rank in (0, 1))
+def test_two_processes_take_the_same_step_as_one_and_end_with_the_same_bits(sequences, two):
+    one, other = (safetensors.torch.load_file(two / f"rank-{rank}.safetensors") for rank in (0, 1))
     assert one.keys() == other.keys()
     assert all(torch.equal(tensor, other[name]) for name, tensor in one.items())
     alone = TrainingRun.begin(one_update(CONFIG), sequences)
@@ -89,50 +95,62 @@ def test_two_processes_take_the_same_step_as_one_and_end_with_the_same_bits(sequ
         torch.testing.assert_close(one[f"gradient.{name}"], parameter.grad, rtol=1e-3, atol=1e-5)
     for name, buffer in alone.network.named_buffers():
         torch.testing.assert_close(one[f"once.{name}"], buffer)
-    assert {file.name for file in tmp_path.iterdir()} == {
-        CHECKPOINT, RUN_JSON, "rank-0.safetensors", "rank-1.safetensors"
-    }  # fmt: skip
-    assert json.loads((tmp_path / RUN_JSON).read_text())["devices"] == 2
+    assert json.loads((two / "out" / RUN_JSON).read_text())["devices"] == 2
 
 
-def test_a_run_that_lost_a_process_resumes_and_ends_with_the_same_weights(folder, tmp_path):
-    whole, parts = tmp_path / "whole", tmp_path / "parts"
-    at_once = train(CONFIG, whole, folder, devices=2)
+def test_what_ranks_exchange_besides_tensors(two):
+    """The text of rank_worker.py says what each line is."""
+    told = [json.loads((two / f"rank-{rank}.json").read_text()) for rank in (0, 1)]
+    assert told[0]["bytes"] == told[1]["bytes"] == "of rank 1"
+    assert [one["work"] for one in told] == ["done by 0", "done by 1"]
+    assert told[0]["other_failed"] == "process 1 of the run failed: a full disk; " + AGAIN
+    assert told[1]["other_failed"] == "a full disk"
+    assert "process 1 of the run has b" in told[0]["differs"]
+    assert "process 0 of the run has a" in told[1]["differs"]
 
-    def kill(progress):
-        if progress.step == 8:
-            for process in multiprocessing.active_children():
-                process.kill()
 
-    with pytest.raises(LostRank, match="process 1 of the run ended"):
-        train(CONFIG, parts, folder, devices=2, on_progress=kill)
-    shutil.copytree(parts, tmp_path / "alone")
+def test_a_run_that_lost_a_process_starts_again_and_ends_with_the_weights_of_an_uninterrupted_one(
+    folder, two, tmp_path
+):
+    """The launcher of `neurove train --devices 2` starts both again, and they continue from the checkpoint."""
+    (tmp_path / "tiny.toml").write_text(TOML)
+    out = tmp_path / "out"
+    words = ["train", str(tmp_path / "tiny.toml"), "--out", str(out), "--data", str(folder), "--device", "cpu"]
+    command = [sys.executable, "-m", "neurove_service.cli", *words, "--calibration-sequences", "0", "--devices", "2"]
+    with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as run:
+        wait_until(lambda: (out / CHECKPOINT).exists() or run.poll() is not None)
+        (first, *_) = children_of(run.pid)
+        os.kill(first, signal.SIGKILL)
+        _, errors = run.communicate(timeout=300)
+    assert run.returncode == 0, errors
+    assert f"exitcode: {-signal.SIGKILL}" in errors  # of torch
+    one, other = (bundle.load(each / "tiny.safetensors") for each in (two / "out", out))
+    weights = other.network.state_dict()
+    assert all(torch.equal(tensor, weights[name]) for name, tensor in one.network.state_dict().items())
+    assert "2 devices" in other.provenance
     with pytest.raises(BadModel, match="began with devices=2"):
-        train(CONFIG, tmp_path / "alone", folder, resume=True)
-    resumed = train(CONFIG, parts, folder, resume=True, devices=2)
-    assert not multiprocessing.active_children()
-    one, two = (bundle.load(path).network.state_dict() for path in (at_once, resumed))
-    assert all(torch.equal(tensor, two[name]) for name, tensor in one.items())
-    assert "2 devices" in bundle.load(resumed).provenance
+        train(CONFIG, out, folder, resume=True)
 
 
 def test_one_process_follows_the_recipe_bit_for_bit(folder, sequences, tmp_path):
     """The reference is the plain loop, without ranks."""
-    run = TrainingRun.begin(CONFIG, sequences)
+    recipe = CONFIG.recipe.model_copy(update={"steps": 12})
+    config = CONFIG.model_copy(update={"recipe": recipe})
+    run = TrainingRun.begin(config, sequences)
     network, optimiser, rng, balance = run.network, run.optimiser, run.rng, run.balance
-    for step in range(0, RECIPE.steps, RECIPE.chunks):
-        segment, state = draw(rng, sequences, RECIPE), network.initial_state(RECIPE.batch)
-        for chunk in range(RECIPE.chunks):
+    for step in range(0, recipe.steps, recipe.chunks):
+        segment, state = draw(rng, sequences, recipe), network.initial_state(recipe.batch)
+        for chunk in range(recipe.chunks):
             windows = slice(2 * chunk, 2 * chunk + 2)
-            optimiser.param_groups[0]["lr"] = learning_rate(step + chunk, RECIPE)
+            optimiser.param_groups[0]["lr"] = learning_rate(step + chunk, recipe)
             answers, state = network(to_spikes(segment.counts[windows], "log1p"), state)
-            loss, balance = scaled_sum(*losses(run, answers, segment, windows), balance, RECIPE.balance_decay)
+            loss, balance = scaled_sum(*losses(run, answers, segment, windows), balance, recipe.balance_decay)
             optimiser.zero_grad()
             loss.backward()
-            nn.utils.clip_grad_norm_(network.parameters(), RECIPE.clip_norm)
+            nn.utils.clip_grad_norm_(network.parameters(), recipe.clip_norm)
             optimiser.step()
             state = detached(state)
-    made = bundle.load(train(CONFIG, tmp_path, folder)).network.state_dict()
+    made = bundle.load(train(config, tmp_path, folder)).network.state_dict()
     assert all(torch.equal(tensor, made[name]) for name, tensor in network.state_dict().items() if "num_b" not in name)
 
 
@@ -155,9 +173,9 @@ def test_a_shared_norm_computes_what_the_norm_of_torch_does(norm, shape):
 
 
 @pytest.mark.parametrize("devices", [0, 3])
-def test_a_batch_that_does_not_split_is_refused(folder, tmp_path, devices):
+def test_a_batch_that_does_not_split_is_refused(tmp_path, devices):
     with pytest.raises(InvalidField, match=rf"devices={devices}: recipe.batch=4 does not split"):
-        train(CONFIG, tmp_path, folder, devices=devices)
+        pipeline.check(CONFIG, tmp_path, devices=devices)
 
 
 def test_a_device_must_exist():

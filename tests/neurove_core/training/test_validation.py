@@ -17,6 +17,7 @@ from neurove_core.training.config import DataConfig, RecipeConfig
 from neurove_core.training.curve import draw_curve
 from neurove_core.training.data import Sequences, Span
 from neurove_core.training.loop import CHECKPOINT, RUN_JSON, kept_step, train, train_to_end
+from neurove_core.training.ranks import Ranks
 from neurove_core.training.recorded import RecordedSequences
 from neurove_core.training.run import TrainingRun
 from neurove_core.training.validation import Held, is_over, sentences, validate
@@ -199,8 +200,7 @@ def test_a_run_from_one_drive_is_validated_on_its_end_and_on_simulated_scenes(tm
     [
         ({}, {"calibration_sequences": 15}, "calibration_sequences=15: must be at least 16"),
         ({}, {"calibration_sequences": -1}, "calibration_sequences=-1"),
-        ({}, {"workers": 0}, "workers=0: must be at least 1"),
-        ({}, {"devices": 3}, "devices=3: recipe.batch=4 does not split"),
+        ({}, {"ranks": Ranks(count=3)}, "devices=3: recipe.batch=4 does not split"),
         ({"cameras": {"nikon": 1.0}}, {}, "'nikon'"),
         ({"scenes": {"moon": 1.0}}, {}, "scene='moon'"),
         ({"hands": {"thrown": 1.0}}, {}, "data.hands='thrown': known motions: waved, turned, slid, spun"),

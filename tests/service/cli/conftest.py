@@ -3,34 +3,14 @@
 import pytest
 
 from neurove_service.cli import main
-
-CONFIG = """
-name = "tiny"
-[model.canonical]
-width = 22
-height = 16
-[model.network]
-channels = [4, 8]
-features = 16
-hidden = 16
-[data]
-sequences = 2
-seconds = 0.5
-[data.cameras]
-"pinhole:24x18" = 1.0
-[recipe]
-steps = 8
-batch = 2
-segment_windows = 4
-chunk_windows = 2
-"""
+from tests import tiny
 
 
 @pytest.fixture(scope="session")
 def trained(tmp_path_factory):
     """A folder with tiny.toml and the results of its training in out/; no test changes them."""
     folder = tmp_path_factory.mktemp("train")
-    (folder / "tiny.toml").write_text(CONFIG)
+    (folder / "tiny.toml").write_text(tiny.toml())
     arguments = [
         "train",
         str(folder / "tiny.toml"),

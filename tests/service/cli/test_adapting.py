@@ -11,22 +11,8 @@ from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.models import bundle
 from neurove_core.models.bundle import PER_HEIGHT
 from neurove_core.sources import open_source
-from tests import drives
+from tests import drives, tiny
 
-CONFIG = """
-name = "tiny"
-[data]
-sequences = 2
-seconds = 0.5
-[data.cameras]
-"pinhole:24x18" = 1.0
-[recipe]
-steps = 8
-batch = 4
-segment_windows = 4
-chunk_windows = 2
-validation_sequences = 1
-"""
 TINY = ModelConfig(
     canonical=CanonicalConfig(width=22, height=16), network=NetworkConfig(channels=(4, 8), features=16, hidden=16)
 )
@@ -36,7 +22,7 @@ MOUNT = ("--mount", f"0,{drives.PITCH_DEG},0", "--position", ",".join(map(str, d
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("adapt")
-    (folder / "tiny.toml").write_text(CONFIG)
+    (folder / "tiny.toml").write_text(tiny.toml(model="", batch=4, validation_sequences=1))
     scaling = {"offset": torch.tensor([0.0, 0, 8, 0, 0, 0]), "scale": torch.tensor([5.0] * 3 + [0.3] * 3)}
     start = replace(bundle.untrained(3, TINY, "start"), linear_unit=PER_HEIGHT, trained=True, **scaling).with_digest()
     bundle.save(start, folder / "start.safetensors")

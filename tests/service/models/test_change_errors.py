@@ -33,7 +33,7 @@ def node(folder):
 
     def make(**arguments):
         guard = Guard()
-        slot = ModelSlot("one", folder, Rules(probation_s=0.05), guard=guard, **arguments)
+        slot = ModelSlot("one", folder, Rules(probation_s=0.05, prime_s=0.05), guard=guard, **arguments)
         made.append(slot)
         stream = Stream("cam0", slot)
         for packet in make_packets(100):
@@ -70,7 +70,7 @@ def test_a_bug_before_the_switch_refuses_the_change(node):
 class Unreadable:
     """A stream whose figures cannot be read while a model is on probation."""
 
-    name, flowing = "cam1", True
+    name, flowing = "cam1", False  # without packets, so that a change does not wait for it
 
     def __init__(self, slot, stream):
         self._slot, self._stream = slot, stream

@@ -1,0 +1,150 @@
+"""What a stream carries from window to window, as bytes: another process goes on with it, bit for bit.
+
+The bytes are msgpack and name the dtype and the shape of every array. They are read without unpickling: only the
+classes of `_KINDS` are made, and the network state must have the shapes of the reader's own model.
+"""
+
+from typing import Any, Final, NamedTuple
+
+import msgpack
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from neurove_core.estimator import StreamState
+from neurove_core.networks.ann import AnnState
+from neurove_core.networks.neurove import NetworkState
+from neurove_core.networks.snn_ang import SnnAngState
+from neurove_core.networks.state import is_finite
+from neurove_core.refine.ground import GroundEvents, GroundState
+from neurove_core.refine.ground_sway import Sway
+from neurove_core.refine.rotation import Filter
+from neurove_core.spiking.aslstm import ASLSTMState
+from neurove_core.spiking.lif import LIFState
+from neurove_core.timescales import Longer
+from neurove_protocol.errors import InvalidField, NeuroVEError
+
+MAX_BYTES: Final = 32 << 20
+"""Cap of the bytes of one stream's state."""
+
+_KINDS: Final[dict[str, Any]] = {
+    kind.__name__: kind
+    for kind in (
+        AnnState,
+        ASLSTMState,
+        Filter,
+        GroundEvents,
+        GroundState,
+        LIFState,
+        Longer,
+        NetworkState,
+        SnnAngState,
+        Sway,
+    )
+}
+_DTYPES: Final = ("|u1", "|i1", "|b1", "<u2", "<i2", "<u4", "<i4", "<i8", "<u8", "<f4", "<f8")
+_PARTS: Final = ("network", "age", "end_us", "filter", "ground", "recent", "longer")
+_WHAT: Final = "stream state"
+
+
+class Carried(NamedTuple):
+    """The parts of a `StreamState` that a stream carries over the end of a window."""
+
+    network: Any
+    age: int
+    end_us: int
+    filter: Filter | None
+    ground: GroundState
+    recent: tuple[NDArray[np.uint8], ...]
+    longer: Longer
+
+    def into(self, state: StreamState) -> StreamState:
+        """A state with these parts; sensor, lens and the open window are its own."""
+        return state._replace(**self._asdict())
+
+
+def encode(state: StreamState) -> bytes:
+    """The carried parts of a state that has processed a window."""
+    packed: bytes = msgpack.packb([_packed(getattr(state, name)) for name in _PARTS])
+    return packed
+
+
+def decode(data: bytes, own: StreamState) -> Carried:
+    """Read the carried parts of another process.
+
+    Args:
+        data: from `encode`.
+        own: a state of the reader with the same model; the network state must have its shapes.
+
+    Raises:
+        InvalidField: the bytes are no such state, or that of another model.
+    """
+    if len(data) > MAX_BYTES:
+        raise InvalidField(_WHAT, "size", len(data), f"at most {MAX_BYTES} bytes")
+    try:
+        values = [_unpacked(one) for one in msgpack.unpackb(data, max_bin_len=MAX_BYTES, max_ext_len=0)]
+        carried = Carried(*values)
+    except NeuroVEError:
+        raise
+    except (ValueError, TypeError, LookupError, RecursionError, msgpack.UnpackException) as error:
+        raise InvalidField(_WHAT, "data", type(error).__name__, "the state of a stream as msgpack") from None
+    if _shape(carried.network) != _shape(own.network):
+        raise InvalidField(_WHAT, "network", type(carried.network).__name__, "the shapes of this node's model")
+    if not (_is_count(carried.age) and isinstance(carried.end_us, int) and is_finite(carried.network)):
+        raise InvalidField(_WHAT, "network", carried.age, "finite numbers, an age and the end of a window")
+    kinds = (Filter | None, GroundState, tuple, Longer)
+    for name, value, kind in zip(_PARTS[3:], carried[3:], kinds, strict=True):
+        if not isinstance(value, kind):
+            raise InvalidField(_WHAT, name, type(value).__name__, str(kind))
+    return carried
+
+
+def _is_count(value: object) -> bool:
+    return type(value) is int and value >= 0
+
+
+def _packed(value: Any) -> Any:
+    if value is None or isinstance(value, bool | int | float):
+        return value
+    if isinstance(value, torch.Tensor):
+        return ["tensor", *_bytes_of(value.detach().numpy())]
+    if isinstance(value, np.ndarray):
+        return ["array", *_bytes_of(value)]
+    if isinstance(value, np.generic):
+        return ["scalar", *_bytes_of(np.asarray(value))]
+    if hasattr(value, "_fields"):
+        return ["named", type(value).__name__, [_packed(one) for one in value]]
+    assert isinstance(value, tuple), type(value)
+    return ["tuple", [_packed(one) for one in value]]
+
+
+def _bytes_of(array: NDArray[Any]) -> tuple[str, list[int], bytes]:
+    return array.dtype.str, list(array.shape), array.tobytes()
+
+
+def _unpacked(value: Any) -> Any:
+    if not isinstance(value, list):
+        if value is None or isinstance(value, bool | int | float):
+            return value
+        raise ValueError("neither a number nor a list")
+    kind, *rest = value
+    if kind == "tuple":
+        return tuple(_unpacked(one) for one in rest[0])
+    if kind == "named":
+        return _KINDS[rest[0]](*(_unpacked(one) for one in rest[1]))
+    dtype, shape, data = rest
+    if dtype not in _DTYPES:
+        raise ValueError("another dtype")
+    array = np.frombuffer(data, np.dtype(dtype)).reshape(shape).copy()
+    if kind == "tensor":
+        return torch.from_numpy(array)
+    return array[()] if kind == "scalar" else array
+
+
+def _shape(value: Any) -> Any:
+    """The structure of a network state: classes, and the dtype and shape of each tensor."""
+    if isinstance(value, torch.Tensor):
+        return value.dtype, tuple(value.shape)
+    if isinstance(value, tuple):
+        return type(value).__name__, tuple(_shape(one) for one in value)
+    return type(value).__name__

@@ -1,0 +1,190 @@
+"""Fellows: the nodes that answer the same streams as this one; what they say to each other over the network."""
+
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+
+from neurove_protocol import TwistEstimate
+from neurove_protocol.codec import Message
+from neurove_protocol.duty import (
+    DrainReply,
+    DrainRequest,
+    DutyReply,
+    DutyRequest,
+    StateReply,
+    StateRequest,
+    TakeRequest,
+)
+from neurove_protocol.errors import InvalidField, NeuroVEError
+from neurove_protocol.keys import Keys
+from neurove_service import logs
+from neurove_service.streams.duty import Duty
+from neurove_service.streams.pair import Pair
+from neurove_service.streams.tenure import Tenure
+from neurove_service.transport import Transport
+
+log = logs.get(__name__)
+
+_STATE_S = 0.5  # for a state, on both sides
+_TAKE_S = 1.0
+_POLL_S = 0.005
+
+
+class Fellows:
+    """Opens the duty of each stream, hears the other nodes, and answers their questions.
+
+    Args:
+        transport: an open session.
+        keys: of the deployment.
+        node: name of this node.
+        reluctant: whether other nodes take precedence where no node answers yet.
+    """
+
+    def __init__(self, transport: Transport, keys: Keys, node: str, *, reluctant: bool) -> None:
+        self._transport, self._keys, self._node, self._reluctant = transport, keys, node, reluctant
+        self._pairs: dict[str, Pair] = {}
+        self._serving: defaultdict[str, set[str]] = defaultdict(set)  # stream -> the other nodes that serve it
+        self._lock = threading.Lock()
+        self._draining = False
+
+    def join(self) -> None:
+        """Hear the other nodes and answer their questions; before the first packet."""
+        keys, node, transport = self._keys, self._node, self._transport
+        transport.watch_tokens(keys.serves(), self._on_token)
+        transport.subscribe_timed(keys.velocity(), self._on_estimate, remote=True)
+        transport.answer(keys.duty(node), self._reply)
+        transport.answer(keys.state(node), self._state)
+        transport.answer(keys.take(node), self._take)
+        transport.answer_streaming(keys.drain(node), lambda request, _: self._drain(request))
+
+    def open_duty(self, stream: str, wake: Callable[[], None]) -> Duty:
+        """The duty of a stream that begins."""
+        tenure = Tenure(self._node, stream, self, reluctant=self._reluctant)
+        pair = Pair(tenure, self, wake, on_close=lambda closed: self._forget(stream, closed))
+        pair.drain(draining=self._draining)
+        self._pairs[stream] = pair
+        return pair
+
+    def names(self, stream: str) -> Sequence[str]:
+        """The other nodes that serve a stream."""
+        with self._lock:
+            return sorted(self._serving.get(stream, ()))
+
+    def roles(self, stream: str, timeout_s: float) -> list[DutyReply]:
+        """What the other nodes do on a stream, as far as they reply in time."""
+        replies = [DutyReply.decode(one) for one in self._ask(self._keys.duty(), DutyRequest(stream=stream), timeout_s)]
+        return [one for one in replies if one.node != self._node]
+
+    def state(self, stream: str, node: str, digest: str) -> StateReply | None:
+        """The state of a stream on another node."""
+        request = StateRequest(stream=stream, digest=digest)
+        replies = self._ask(self._keys.state(node), request, _STATE_S)
+        return StateReply.decode(replies[0]) if replies else None
+
+    def drain(self, *, resume: bool = False, patience_s: float = _TAKE_S) -> DrainReply:
+        """Hand over every stream that this node answers to a node that follows it; `resume` ends the draining.
+
+        Args:
+            resume: whether the node may answer again.
+            patience_s: how long to wait for each reply of another node [s].
+        """
+        self._draining = not resume
+        pairs = dict(self._pairs)
+        for pair in pairs.values():
+            pair.drain(draining=not resume)
+        handed, kept = dict[str, str](), dict[str, str]()
+        for stream, pair in pairs.items() if not resume else ():
+            if pair.reply().role != "answers":
+                continue
+            node, why = self._hand_over(stream, pair, patience_s)
+            if node:
+                handed[stream] = node
+            else:
+                kept[stream] = why
+        log.info("drained" if not resume else "draining ended", handed=len(handed), kept=len(kept))
+        return DrainReply(node=self._node, handed=handed, kept=kept)
+
+    def _hand_over(self, stream: str, pair: Pair, patience_s: float) -> tuple[str, str]:
+        """Hand over one stream; the node that answers it now, or why there is none."""
+        others = self.roles(stream, patience_s) if self.names(stream) else []
+        ready = sorted(one.node for one in others if one.role == "follows" and one.equal and not one.draining)
+        if not ready:
+            return "", "no other node follows it with equal state"
+        target, resigned = ready[0], pair.resign(patience_s)
+        if resigned is None:
+            return "", "this node did not stop to answer"
+        self._ask(
+            self._keys.take(target),
+            TakeRequest(stream=stream, node=self._node, term=resigned.term, start_us=resigned.start_us),
+            patience_s,
+        )
+        if not pair.flows:
+            return target, ""
+        deadline = time.monotonic() + 5 * patience_s
+        while time.monotonic() < deadline:
+            now = pair.reply()
+            if now.role == "follows" and now.leader:
+                return now.leader, ""
+            if now.role == "answers":
+                break
+            threading.Event().wait(_POLL_S)
+        return "", f"{target} has not published since the hand-over"
+
+    def _forget(self, stream: str, closed: Pair) -> None:
+        if self._pairs.get(stream) is closed:
+            del self._pairs[stream]
+
+    def _ask(self, key: str, request: Message, timeout_s: float) -> list[bytes]:
+        try:
+            return [one.payload for one in self._transport.ask(key, request.encode(), timeout_s)]
+        except NeuroVEError as error:  # a node refused
+            log.debug("no answer", key=key, why=error.message)
+            return []
+
+    def _on_estimate(self, key: str, payload: bytes, _received_ns: int, _sent_us: int | None) -> None:
+        pair = self._pairs.get(self._keys.stream_of(key))
+        if pair is not None:
+            estimate = TwistEstimate.decode(payload)
+            if estimate.node != self._node:
+                pair.heard(estimate)
+
+    def _on_token(self, key: str, present: bool) -> None:  # as transport calls it
+        node, stream = self._keys.node_of(key), self._keys.served_of(key)
+        if node == self._node:
+            return
+        with self._lock:
+            (self._serving[stream].add if present else self._serving[stream].discard)(node)
+        pair = self._pairs.get(stream)
+        if pair is not None and not present:
+            pair.gone(node)
+
+    def _pair(self, what: str, stream: str) -> Pair:
+        pair = self._pairs.get(stream)
+        if pair is None:
+            raise InvalidField(what, "stream", stream, "a stream that this node serves")
+        return pair
+
+    def _reply(self, request: bytes) -> bytes:
+        wanted = DutyRequest.decode(request)
+        pair = self._pairs.get(wanted.stream)
+        absent = DutyReply(node=self._node, stream=wanted.stream, role="absent")
+        return (pair.reply() if pair is not None else absent).encode()
+
+    def _state(self, request: bytes) -> bytes:
+        wanted = StateRequest.decode(request)
+        reply = self._pair(wanted.what, wanted.stream).state(wanted.digest, _STATE_S)
+        if reply is None:
+            raise InvalidField(
+                wanted.what, "digest", wanted.digest, "a model that has answered a window of this stream"
+            )
+        return reply.encode()
+
+    def _take(self, request: bytes) -> bytes:
+        wanted = TakeRequest.decode(request)
+        pair = self._pair(wanted.what, wanted.stream)
+        pair.take(wanted.node, wanted.term, wanted.start_us)
+        return pair.reply().encode()
+
+    def _drain(self, request: bytes) -> bytes:
+        return self.drain(resume=DrainRequest.decode(request).resume).encode()

@@ -1,0 +1,242 @@
+"""Pair: the duty of a node on a stream that several nodes can answer. One answers, the others follow with warm state.
+
+Every node computes every window. The node that answers publishes its estimates with its term; the others hear them and
+keep their own answers to the windows that they have not heard yet. If the token of the answering node disappears, or
+its estimate is `LATE_WINDOWS` late, a follower takes the next term and publishes what it kept, in order.
+
+A node that was suspended may have been superseded without having heard of it. So a node that answers and finds a pause
+of `DOUBT_WINDOWS` in its own work asks the others before it publishes.
+"""
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+from neurove_protocol import TwistEstimate
+from neurove_protocol.control import StandbyStatus
+from neurove_protocol.duty import DutyReply, StateReply
+from neurove_service import logs
+from neurove_service.streams.following import Following, Sync
+from neurove_service.streams.stream import Stream
+from neurove_service.streams.tenure import Peers, Tenure
+
+log = logs.get(__name__)
+
+DOUBT_WINDOWS: Final = 1.25
+"""A node that answers asks the others after a pause of so many windows in its work; less than `LATE_WINDOWS`."""
+
+LONG_PAUSE_NS: Final = 1_000_000_000
+"""After a pause as long, a node that gets no reply listens first: packets were lost, and another node may answer."""
+
+_CONFIRM_WINDOWS: Final = 4  # how long to wait for replies
+
+
+class Resigned(NamedTuple):
+    """How a node stopped to answer."""
+
+    term: int
+    start_us: int | None  # of the last window that it published
+
+
+class Pair:
+    """The duty of one node on one stream.
+
+    The worker calls `answer`, `turn`, `wait_s` and `close`; the other methods are for any thread.
+
+    Args:
+        tenure: the role of this node.
+        peers: the other nodes.
+        wake: lets the worker of the stream turn at once.
+        now_ns: monotonic clock [ns].
+        on_close: called when the worker ends.
+    """
+
+    def __init__(
+        self,
+        tenure: Tenure,
+        peers: Peers,
+        wake: Callable[[], None],
+        now_ns: Callable[[], int] = time.monotonic_ns,
+        on_close: Callable[["Pair"], None] = lambda _: None,
+    ) -> None:
+        self._tenure, self._peers, self._wake, self._now_ns, self._on_close = tenure, peers, wake, now_ns, on_close
+        self._stream = tenure.stream
+        self._following = Following()
+        self._sync = Sync(self._stream)
+        self._calls: deque[Callable[[], None]] = deque()  # from other threads, for the worker
+        self._turned_ns = self._answered_ns = now_ns()
+        self._pause_ns = 0  # longest pause of the worker since the last answer
+        self._window_ns = 50_000_000
+        self._last: TwistEstimate | None = None  # published last
+
+    @property
+    def flows(self) -> bool:
+        """Whether this node has computed a window recently."""
+        return self._now_ns() - self._answered_ns < LONG_PAUSE_NS
+
+    def heard(self, estimate: TwistEstimate) -> None:
+        """Another node has published an estimate of the stream."""
+        self._call(lambda: self._hear(estimate))
+
+    def gone(self, node: str) -> None:
+        """The token of another node has disappeared."""
+        self._call(lambda: self._lose(node))
+
+    def drain(self, *, draining: bool) -> None:
+        """Let other nodes take precedence from now on, or no more."""
+        self._tenure.draining = draining
+        self._call(self._tenure.set_patience)
+
+    def take(self, node: str, term: int, start_us: int | None) -> None:
+        """Take over from a node that hands over; `start_us` is the last window that it answered."""
+        self._call(lambda: self._take(node, term, start_us))
+
+    def resign(self, timeout_s: float) -> Resigned | None:
+        """Stop to answer, after the estimate that is on its way; None if this node does not answer, or is stuck."""
+        done, resigned = threading.Event(), list[Resigned]()
+
+        def stop() -> None:
+            if self._tenure.answers:
+                resigned.append(Resigned(self._tenure.term, self._last.start_us if self._last else None))
+                self._tenure.listen("hands over")
+            done.set()
+
+        self._call(stop)
+        done.wait(timeout_s)
+        return resigned[0] if resigned else None
+
+    def reply(self) -> DutyReply:
+        """What this node does on the stream."""
+        tenure, following = self._tenure, self._following
+        return DutyReply(
+            node=tenure.node,
+            stream=self._stream,
+            role=tenure.role,
+            term=tenure.term,
+            leader=tenure.leader or None,
+            equal=tenure.answers or following.equal,
+            draining=tenure.draining,
+            digest=following.digest,
+        )
+
+    def state(self, digest: str, timeout_s: float) -> StateReply | None:
+        """The state of the stream for a follower; None if this node has no such state, or is stuck."""
+        found = self._sync.ask(digest, timeout_s, self._wake)
+        about = {"node": self._tenure.node, "stream": self._stream, "digest": digest}
+        return None if found is None else StateReply.model_validate(about | found._asdict())
+
+    def status(self) -> StandbyStatus:
+        """For the status of the stream."""
+        tenure, following = self._tenure, self._following
+        return StandbyStatus(
+            role=tenure.role,
+            leader=tenure.leader or None,
+            term=tenure.term,
+            equal=following.equal and not tenure.answers,
+            other_model=following.other_model,
+            draining=tenure.draining,
+            followers=len(self._peers.names(self._stream)) if tenure.answers else 0,
+        )
+
+    def answer(self, estimate: TwistEstimate) -> list[TwistEstimate]:
+        """The estimates to publish now that this one is there."""
+        self._window_ns = (estimate.end_us - estimate.start_us) * 1000
+        pause_ns = self._note_pause()
+        silent_ns, self._answered_ns, self._pause_ns = self._turned_ns - self._answered_ns, self._turned_ns, 0
+        pause_ns = max(pause_ns, silent_ns) if silent_ns > LONG_PAUSE_NS else pause_ns
+        self._run_calls()
+        self._following.digest = estimate.digest
+        if self._tenure.answers and pause_ns > DOUBT_WINDOWS * self._window_ns:
+            self._confirm(pause_ns)
+            self._run_calls()
+        elif not self._tenure.answers and pause_ns > LONG_PAUSE_NS:
+            self._following.drop()
+            self._tenure.set_patience()
+        if self._tenure.answers:
+            return [self._stamped(estimate)]
+        self._following.add(estimate, self._now_ns())
+        return self._due()
+
+    def turn(self, stream: Stream) -> list[TwistEstimate]:
+        """The estimates to publish now; also gives and takes the state of the stream."""
+        self._note_pause()
+        self._run_calls()
+        self._sync.serve(stream)
+        leader = self._tenure.leader
+        if self._tenure.role == "follows" and self._following.wants_state(self._now_ns()):
+            if self._sync.fetch(stream, lambda digest: self._peers.state(self._stream, leader, digest)):
+                log.info("state taken", stream=self._stream, leader=leader)
+            self._turned_ns = self._now_ns()
+        return [] if self._tenure.answers else self._due()
+
+    def wait_s(self, most_s: float) -> float:
+        """Until the oldest estimate that is kept is late."""
+        since_ns = self._following.since_ns
+        if self._tenure.answers or since_ns is None:
+            return most_s
+        return min(most_s, max(0.0, (since_ns + self._tenure.patience_ns(self._window_ns) - self._now_ns()) / 1e9))
+
+    def close(self) -> None:
+        """The worker has ended."""
+        self._on_close(self)
+
+    def _call(self, call: Callable[[], None]) -> None:
+        self._calls.append(call)
+        self._wake()
+
+    def _run_calls(self) -> None:
+        while self._calls:
+            self._calls.popleft()()
+
+    def _note_pause(self) -> int:
+        """The longest pause between two turns of the worker since the last answer [ns]."""
+        now_ns = self._now_ns()
+        self._pause_ns, self._turned_ns = max(self._pause_ns, now_ns - self._turned_ns), now_ns
+        return self._pause_ns
+
+    def _due(self) -> list[TwistEstimate]:
+        """What to publish: nothing, or all that is kept, if this node takes over now."""
+        since_ns, tenure = self._following.since_ns, self._tenure
+        if since_ns is None or self._now_ns() - since_ns < tenure.patience_ns(self._window_ns):
+            return []
+        tenure.take_over("no other node answers" if tenure.role == "listens" else f"{tenure.leader} is late")
+        if self._following.other_model:
+            log.warning("another model than before answers", stream=self._stream, before=self._following.other_model)
+        return [self._stamped(estimate) for estimate in self._following.release()]
+
+    def _stamped(self, estimate: TwistEstimate) -> TwistEstimate:
+        seq = self._following.seq_of(estimate)
+        self._last = estimate.model_copy(update={"seq": seq, "term": self._tenure.term})
+        return self._last
+
+    def _hear(self, estimate: TwistEstimate) -> None:
+        if self._tenure.hear(estimate.node or "", estimate.term or 0, self._now_ns()):
+            self._following.hear(estimate)
+
+    def _lose(self, node: str) -> None:
+        if node == self._tenure.leader:
+            at_once = self.flows and not self._tenure.draining and self._tenure.rank() == 0
+            self._tenure.listen(f"{node} has left", at_once=at_once)
+
+    def _take(self, node: str, term: int, start_us: int | None) -> None:
+        if not self._tenure.answers and term >= self._tenure.term:
+            self._tenure.term = term
+            self._following.leave_out(start_us)
+            self._tenure.listen(f"{node} hands over", at_once=True)
+
+    def _confirm(self, pause_ns: int) -> None:
+        """Ask the others after a pause: another node may have taken over. Without an answer, listen first."""
+        tenure, names = self._tenure, set(self._peers.names(self._stream))
+        if not names and pause_ns < LONG_PAUSE_NS:
+            return
+        replies = self._peers.roles(self._stream, _CONFIRM_WINDOWS * self._window_ns / 1e9)
+        self._turned_ns = self._now_ns()
+        others = [(one.term, one.node) for one in replies if one.role == "answers"]
+        if others and max(others) > (tenure.term, tenure.node):
+            log.warning("superseded in a pause", stream=self._stream, pause_ms=pause_ns // 1_000_000)
+            term, leader = max(others)
+            tenure.follow(leader, term)
+        elif not replies or not names <= {one.node for one in replies}:
+            tenure.listen("no reply from another node after a pause")

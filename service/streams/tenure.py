@@ -1,0 +1,120 @@
+"""Tenure: which node answers a stream, in which term, as far as this node knows; and when this node takes over."""
+
+import hashlib
+import time
+from collections.abc import Callable, Sequence
+from typing import Final, Protocol
+
+from neurove_protocol.duty import QUIET_NS, DutyReply, Role, StateReply
+from neurove_service import logs
+
+log = logs.get(__name__)
+
+LATE_WINDOWS: Final = 1.5
+"""A follower takes over if the estimate of the other node is so many windows later than its own."""
+
+DRAINING: Final = 4.0
+"""A node that is drained waits so many times longer before it takes over again."""
+
+_RELUCTANT: Final = 2  # ranks behind the other nodes
+
+
+class Peers(Protocol):
+    """The other nodes that serve a stream."""
+
+    def names(self, stream: str, /) -> Sequence[str]:
+        """Their names, by their tokens."""
+
+    def roles(self, stream: str, timeout_s: float, /) -> list[DutyReply]:
+        """What they do on the stream, as far as they reply in time."""
+
+    def state(self, stream: str, node: str, digest: str, /) -> StateReply | None:
+        """The state of the stream on the node that answers it."""
+
+
+class Tenure:
+    """The role of one node on one stream; only the worker of the stream changes it.
+
+    A term is the time of taking over in milliseconds since 1970, or one more than the newest term if that is later. So
+    it rises when all nodes restart, too.
+
+    Args:
+        node: name of this node.
+        stream: name of the stream.
+        peers: the other nodes.
+        reluctant: whether other nodes take precedence where no node answers yet.
+    """
+
+    def __init__(self, node: str, stream: str, peers: Peers, *, reluctant: bool = False) -> None:
+        self.node, self.stream, self._peers, self._reluctant = node, stream, peers, reluctant
+        self.role: Role = "listens"
+        self.term, self.leader = 0, ""
+        self.draining = False
+        self._heard_ns = 0
+        self._patience = 1.0
+        self.set_patience()
+
+    @property
+    def answers(self) -> bool:
+        """Whether this node answers the stream."""
+        return self.role == "answers"
+
+    def patience_ns(self, window_ns: int) -> float:
+        """How long the estimates of another node may be missing [ns]."""
+        return self._patience * LATE_WINDOWS * window_ns
+
+    def hear(self, sender: str, term: int, now_ns: int) -> bool:
+        """Another node has published; False if it does not know yet that it was superseded."""
+        known, quiet = (self.term, self.leader), now_ns - self._heard_ns > QUIET_NS
+        if (term, sender) < known and (self.answers or (self.leader and not quiet)):
+            return False
+        if (term, sender) != known or self.role != "follows":
+            self.follow(sender, term)
+        self._heard_ns = now_ns
+        return True
+
+    def follow(self, leader: str, term: int) -> None:
+        """Another node answers."""
+        log.info("follows", stream=self.stream, leader=leader, term=term)
+        self.role, self.leader, self.term = "follows", leader, term
+        self.set_patience()
+
+    def listen(self, why: str, *, at_once: bool = False) -> None:
+        """No node is known to answer.
+
+        Args:
+            why: for the log.
+            at_once: whether to take over with the next own estimate, instead of waiting for another node's.
+        """
+        log.info("listens", stream=self.stream, why=why)
+        self.role, self.leader = "listens", ""
+        self.set_patience()
+        if at_once:
+            self._patience = 0.0
+
+    def take_over(self, why: str, *, unix_ms: Callable[[], int] = lambda: time.time_ns() // 1_000_000) -> None:
+        """This node answers from now on, in a new term."""
+        self.term = max(self.term + 1, unix_ms())
+        self.role, self.leader = "answers", self.node
+        log.warning("answers the stream", stream=self.stream, term=self.term, why=why)
+
+    def rank(self) -> int:
+        """How many other nodes take over first."""
+        names = {*self._peers.names(self.stream), self.node} - {self.leader if self.role == "follows" else ""}
+        return ranked(self.stream, names | {self.node}).index(self.node)
+
+    def set_patience(self) -> None:
+        """Set how long to wait for other nodes, by this node's rank among them."""
+        rank = self.rank() + (_RELUCTANT if self._reluctant and not self.term else 0)
+        self._patience = (1.0 + rank) * (DRAINING if self.draining else 1.0)
+
+
+def ranked(stream: str, nodes: set[str]) -> list[str]:
+    """Nodes in the order in which they answer a stream: rendezvous hashing, the same on every node.
+
+    >>> ranked("cam0", {"n1", "n2", "n3"})
+    ['n3', 'n2', 'n1']
+    >>> [one for one in ranked("cam0", {"n1", "n2", "n3", "n4"}) if one != "n4"]
+    ['n3', 'n2', 'n1']
+    """
+    return sorted(nodes, key=lambda node: hashlib.sha256(f"{stream} {node}".encode()).digest())

@@ -1,0 +1,70 @@
+"""The state of a stream goes to another process as bytes, and the estimates go on bit for bit."""
+
+import msgpack
+import numpy as np
+import pytest
+
+from neurove_core import carried
+from neurove_core.config import ModelConfig
+from neurove_core.estimator import Estimator
+from neurove_core.ingest.windows import Window
+from neurove_core.models import bundle
+from neurove_protocol import Sensor
+from neurove_protocol.errors import NeuroVEError
+from tests.bundles import CONFIG, make_bundle
+
+SENSOR = Sensor(20, 16)
+
+
+def windows(config: ModelConfig, count: int, first: int = 0) -> list[Window]:
+    shape = (config.input_shape[0] if not config.network.history else 2 * config.window.bins, 8, 10)
+    rng = np.random.default_rng(first)
+    duration = config.window.duration_us
+    return [
+        Window((first + i) * duration, rng.poisson(0.5, shape).astype(np.uint8), 100, 0, bridged=False)
+        for i in range(count)
+    ]
+
+
+@pytest.mark.parametrize("kind", ["neurove", "ann"])
+def test_another_process_goes_on_bit_for_bit(kind):
+    estimator = Estimator(bundle.untrained(3, CONFIG.model_copy(update={"kind": kind})))
+    _, state = estimator.follow(windows(CONFIG, 20), estimator.initial_state(SENSOR))
+    other = carried.decode(carried.encode(state), estimator.initial_state(SENSOR)).into(estimator.initial_state(SENSOR))
+    more = windows(CONFIG, 5, first=20)
+    wanted, _ = estimator.follow(more, state)
+    got, _ = estimator.follow(more, other)
+    cold, _ = estimator.follow(more, estimator.initial_state(SENSOR))
+    for one, two in zip(wanted, got, strict=True):
+        assert one.twists.tobytes() == two.twists.tobytes()
+        assert one.settled == two.settled
+        assert one.first == two.first
+    assert wanted[0].twists.tobytes() != cold[0].twists.tobytes()
+
+
+def test_every_truncation_and_the_state_of_another_model_are_refused():
+    estimator = Estimator(make_bundle())
+    _, state = estimator.follow(windows(CONFIG, 3), estimator.initial_state(SENSOR))
+    data = carried.encode(state)
+    for length in range(0, len(data), 7):
+        with pytest.raises(NeuroVEError):
+            carried.decode(data[:length], state)
+    network = CONFIG.network.model_copy(update={"hidden": 5})
+    other = Estimator(make_bundle(network=network))
+    with pytest.raises(NeuroVEError, match="shapes of this node's model"):
+        carried.decode(data, other.initial_state(SENSOR))
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        [1, 2, 3],
+        [["named", "Popen", [["tuple", []]]], 1, 2, None, None, ["tuple", []], None],
+        [["tensor", "|O", [1], b"12345678"], 1, 2, None, None, ["tuple", []], None],
+        [["tensor", "<f8", [9], b"12345678"], 1, 2, None, None, ["tuple", []], None],
+    ],
+)
+def test_only_known_classes_and_plain_numbers_are_made(values):
+    estimator = Estimator(make_bundle())
+    with pytest.raises(NeuroVEError):
+        carried.decode(msgpack.packb(values), estimator.initial_state(SENSOR))
