@@ -10,7 +10,7 @@ JOBS ?= 2
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 
-.PHONY: run test ros2 format picture docs clean
+.PHONY: run test ros2 format picture docs image clean
 
 run: $(VENV)/warm
 	@echo "with a live page for browsers: $(BIN)/neurove demo --page"
@@ -34,6 +34,9 @@ picture: $(VENV)/installed  # the pictures in README, of a simulated street; the
 
 docs: $(VENV)/installed  # the documentation site in build/docs/site; a broken link is an error
 	@$(BIN)/python deploy/docs/build.py build/docs
+
+image:  # the container image `neurove`, with buildah; IMAGE_ARGS: further arguments of `buildah build`
+	@deploy/image.sh neurove $(IMAGE_ARGS)
 
 format: $(VENV)/installed
 	$(BIN)/ruff format .

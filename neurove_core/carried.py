@@ -4,23 +4,20 @@ The bytes are msgpack and name the dtype and the shape of every array. They are 
 classes of `_KINDS` are made, and the network state must have the shapes of the reader's own model.
 """
 
+import sys
 from typing import Any, Final, NamedTuple
 
 import msgpack
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from neurove_core.estimator import StreamState
-from neurove_core.networks.ann import AnnState
-from neurove_core.networks.neurove import NetworkState
-from neurove_core.networks.snn_ang import SnnAngState
-from neurove_core.networks.state import is_finite
+from neurove_core.networks.arrays import ArrayState
 from neurove_core.refine.ground import GroundEvents, GroundState
 from neurove_core.refine.ground_sway import Sway
 from neurove_core.refine.rotation import Filter
-from neurove_core.spiking.aslstm import ASLSTMState
-from neurove_core.spiking.lif import LIFState
+from neurove_core.refine.scene import Scene
+from neurove_core.refine.stages import State as Stages
 from neurove_core.timescales import Longer
 from neurove_protocol.errors import InvalidField, NeuroVEError
 
@@ -28,22 +25,10 @@ MAX_BYTES: Final = 32 << 20
 """Cap of the bytes of one stream's state."""
 
 _KINDS: Final[dict[str, Any]] = {
-    kind.__name__: kind
-    for kind in (
-        AnnState,
-        ASLSTMState,
-        Filter,
-        GroundEvents,
-        GroundState,
-        LIFState,
-        Longer,
-        NetworkState,
-        SnnAngState,
-        Sway,
-    )
+    kind.__name__: kind for kind in (ArrayState, Filter, GroundEvents, GroundState, Longer, Scene, Stages, Sway)
 }
 _DTYPES: Final = ("|u1", "|i1", "|b1", "<u2", "<i2", "<u4", "<i4", "<i8", "<u8", "<f4", "<f8")
-_PARTS: Final = ("network", "age", "end_us", "filter", "ground", "recent", "longer")
+_PARTS: Final = ("network", "age", "end_us", "stages", "ground", "recent", "longer")
 _WHAT: Final = "stream state"
 
 
@@ -53,7 +38,7 @@ class Carried(NamedTuple):
     network: Any
     age: int
     end_us: int
-    filter: Filter | None
+    stages: Stages
     ground: GroundState
     recent: tuple[NDArray[np.uint8], ...]
     longer: Longer
@@ -90,9 +75,9 @@ def decode(data: bytes, own: StreamState) -> Carried:
         raise InvalidField(_WHAT, "data", type(error).__name__, "the state of a stream as msgpack") from None
     if _shape(carried.network) != _shape(own.network):
         raise InvalidField(_WHAT, "network", type(carried.network).__name__, "the shapes of this node's model")
-    if not (_is_count(carried.age) and isinstance(carried.end_us, int) and is_finite(carried.network)):
+    if not (_is_count(carried.age) and isinstance(carried.end_us, int) and carried.network.finite()):
         raise InvalidField(_WHAT, "network", carried.age, "finite numbers, an age and the end of a window")
-    kinds = (Filter | None, GroundState, tuple, Longer)
+    kinds = (Stages, GroundState, tuple, Longer)
     for name, value, kind in zip(_PARTS[3:], carried[3:], kinds, strict=True):
         if not isinstance(value, kind):
             raise InvalidField(_WHAT, name, type(value).__name__, str(kind))
@@ -106,7 +91,7 @@ def _is_count(value: object) -> bool:
 def _packed(value: Any) -> Any:
     if value is None or isinstance(value, bool | int | float):
         return value
-    if isinstance(value, torch.Tensor):
+    if _is_tensor(value):
         return ["tensor", *_bytes_of(value.detach().numpy())]
     if isinstance(value, np.ndarray):
         return ["array", *_bytes_of(value)]
@@ -131,20 +116,40 @@ def _unpacked(value: Any) -> Any:
     if kind == "tuple":
         return tuple(_unpacked(one) for one in rest[0])
     if kind == "named":
-        return _KINDS[rest[0]](*(_unpacked(one) for one in rest[1]))
+        return (_KINDS | _kinds_of_torch())[rest[0]](*(_unpacked(one) for one in rest[1]))
     dtype, shape, data = rest
     if dtype not in _DTYPES:
         raise ValueError("another dtype")
     array = np.frombuffer(data, np.dtype(dtype)).reshape(shape).copy()
     if kind == "tensor":
-        return torch.from_numpy(array)
+        return sys.modules["torch"].from_numpy(array)
     return array[()] if kind == "scalar" else array
 
 
 def _shape(value: Any) -> Any:
-    """The structure of a network state: classes, and the dtype and shape of each tensor."""
-    if isinstance(value, torch.Tensor):
-        return value.dtype, tuple(value.shape)
+    """The structure of a network state: classes, whole numbers, and the dtype and shape of each array or tensor."""
+    if isinstance(value, np.ndarray) or _is_tensor(value):
+        return type(value).__name__, value.dtype, tuple(value.shape)
+    if isinstance(value, int):
+        return value
     if isinstance(value, tuple):
         return type(value).__name__, tuple(_shape(one) for one in value)
     return type(value).__name__
+
+
+def _is_tensor(value: Any) -> bool:
+    torch = sys.modules.get("torch")  # without it nothing is a tensor, and a service does not load it for this
+    return torch is not None and isinstance(value, torch.Tensor)
+
+
+def _kinds_of_torch() -> dict[str, Any]:
+    """The classes of the networks that run in torch; none in a process that has not loaded it."""
+    if "torch" not in sys.modules:
+        return {}
+    from neurove_core.networks.ann import AnnState
+    from neurove_core.networks.neurove import NetworkState
+    from neurove_core.networks.snn_ang import SnnAngState
+    from neurove_core.spiking.aslstm import ASLSTMState
+    from neurove_core.spiking.lif import LIFState
+
+    return {kind.__name__: kind for kind in (AnnState, ASLSTMState, LIFState, NetworkState, SnnAngState)}

@@ -31,8 +31,8 @@ log = logging.getLogger(__name__)
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
-_CONNECT_S: Final = 5.0
-_WORKERS_S: Final = 30.0  # until the first worker must be there
+_CONNECT_S: Final = 10.0
+_WORKERS_S: Final = 60.0  # until the first worker must be there
 _SILENT_S: Final = 30.0  # without a result, until the workers are counted
 _AT_ONCE: Final = 256  # tasks that the scheduler has at once; their jobs and results take memory
 _PACKAGES: Final = ("numpy", "numba", "distributed")

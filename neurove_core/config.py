@@ -155,9 +155,10 @@ class ModelConfig(Config):
         (4.0, 0.5),
         description="Greatest linear (model's unit) and angular [rad/s] speed, times the scale, of a longer window.",
     )
-    scale_floor: tuple[float, float] = Field(
-        (0.25, 0.04),
-        description="Speeds of one window; with less of both the camera may be stationary: no longer window answers.",
+    scale_floor: float = Field(
+        0.25,
+        ge=0,
+        description="Linear speed (model's unit) of one window below which no longer window answers; see timescales.",
     )
 
     LATER = ("scales", "scale_bounds", "scale_floor")
@@ -168,8 +169,6 @@ class ModelConfig(Config):
             raise ValueError(f"scales={self.scales}: must rise, from at least 2 to at most {MAX_HISTORY}")
         if not min(self.scale_bounds) > 0:
             raise ValueError(f"scale_bounds={self.scale_bounds}: both must be above 0")
-        if not min(self.scale_floor) >= 0:
-            raise ValueError(f"scale_floor={self.scale_floor}: both must be at least 0")
         if self.scales and self.network.history:
             raise ValueError(f"scales={self.scales}: a model with network.history={self.network.history} has none")
         return self

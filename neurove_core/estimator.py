@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.engine.runner import runner_of
+from neurove_core.extras import installed
 from neurove_core.geometry.tables import TABLES
 from neurove_core.ingest import windows
 from neurove_core.ingest.channels import Recent, remembered, with_history
@@ -21,15 +21,12 @@ from neurove_core.io.packets import slices
 from neurove_core.io.recording import Recording
 from neurove_core.models.bounds import UNSET, Bounds
 from neurove_core.models.bundle import PER_HEIGHT, Bundle, LinearUnit
-from neurove_core.networks.kinds import State
-from neurove_core.networks.neurove import NetworkState, NeuroVE
-from neurove_core.networks.runner import Runner
-from neurove_core.refine import errors, ground, scene
+from neurove_core.networks.arrays import Runner, State
+from neurove_core.refine import errors, ground
 from neurove_core.refine import stages as refining
 from neurove_core.refine.ground import GroundState
 from neurove_core.refine.rotation import Given, Rate
 from neurove_core.refine.rotation import Refined as RotationFound
-from neurove_core.refine.search import compile_kernels
 from neurove_core.refine.view import View
 from neurove_core.timescales import Answer, Longer, chosen, followed, jobs, slowed, watched
 from neurove_protocol import CameraInfo, Events, Sensor
@@ -119,8 +116,9 @@ class Estimator:
     """A loaded model that serves any number of streams. It holds no stream's state and is safe to share.
 
     Args:
-        bundle: the model; its network is put into evaluation mode.
-        runner: runs the network; by default the fastest one. `PlainRunner(bundle.network)` runs the network itself.
+        bundle: the model. Its weights are copied; later changes have no effect.
+        runner: runs the network; by default the fastest one, which needs torch for baselines alone.
+            `PlainRunner(bundle.network)` runs the network itself.
         bounds: absolute bounds of sigma for `uncertain`; they take precedence over those of the bundle.
         refine: whether to refine estimates by the events, see `refine.rotation` and `refine.ground`. It needs the
             CameraInfo of a stream and a bundle with an uncertainty that does not refuse it.
@@ -133,9 +131,8 @@ class Estimator:
         self._refines = refine and bundle.uncertainty is not None and bundle.metadata.refine == "auto"
         self._bounds = bounds
         self.config = bundle.config
-        self.network = bundle.network.eval().requires_grad_(requires_grad=False)
-        self._runner: Runner = runner or runner_of(self.network)
-        self._offset, self._scale = bundle.offset.double().numpy(), bundle.scale.double().numpy()
+        self._runner: Runner = runner or _runner_of(bundle)
+        self._offset, self._scale = bundle.scaling
 
     def initial_state(self, sensor: Sensor, camera: CameraInfo | None = None) -> StreamState:
         """The state of a new stream, its network state zero.
@@ -150,7 +147,7 @@ class Estimator:
         lut = TABLES.of(self.config.canonical, sensor, camera)
         per_pixel = self.config.low_activity_per_pixel * np.count_nonzero(lut >= 0)
         least = max(float(self.config.low_activity_events), float(per_pixel))
-        network = self.network.initial_state()
+        network = self._runner.initial_state()
         view = View.of(camera) if self._refines and camera is not None else None
         return StreamState(sensor, camera, lut, WindowsState(), network, 0, low_activity_below=least, view=view)
 
@@ -186,8 +183,8 @@ class Estimator:
     def push_many(self, pushes: Sequence[Push]) -> list[PushResult]:
         """Add a packet to each of several streams, and estimate all windows that they complete, in common batches.
 
-        The results are those of `push` for each, in less time where several streams complete a window. See
-        `FastRunner` for when they are equal bit for bit.
+        The results are those of `push` for each, in less time where several streams complete a window, and equal bit
+        for bit where the network runs on arrays.
 
         Args:
             pushes: at most one packet of each stream.
@@ -223,18 +220,15 @@ class Estimator:
         """
         if window.sample is None or state.view is None or estimate.covariance is None:
             return estimate, state
-        height_m = (state.camera.height_m if state.camera else None) or 1.0
+        known_m = state.camera.height_m if state.camera else None
+        height_m = known_m or 1.0
         about = window.start_us, self.config.window.duration_us, window.sample, state.view, estimate.twists.mean(axis=0)
-        given = Given(*about, estimate.covariance, estimate.low_activity, None, height_m)
+        given = Given(*about, estimate.covariance, estimate.low_activity, None, height_m, known_m is not None)
         found = refining.refine(given, state.stages)
-        state = state._replace(stages=found.state)
-        if found.turn.outcome == "accepted":
-            estimate = _turned(estimate, found.turn, found.velocity)
-        answer = estimate
-        if found.level:
-            answer, state = _over_ground(window, estimate, state, found.turn.sigma_rad_s)
-        else:
-            state = state._replace(ground=GroundState())
+        state = state._replace(stages=found.state, ground=state.ground if found.level else GroundState())
+        estimate = _turned(estimate, found.turn, found.velocity)
+        about_turn = window, estimate, state, found.turn.sigma_rad_s
+        answer, state = _over_ground(*about_turn) if found.level else (estimate, state)
         if answer is estimate and found.velocity is None:
             answer = _with_errors(estimate, found.turn, height_m)
         return answer._replace(uncertain=self.is_uncertain(answer.twists, answer.covariance)), state
@@ -263,7 +257,7 @@ class Estimator:
         """The answer of the time scale that fits the motion; longer windows run on the way."""
         if not self.config.scales:
             return answer
-        wanted, longer = jobs(window.counts, stream.state.longer, self.network, self.config)
+        wanted, longer = jobs(window.counts, stream.state.longer, self._runner, self.config)
         runs = self._runner.run([job.counts for job in wanted], [job.state for job in wanted]) if wanted else []
         longer = followed(longer, [(job, state) for job, (_, state) in zip(wanted, runs, strict=True)], self.config)
         stream.state = stream.state._replace(longer=watched(longer, answer.twists, self.config))
@@ -275,7 +269,7 @@ class Estimator:
     def _reset_after_gap(self, stream: _Progress, window: Window) -> None:
         """Reset the network state where a window does not follow the one before it."""
         if stream.state.end_us not in (None, window.start_us) and not window.bridged:
-            fresh = self.network.initial_state()
+            fresh = self._runner.initial_state()
             stream.state = stream.state._replace(network=fresh, age=0, recent=(), longer=Longer())
 
     def _take(self, stream: _Progress, window: Window, twists: NDArray[np.float64], network: State) -> None:
@@ -298,13 +292,10 @@ class Estimator:
 
     def _covariance(self, answer: Answer, metres: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Covariance (6, 6) of the twists of an answer, in the units of the estimate."""
-        state = answer.network
-        if not isinstance(self.network, NeuroVE) or not isinstance(state, NetworkState):
-            return None
-        log_sigma = self.network.log_sigma(state)
+        log_sigma = self._runner.log_sigma(answer.network)
         if self.bundle.uncertainty is None or log_sigma is None:
             return None
-        return self.bundle.uncertainty.covariance(log_sigma[0].double().numpy(), self._scale * metres / answer.scale)
+        return self.bundle.uncertainty.covariance(log_sigma, self._scale * metres / answer.scale)
 
     def _estimate(self, window: Window, answer: Answer, before: StreamState) -> WindowEstimate:
         metres, age = _to_metres(before.camera, self.bundle.linear_unit), before.age
@@ -321,6 +312,22 @@ class Estimator:
             covariance=covariance,
             uncertain=self.is_uncertain(twists, covariance),
         )
+
+
+def _runner_of(bundle: Bundle) -> Runner:
+    """The fastest runner of a model: on arrays, whether it was read from a file or is in memory; baselines in torch.
+
+    Both run the same code, so a golden test that was recorded of a model in memory holds for its file.
+    """
+    if bundle.config.kind == "neurove":
+        from neurove_core.engine.array_runner import ArrayRunner
+
+        found = ArrayRunner(bundle.current_weights)
+        if found.is_compiled or not installed("torch"):
+            return found  # else torch is faster than plain numpy
+    from neurove_core.engine.runner import runner_of
+
+    return runner_of(bundle.network.eval().requires_grad_(requires_grad=False))
 
 
 def _begin(push: Push, pushed: Pushed) -> _Progress:
@@ -345,8 +352,7 @@ def _with_rate(
 def _is_finite(estimator: Estimator, state: StreamState) -> bool:
     """Whether the estimates of some events are finite; this compiles all code."""
     if state.view is not None:
-        compile_kernels(state.view.grid)
-        scene.compile_kernels(state.view.grid)
+        refining.compile_kernels(state.view.grid)
         ground.compile_kernels(_warm_camera(state.sensor))
     for given in _warm_events(state.sensor, estimator.config.window.duration_us):
         answer = estimator.push(given, state._replace(windows=WindowsState()), 0)
@@ -358,8 +364,8 @@ def _is_finite(estimator: Estimator, state: StreamState) -> bool:
 
 
 def _turned(estimate: WindowEstimate, found: RotationFound, velocity: refining.Velocity | None) -> WindowEstimate:
-    """The estimate with the angular part of the refinement, and with a linear part where it found one."""
-    if estimate.covariance is None:
+    """The estimate with the angular part of the refinement, and the linear one if it has one, where it is accepted."""
+    if estimate.covariance is None or found.outcome != "accepted":
         return estimate
     twists, covariance = _with_rate(estimate.twists, estimate.covariance, found.rate, found.change_rad_s)
     if velocity is not None:

@@ -35,7 +35,7 @@ def check(estimator: Estimator) -> None:
     if golden is None:
         return
     got, want = answers(estimator, golden.counts), golden.twists.astype(np.float64)
-    allowed = golden.tolerance * np.abs(estimator.bundle.scale.double().numpy())
+    allowed = golden.tolerance * np.abs(estimator.bundle.scaling[1])
     off = np.abs(got - want) / np.maximum(allowed, np.finfo(np.float64).tiny)
     off[~np.isfinite(got)] = np.inf
     window, bin_, axis = (int(at) for at in np.unravel_index(int(np.argmax(off)), off.shape))

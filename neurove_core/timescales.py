@@ -8,7 +8,8 @@ scale, stays within `scale_bounds`, the next scale answers instead. A fast motio
 aliases.
 
 The noise of a stationary camera adds up in a long window, where it looks like motion. In one window the network tells
-both apart. So a long window answers only if the network sees a motion in each window that is part of it: `scale_floor`.
+both apart. A camera in a hand turns without much speed, and its rates change within a long window. So a long window
+answers only if the network sees a linear speed of `scale_floor` in each window that is part of it.
 """
 
 from collections.abc import Sequence
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from neurove_core.config import ModelConfig
 from neurove_core.ingest.channels import Counts, add_saturating
-from neurove_core.networks.kinds import Network, State
+from neurove_core.networks.arrays import Begins, State
 
 STEPS: Final = 3
 """Long windows that a state must have seen before its scale answers."""
@@ -33,7 +34,7 @@ class Longer(NamedTuple):
     states: tuple[
         tuple[State, ...], ...
     ] = ()  # of each scale, one for each of its turns; empty before the first window
-    moving: int = 0  # newest windows in a row in which the network sees a motion
+    moving: int = 0  # newest windows in a row in which the network sees a linear speed
 
 
 class Answer(NamedTuple):
@@ -53,13 +54,13 @@ class Job(NamedTuple):
     turn: int  # which state of its scale
 
 
-def jobs(window: Counts, longer: Longer, network: Network, config: ModelConfig) -> tuple[list[Job], Longer]:
+def jobs(window: Counts, longer: Longer, network: Begins, config: ModelConfig) -> tuple[list[Job], Longer]:
     """The runs that a new window of a stream asks for, and the stream's state with that window.
 
     Args:
         window: (2n * parts, H, W), the newest.
         longer: state of the stream.
-        network: of the model.
+        network: of the model, or its runner.
         config: of the model.
     """
     scales = config.scales
@@ -109,8 +110,8 @@ def slowed(twists: NDArray[np.float64], scale: int) -> NDArray[np.float64]:
 
 def watched(longer: Longer, twists: NDArray[np.float64], config: ModelConfig) -> Longer:
     """The state of a stream after the answer (n, 6) of the network to its newest window alone."""
-    still = _within(twists.mean(axis=0), config.scale_floor)
-    return longer._replace(moving=0 if still else longer.moving + 1)
+    speed = float(np.linalg.norm(twists.mean(axis=0)[:3]))
+    return longer._replace(moving=longer.moving + 1 if speed > config.scale_floor else 0)
 
 
 def chosen(answers: Sequence[Answer], longer: Longer, bounds: tuple[float, float]) -> Answer:
@@ -123,13 +124,10 @@ def chosen(answers: Sequence[Answer], longer: Longer, bounds: tuple[float, float
     """
     best = answers[0]
     for answer in answers[1:]:
+        mean = best.twists.mean(axis=0) * answer.scale
+        within = all(np.linalg.norm(part) <= bound for part, bound in zip((mean[:3], mean[3:]), bounds, strict=True))
         known = longer.windows >= STEPS * answer.scale and longer.moving >= answer.scale
-        if not known or not _within(best.twists.mean(axis=0) * answer.scale, bounds):
+        if not known or not within:
             break
         best = answer
     return best
-
-
-def _within(twist: NDArray[np.float64], bounds: tuple[float, float]) -> bool:
-    """Whether a twist (6,) is at most as fast as the linear and the angular bound."""
-    return all(np.linalg.norm(part) <= bound for part, bound in zip((twist[:3], twist[3:]), bounds, strict=True))

@@ -88,3 +88,16 @@ def is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:  # another name
         return False
+
+
+def where(listen: tuple[str, ...], connect: tuple[str, ...]) -> str:
+    """The endpoints of a session, for an error."""
+    parts = [f"listen={', '.join(listen)}"] * bool(listen) + [f"connect={', '.join(connect)}"] * bool(connect)
+    return " ".join(parts) or "no endpoints"
+
+
+def unreached(connect: tuple[str, ...]) -> str:
+    """Why there is no connection; Zenoh reports a closed port and a refused certificate in the same way."""
+    secured = any(endpoint.startswith(("tls/", "quic/")) for endpoint in connect)
+    refused = ", or one side refuses the other's certificate (zenoh_config)" if secured else ""
+    return f"no process listens at {', '.join(connect)}{refused}"

@@ -23,6 +23,7 @@ from neurove_protocol.errors import Busy, InternalError, NeuroVEError
 from neurove_protocol.events import MAX_PACKET_BYTES
 from neurove_service import logs
 from neurove_service.desk import Desk
+from neurove_service.endpoints import unreached, where
 from neurove_service.guard import Guard
 
 log = logs.get(__name__)
@@ -182,6 +183,11 @@ class Transport:
         handler = zenoh.handlers.Callback(receive, indirect=False)
         return _keep(self._kept, self.session.declare_subscriber(key, handler, allowed_origin=origin))
 
+    def subscribe_newest(self, key: str, most: int) -> tuple[Callable[[], list[bytes]], Callable[[], None]]:
+        """Keep the newest messages of a key, without Python for each; returns what takes them and what ends it."""
+        declared = self.session.declare_subscriber(key, zenoh.handlers.RingChannel(most))
+        return lambda: _taken(declared), _keep(self._kept, declared)
+
     def answer(self, key: str, handle: Callable[[bytes], bytes], schema: str = CONTROL_SCHEMA) -> None:
         """Answer the queries of a key on a separate thread; an error of `handle` goes to the caller.
 
@@ -313,6 +319,10 @@ def _keep(kept: list[Any], declared: Any) -> Callable[[], None]:
     return undeclare
 
 
+def _taken(declared: Any) -> list[bytes]:
+    return [sample.payload.to_bytes() for sample in iter(declared.try_recv, None)]
+
+
 def _sent_us(attachment: zenoh.ZBytes | None) -> int | None:
     """The time of sending in an attachment [us]; None if there is none or it is another attachment."""
     if attachment is None:
@@ -404,12 +414,12 @@ def open_transport(
         except zenoh.ZError as error:
             if not str(error).startswith("Unable to connect"):  # Zenoh has one error class and no codes
                 raise EndpointError(
-                    f"cannot open a Zenoh session: {_where(listen, connect)}: {_reason(error)}"
+                    f"cannot open a Zenoh session: {where(listen, connect)}: {_reason(error)}"
                 ) from None
         if time.monotonic() >= deadline or stop.is_set():
-            raise Unreachable(_unreached(connect))
+            raise Unreachable(unreached(connect))
         if not waiting:
-            log.info("waiting for a router", connect=", ".join(connect), why=_unreached(connect))
+            log.info("waiting for a router", connect=", ".join(connect), why=unreached(connect))
             waiting = True
         stop.wait(_RETRY_S)
 
@@ -427,21 +437,9 @@ def _session_config(
         for key, value in (_SETTINGS | ({"timestamping/enabled": True} if timestamps else {})).items():
             config.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
-        where = f"zenoh_config={config_file}" if config_file else _where(listen, connect)
-        raise EndpointError(f"cannot configure Zenoh: {where}: {_reason(error)}") from None
+        place = f"zenoh_config={config_file}" if config_file else where(listen, connect)
+        raise EndpointError(f"cannot configure Zenoh: {place}: {_reason(error)}") from None
     return config
-
-
-def _where(listen: tuple[str, ...], connect: tuple[str, ...]) -> str:
-    parts = [f"listen={', '.join(listen)}"] * bool(listen) + [f"connect={', '.join(connect)}"] * bool(connect)
-    return " ".join(parts) or "no endpoints"
-
-
-def _unreached(connect: tuple[str, ...]) -> str:
-    """Why there is no connection; Zenoh reports a closed port and a refused certificate in the same way."""
-    secured = any(endpoint.startswith(("tls/", "quic/")) for endpoint in connect)
-    refused = ", or one side refuses the other's certificate (zenoh_config)" if secured else ""
-    return f"no process listens at {', '.join(connect)}{refused}"
 
 
 def _reason(error: zenoh.ZError) -> str:

@@ -32,11 +32,11 @@ MAY_IMPORT = {
     "neurove_core.ingest": "config compiled geometry",
     "neurove_core.networks": "config compiled spiking",
     "neurove_core.engine": "compiled spiking networks",
-    "neurove_core.models": "config files networks",
+    "neurove_core.models": "config files extras networks",
     "neurove_core.timescales": "config ingest networks",
     "neurove_core.refine": "compiled geometry ingest",
     "neurove_core.inertial": "",
-    "neurove_core.estimator": "geometry ingest networks engine models io refine timescales",
+    "neurove_core.estimator": "extras geometry ingest networks engine models io refine timescales",
     "neurove_core.self_test": "config models estimator",
     "neurove_core.aided": "estimator inertial",
     "neurove_core.carried": "spiking networks refine estimator timescales",
@@ -75,13 +75,14 @@ MAY_IMPORT = {
     "neurove_service.config": "core:files endpoints labels",
     "neurove_service.guard": "logs",
     "neurove_service.desk": "",
-    "neurove_service.transport": "logs guard desk",
+    "neurove_service.transport": "logs guard desk endpoints",
     "neurove_service.streams": (
         "core:config core:geometry core:ingest core:networks core:models core:estimator "
         "core:inertial core:aided core:carried logs guard clock_offset"
     ),
     "neurove_service.models": (
-        "core:config core:files core:ingest core:networks core:models core:estimator core:self_test logs guard streams"
+        "core:config core:extras core:files core:ingest core:networks core:models core:estimator core:self_test"
+        " logs guard streams"
     ),
     "neurove_service.metrics": "logs guard",
     "neurove_service.clients": (

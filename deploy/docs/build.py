@@ -16,6 +16,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 
+from diagrams import FENCE, file_of
+
 ROOT = Path(__file__).resolve().parents[2]
 CONFIG = Path(__file__).with_name("mkdocs.yml")
 LINK = re.compile(r"\]\(([^)\s#]+)(#[^)\s]*)?\)")
@@ -99,6 +101,27 @@ def collect(into: Path) -> None:
         for path in (page, *links_of(page)):
             (into / path.parent).mkdir(parents=True, exist_ok=True)
             shutil.copyfile(ROOT / path, into / path)
+
+
+def picture_diagrams(into: Path) -> None:
+    """Replace each Mermaid diagram, which a script from another host would draw, by its committed picture.
+
+    Raises:
+        SystemExit: a diagram has no picture, because its text changed.
+    """
+    for page in into.rglob("*.md"):
+        text = page.read_text(encoding="utf-8")
+        for diagram in FENCE.findall(text):
+            picture = file_of(diagram)
+            if not picture.is_file():
+                sys.exit(f"{page.relative_to(into)}: a diagram has no picture: run deploy/docs/diagrams.py")
+            target = into / picture.relative_to(ROOT)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(picture, target)
+            steps = "../" * len(page.relative_to(into).parent.parts)
+            image = f"![diagram]({steps}{picture.relative_to(ROOT).as_posix()})\n"
+            text = text.replace(f"```mermaid\n{diagram}```\n", image)
+        page.write_text(text, encoding="utf-8")
 
 
 def write_reference(into: Path) -> None:
@@ -236,6 +259,7 @@ def build(out: Path) -> int:
     """Build the site below a folder; returns the exit code of Zensical."""
     shutil.rmtree(out, ignore_errors=True)
     collect(out / "pages")
+    picture_diagrams(out / "pages")
     write_reference(out / "pages" / "reference")
     shutil.copyfile(CONFIG, out / "mkdocs.yml")
     zensical = Path(sys.executable).with_name("zensical")

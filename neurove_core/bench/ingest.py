@@ -78,7 +78,7 @@ def end_to_end(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: 
     tonic = peers.load("tonic.functional", missing) if with_peers else None
     for name, config in shapes.items():
         estimator = Estimator(bundle.untrained(0, config))
-        network = cast("NeuroVE", estimator.network)
+        network = cast("NeuroVE", estimator.bundle.network)
         others = peers.networks(network, missing) if with_peers else {}
         narrow = Estimator(bundle.untrained(0, window.with_precision(config, "int8")))
         runs: dict[str, Callable[[], Any]] = {"ours": _estimated(estimator, events)}

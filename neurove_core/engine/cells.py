@@ -1,35 +1,42 @@
 """The compiled pass from the last feature map to the twists: projection, ASLSTM layers and readout."""
 
-import numpy as np
-import torch
-from numpy.typing import NDArray
-from torch import Tensor
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
-from neurove_core.engine.folding import Folded
-from neurove_core.spiking.aslstm import ASLSTMParams
+import numpy as np
+from numpy.typing import NDArray
+
 from neurove_core.spiking.fused.activations import fused, sigmoid, tanh
+
+if TYPE_CHECKING:  # this module needs no torch
+    from neurove_core.spiking.aslstm import ASLSTMParams
 
 Array = NDArray[np.float32]
 
 
-def copied_params(params: ASLSTMParams) -> ASLSTMParams:
+def copied_params(params: "ASLSTMParams") -> "ASLSTMParams":
     """A copy of a cell's weights, independent of later changes of the network."""
     w_x, w_v, b, d_time = (tensor.detach().clone() for tensor in (params.w_x, params.w_v, params.b, params.d_time))
-    return ASLSTMParams(w_x, w_v, b, d_time, params.alpha, params.v_th)
+    return params._replace(w_x=w_x, w_v=w_v, b=b, d_time=d_time)
 
 
-def flattened_weights(project: Folded | None, cells: list[ASLSTMParams], d_space: Tensor, readout: Folded) -> Array:
+def flattened_weights(project: Any, cells: Sequence[Any], d_space: Any, readout: Any) -> Array:
     """All weights of the compiled pass in one vector, in the order in which `run_cells` reads them.
 
     Matrices are transposed, so that a row has the weights of one input to all outputs. Passing one array to compiled
-    code takes a few microseconds; twenty arrays would take longer than a layer. `project` is None where the rows are
-    projected elsewhere.
+    code takes a few microseconds; twenty arrays would take longer than a layer.
+
+    Args:
+        project: the projection, with weight (F, I) and bias (F); None where the rows are projected elsewhere.
+        cells: of each layer w_x (5N, I), w_v (4N, N), b (5N) and d_time (N), as arrays or as tensors on the CPU.
+        d_space: diffusion (L, N) to the next layer.
+        readout: weight (R, N) and bias (R).
     """
-    tensors = [project.weight.T, project.bias] if project else []
+    parts = [project.weight.T, project.bias] if project else []
     for params, d in zip(cells, d_space, strict=True):
-        tensors += [params.w_x.T, params.w_v.T, params.b, params.d_time, d]
-    tensors += [readout.weight.T, readout.bias]
-    return torch.cat([tensor.reshape(-1) for tensor in tensors]).numpy()
+        parts += [params.w_x.T, params.w_v.T, params.b, params.d_time, d]
+    parts += [readout.weight.T, readout.bias]
+    return np.concatenate([np.asarray(part).reshape(-1) for part in parts])
 
 
 @fused

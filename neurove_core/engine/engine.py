@@ -31,6 +31,7 @@ from neurove_core.engine.folding import (
 )
 from neurove_core.engine.int8 import Int8Extractor, Int8Projection
 from neurove_core.engine.spike_lists import SpikeList, to_maps
+from neurove_core.networks import tables
 from neurove_core.networks.neurove import NetworkState, NeuroVE, SpikingBlock
 from neurove_core.spiking.alif import diffuse
 from neurove_core.spiking.aslstm import ASLSTM, ASLSTMState, aslstm_step
@@ -71,7 +72,7 @@ class Engine:
                 self._project = folded_projection(network, net.channels[-1], *sizes[-1])
                 self._sparse = _over_lists(blocks, self._convolutions, sizes, self._project, self._lif)
             self._readout = Folded(*(tensor.detach().clone() for tensor in network.outputs()))
-            self._kappa = float(torch.sigmoid(network.kappa_logit))
+            self._kappa = tables.sigmoid(float(network.kappa_logit))
             cells = [cell for cell in network.cells if isinstance(cell, ASLSTM)]
             self._params = [copied_params(cell.params()) for cell in cells]
             self._d_space = network.d_space.detach().clone()

@@ -9,6 +9,7 @@ from neurove_core.engine.convolution import Convolution, convolution
 from neurove_core.engine.int8 import Int8Layer
 from neurove_core.networks import quantisation
 from neurove_core.networks.neurove import NeuroVE, SpikingBlock
+from neurove_core.networks.tables import LEVELS
 
 
 class Folded(NamedTuple):
@@ -42,7 +43,7 @@ def folded_convolution(block: SpikingBlock, rows: int, columns: int) -> Convolut
 def int8_layer(block: SpikingBlock, at: int) -> Int8Layer:
     """Block number `at` in 8-bit integers; the factor includes the step of its weights, and at 0 that of the input."""
     weights = quantisation.quantised(block.conv.weight)
-    steps = weights.step.double() / (quantisation.LEVELS if at == 0 else 1)
+    steps = weights.step.double() / (LEVELS if at == 0 else 1)
     factor, offset = folded(steps.view(-1, 1), block.norm)
     return Int8Layer(weights, factor.view(-1).float(), offset.float())
 

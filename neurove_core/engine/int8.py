@@ -26,7 +26,8 @@ from neurove_core.engine.convolution import Convolution
 from neurove_core.engine.fallback import reason_of, vectors_work, warn_once
 from neurove_core.engine.spike_lists import SpikeList, to_maps
 from neurove_core.engine.tiles import LANES
-from neurove_core.networks.quantisation import MAX_WEIGHT, Quantised, codes
+from neurove_core.networks.quantisation import Quantised, codes
+from neurove_core.networks.tables import MAX_WEIGHT
 from neurove_core.spiking.lif import LIFParams, LIFState, lif_scan_reference
 from neurove_core.spiking.plain import is_plain
 

@@ -10,10 +10,11 @@ from torch import Tensor
 
 from neurove_core.engine.encoding import CountInput, to_codes, to_count_input
 from neurove_core.engine.engine import Engine
+from neurove_core.networks.arrays import Runner
 from neurove_core.networks.encoding import to_spikes
 from neurove_core.networks.kinds import Network, State
 from neurove_core.networks.neurove import NetworkState, NeuroVE
-from neurove_core.networks.runner import PlainRunner, Runner, batch_of
+from neurove_core.networks.runner import PlainRunner, batch_of, log_sigma_of
 
 
 def runner_of(network: Network) -> Runner:
@@ -32,13 +33,21 @@ class FastRunner:
     """
 
     def __init__(self, network: NeuroVE) -> None:
-        self._engine = Engine(network)
+        self._engine, self._network = Engine(network), network
         self._encoding = network.config.network.encoding
         self._encode: Callable[[Tensor, str], Tensor | CountInput] = to_spikes
         if network.config.network.precision == "int8":
             self._encode = to_codes
         elif self._engine.reads_counts:
             self._encode = to_count_input
+
+    def initial_state(self) -> State:
+        """The zero state of one stream."""
+        return self._network.initial_state()
+
+    def log_sigma(self, state: State) -> NDArray[np.float64] | None:
+        """Log sigma (6) of the window that led to a state; None without a spread."""
+        return log_sigma_of(self._network, state)
 
     @torch.inference_mode()
     def run(

@@ -13,7 +13,7 @@ This module needs vectors.py: import it only where `fallback.vectors_work()`.
 
 import math
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import torch
@@ -36,6 +36,7 @@ from neurove_core.engine.spike_lists import (
     channels_first,
     channels_last,
     empty_list,
+    in_groups,
     output_shape,
     to_list,
     to_maps,
@@ -144,15 +145,6 @@ def cells_shape(maps: Codes) -> tuple[int, int, int, int]:
     """(R, H, W, C) of maps (R, C, H, W)."""
     count, channels, rows, columns = maps.shape
     return count, rows, columns, channels
-
-
-def in_groups(weight: NDArray[np.int8], group: int) -> NDArray[np.signedinteger[Any]]:
-    """Weights (3, 3, C, C') as (3, groups of channels, 3, C', group), flat: int8 for groups of four, int16 for two."""
-    inputs, outputs = weight.shape[2:]
-    groups = -(-inputs // group)
-    by_input = np.zeros((3, groups * group, 3, outputs), np.int8 if group == 4 else np.int16)
-    by_input[:, :inputs] = weight.transpose(0, 2, 1, 3)
-    return np.ascontiguousarray(by_input.reshape(3, groups, group, 3, outputs).transpose(0, 1, 3, 4, 2)).reshape(-1)
 
 
 class Int8ListConvolution:

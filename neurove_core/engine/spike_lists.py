@@ -1,14 +1,15 @@
 """Spike lists: the neurons of a feature map that fired, by their index, and conversions between memory layouts."""
 
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from neurove_core.compiled import compiled
 from neurove_core.engine.tiles import LANES
+
+if TYPE_CHECKING:  # lists need no torch, only their conversion to tensors does
+    from torch import Tensor
 
 Array = NDArray[np.float32]
 Indices = NDArray[np.int32]
@@ -26,14 +27,14 @@ class SpikeList(NamedTuple):
     total: int  # number of spikes
 
 
-def to_maps(spikes: SpikeList, kind: type[np.generic] = np.float32) -> Tensor:
+def to_maps(spikes: SpikeList, kind: type[np.generic] = np.float32) -> "Tensor":
     """Spikes of 0 and 1 (R, C, H, W), channels last in memory."""
     maps = np.zeros((spikes.shape[0], spikes.shape[1] * spikes.shape[2] * spikes.shape[3]), kind)
     fill_spikes(spikes.indices, spikes.starts, maps)
     return channels_first(maps.reshape(spikes.shape))
 
 
-def to_list(maps: Tensor) -> SpikeList:
+def to_list(maps: "Tensor") -> SpikeList:
     """The spike list of maps (R, C, H, W); the inverse of `to_maps`."""
     rows = channels_last(maps)
     flat = rows.reshape(rows.shape[0], -1)
@@ -64,19 +65,21 @@ def output_shape(given: tuple[int, ...], weights: tuple[int, int], v: Array) -> 
     return maps, *shape
 
 
-def as_numpy(x: Tensor) -> NDArray[Any]:
+def as_numpy(x: "Tensor") -> NDArray[Any]:
     """The values of a tensor without its gradient. It is detached only where needed, because each call costs time."""
     values: NDArray[Any] = (x.detach() if x.requires_grad else x).numpy()
     return values
 
 
-def channels_last(maps: Tensor) -> NDArray[Any]:
+def channels_last(maps: "Tensor") -> NDArray[Any]:
     """Maps (R, C, H, W) as an array (R, H, W, C); no copy where they are channels last in memory."""
     return np.ascontiguousarray(as_numpy(maps).transpose(0, 2, 3, 1))
 
 
-def channels_first(cells: Array) -> Tensor:
+def channels_first(cells: Array) -> "Tensor":
     """An array (R, H, W, C) as a tensor (R, C, H, W) of the same memory; the inverse of `channels_last`."""
+    import torch
+
     return torch.from_numpy(cells.transpose(0, 3, 1, 2))
 
 
@@ -93,3 +96,12 @@ def fill_spikes(indices: Indices, starts: Indices, maps: NDArray[Any]) -> None: 
     for r in range(maps.shape[0]):
         for i in range(starts[r * cells], starts[(r + 1) * cells]):
             maps[r, indices[i]] = 1
+
+
+def in_groups(weight: NDArray[np.int8], group: int) -> NDArray[np.signedinteger[Any]]:
+    """Weights (3, 3, C, C') as (3, groups of channels, 3, C', group), flat: int8 for groups of four, int16 for two."""
+    inputs, outputs = weight.shape[2:]
+    groups = -(-inputs // group)
+    by_input = np.zeros((3, groups * group, 3, outputs), np.int8 if group == 4 else np.int16)
+    by_input[:, :inputs] = weight.transpose(0, 2, 1, 3)
+    return np.ascontiguousarray(by_input.reshape(3, groups, group, 3, outputs).transpose(0, 1, 3, 4, 2)).reshape(-1)

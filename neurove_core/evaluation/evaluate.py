@@ -19,7 +19,7 @@ from neurove_core.io.imu_feed import ImuFeed
 from neurove_core.io.packets import slices
 from neurove_core.io.recording import Recording
 from neurove_core.models.uncertainty import LEVEL, LEVELS, coverage
-from neurove_core.networks.kinds import State, fired
+from neurove_core.networks.arrays import ArrayState, State
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.errors import NeuroVEError
 from neurove_protocol.velocity import AXES, Source
@@ -149,15 +149,24 @@ class _FiringRate:
         self._spikes, self._neurons = dict[str, int](), dict[str, int]()
 
     def add(self, state: State) -> None:
-        for layer, spikes in fired(state).items():
+        for layer, spikes in _fired(state).items():
             self._spikes[layer] = self._spikes.get(layer, 0) + int(spikes.sum())
-            self._neurons[layer] = self._neurons.get(layer, 0) + spikes.numel()
+            self._neurons[layer] = self._neurons.get(layer, 0) + spikes.size
 
     def rates(self) -> dict[str, float]:
         if not self._spikes:
             return {}
         rates = {layer: spikes / self._neurons[layer] for layer, spikes in self._spikes.items()}
         return rates | {"all": sum(self._spikes.values()) / sum(self._neurons.values())}
+
+
+def _fired(state: State) -> dict[str, NDArray[np.bool_]]:
+    """Which neurons fired in the last step, by layer."""
+    if isinstance(state, ArrayState):
+        return state.fired()
+    from neurove_core.networks import kinds
+
+    return {layer: spikes.numpy() for layer, spikes in kinds.fired(state).items()}  # type: ignore[arg-type]  # of torch
 
 
 def evaluate(estimates: Estimates, truth: Twists) -> Evaluation:

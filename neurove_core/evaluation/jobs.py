@@ -1,9 +1,8 @@
 """The evaluation of one recording as a task for a pool; see `tasks`."""
 
 import functools
+import sys
 from typing import Literal, NamedTuple
-
-import torch
 
 from neurove_core.estimator import Estimator
 from neurove_core.evaluation.evaluate import Estimates, estimate_recording
@@ -29,7 +28,8 @@ class EvaluationJob(NamedTuple):
 
 def estimates_of(job: EvaluationJob) -> tuple[Estimates, list[str]]:
     """The estimates of a model for a recording, and what its reader could not read."""
-    torch.set_num_threads(1)
+    if "torch" in sys.modules:  # a worker is one core
+        sys.modules["torch"].set_num_threads(1)
     recording = with_lens(open_source(job.source, job.sensor, job.topic, job.time_unit), job.calibration, job.height_m)
     estimates = estimate_recording(_estimator(job.model, job.refine), recording, inertial=job.inertial)
     return estimates, [f"{recording.name}: {fault}" for fault in recording.faults.found]

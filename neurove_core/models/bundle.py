@@ -6,29 +6,37 @@ tensors for the architecture that the header declares, and that all values are f
 
 import hashlib
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final, Literal, Self
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, Final, Literal, Self, cast
 
-import safetensors.torch
-import torch
+import numpy as np
+import safetensors.numpy
+from numpy.typing import NDArray
 from pydantic import Field, ValidationError, ValidationInfo, field_validator
-from torch import Tensor, nn
 
 from neurove_core.config import Config, ModelConfig
+from neurove_core.extras import MissingExtra
 from neurove_core.files import allow_no_temporary_folder, read_whole, write_atomically
 from neurove_core.models import golden
 from neurove_core.models.bounds import Bounds
 from neurove_core.models.container import Data, object_without_duplicates, read_container, read_tensors
 from neurove_core.models.golden import Golden
+from neurove_core.models.lazy import NetworkField, TensorField, as_array
 from neurove_core.models.metadata import BundleLimits, Metadata
 from neurove_core.models.uncertainty import Uncertainty, why_no_correlation
-from neurove_core.networks import kinds
-from neurove_core.networks.kinds import Network
-from neurove_core.networks.neurove import NeuroVE
+from neurove_core.networks import arrays
+from neurove_core.networks.arrays import Weights
 from neurove_protocol.control import ModelInfo
 from neurove_protocol.errors import BadModel, shown
 from neurove_protocol.fields import WrongField
+
+if TYPE_CHECKING:  # a service loads no torch
+    from torch import Tensor
+
+    from neurove_core.networks.kinds import Network
 
 BUNDLE_VERSION: Final = 1
 SUFFIX = ".safetensors"
@@ -84,9 +92,9 @@ class Bundle:
     trained: bool
     provenance: str
     config: ModelConfig
-    network: Network
-    offset: Tensor  # (6): twist = network output * scale + offset, in linear_unit and rad/s
-    scale: Tensor  # (6)
+    network: "Network"  # or its Weights, and the next two as arrays: see lazy.py
+    offset: "Tensor"  # (6): twist = network output * scale + offset, in linear_unit and rad/s
+    scale: "Tensor"  # (6)
     linear_unit: LinearUnit = METRIC
     metadata: Metadata = field(default_factory=Metadata)
     golden: Golden | None = None  # None: the self-test has nothing to compare and passes
@@ -96,13 +104,12 @@ class Bundle:
     @property
     def info(self) -> ModelInfo:
         """What a node reports about this model."""
-        parameters = sum(parameter.numel() for parameter in self.network.parameters())
         return ModelInfo(
             name=self.name,
             digest=self.digest,
             trained=self.trained,
             provenance=self.provenance,
-            parameters=parameters,
+            parameters=self._parameters,
             release=self.release,
             figures=self.metadata.figures,
         )
@@ -122,6 +129,43 @@ class Bundle:
     def limits(self) -> BundleLimits:
         """Largest allowed differences from the model it replaces."""
         return self.metadata.limits or BundleLimits()
+
+    @property
+    def weights(self) -> Weights | None:
+        """The weights as they were read from a file; None for a network in memory, which somebody may change."""
+        stored = _NETWORK.stored(self)
+        return stored if isinstance(stored, Weights) else None
+
+    @property
+    def current_weights(self) -> Weights:
+        """The weights of a NeuroVE network as they are now; those of one in memory are copied."""
+        if (weights := self.weights) is not None:
+            return weights
+        tensors = {name: array.copy() for name, array in _stored(self).items()}
+        return Weights(self.config, tensors, spread="spread.weight" in tensors)
+
+    @property
+    def scaling(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Offset (6) and scale (6): twist = network output * scale + offset."""
+        offset, scale = (as_array(field.stored(self)).astype(np.float64) for field in (_BUNDLE_OFFSET, _BUNDLE_SCALE))
+        return offset, scale
+
+    @property
+    def weight_bytes(self) -> int:
+        """Size of the weights in memory [bytes]."""
+        if (weights := self.weights) is not None:
+            return sum(array.nbytes for array in weights.tensors.values())
+        from neurove_core.models.networks import bytes_of
+
+        return bytes_of(self.network)
+
+    @property
+    def _parameters(self) -> int:
+        if (weights := self.weights) is not None:
+            return weights.parameters
+        from neurove_core.models.networks import parameters_of
+
+        return parameters_of(self.network)
 
     def to_bytes(self) -> bytes:
         """The bundle as the bytes of its file."""
@@ -144,16 +188,22 @@ class Bundle:
             omitted["uncertainty"] = True
         else:  # what is not set is not stored, so that the bytes of older bundles stay the same
             omitted["uncertainty"] = {name for name, value in header.uncertainty if value is None}
-        tensors = {**_stored(self.network), _OFFSET: self.offset, _SCALE: self.scale}
+        offset, scale = (as_array(field.stored(self)) for field in (_BUNDLE_OFFSET, _BUNDLE_SCALE))
+        tensors = {**_stored(self), _OFFSET: offset, _SCALE: scale}
         if self.golden:
             tensors |= golden.to_tensors(self.golden)
         if self.uncertainty is not None:
-            tensors[_CORRELATION] = self.uncertainty.correlation
-        return safetensors.torch.save(tensors, {_KEY: header.model_dump_json(exclude=omitted)})
+            tensors[_CORRELATION] = self.uncertainty.matrix
+        tensors = {key: np.asarray(array, order="C") for key, array in tensors.items()}
+        return safetensors.numpy.save(tensors, {_KEY: header.model_dump_json(exclude=omitted)})
 
     def with_digest(self) -> Self:
         """This bundle with its digest computed."""
         return replace(self, digest=hashlib.sha256(self.to_bytes()).hexdigest())
+
+
+_NETWORK = NetworkField(Bundle, "network")
+_BUNDLE_OFFSET, _BUNDLE_SCALE = TensorField(Bundle, "offset"), TensorField(Bundle, "scale")
 
 
 def save(bundle: Bundle, path: Path) -> None:
@@ -191,26 +241,23 @@ def from_bytes(data: Data, name: str) -> Bundle:
     header = read_header(data, name)
     tensors = read_tensors(data, name)
     test = golden.from_tensors(tensors, header.config, header.golden_tolerance, name)
-    with torch.device("meta"):  # shapes without memory: a small header may declare terabytes of weights
-        wanted = {**_stored(_network(header)), _OFFSET: torch.zeros(6), _SCALE: torch.ones(6)}
-        if header.uncertainty is not None:
-            wanted[_CORRELATION] = torch.zeros(6, 6)  # not torch.eye: on this device it imports 800 modules
+    wanted = {**_shapes(header), _OFFSET: (6,), _SCALE: (6,)}
+    if header.uncertainty is not None:
+        wanted[_CORRELATION] = (6, 6)
     _check_tensors(tensors, wanted, name)
-    network = _network(header)
-    # cloned, because the tensors are views of the whole file
-    offset, scale, correlation = (tensors.pop(key).clone() if key in tensors else None for key in _SMALL)
+    # copied, because the arrays are views of the whole file
+    offset, scale, correlation = (tensors.pop(key).copy() if key in tensors else None for key in _SMALL)
     assert offset is not None
     assert scale is not None
     uncertainty = _uncertainty(header.uncertainty, correlation, name)
-    network.load_state_dict(tensors, strict=False)  # names are checked; only the norms' batch counters are not stored
     return Bundle(
         name=header.name,
         trained=header.trained,
         provenance=header.provenance,
         config=header.config,
-        network=network.eval(),
-        offset=offset,
-        scale=scale,
+        network=cast("Network", Weights(header.config, tensors, spread=header.uncertainty is not None)),
+        offset=cast("Tensor", offset),
+        scale=cast("Tensor", scale),
         linear_unit=header.linear_unit,
         metadata=Metadata(**{name: getattr(header, name) for name in Metadata.model_fields}),
         golden=test,
@@ -259,51 +306,52 @@ def untrained(seed: int = 0, config: ModelConfig | None = None, name: str = "unt
         seed: of the weights.
         config: of the model; the default is ModelConfig().
         name: of the model.
+
+    Raises:
+        MissingExtra: torch is not installed.
     """
+    networks = _networks()
     config = config or ModelConfig()
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        network = kinds.make(config)
-        shape = (8, 4, *config.input_shape)
-        _take_statistics(network, torch.poisson(torch.full(shape, 0.3)).log1p())
     return Bundle(
         name=name,
         trained=False,
-        provenance=f"random weights, neurove_core.models.bundle.untrained(seed={seed}), torch {torch.__version__}",
+        provenance=f"random weights, neurove_core.models.bundle.untrained(seed={seed}), torch {networks.VERSION}",
         config=config,
-        network=network.eval(),
-        offset=torch.zeros(6),
-        scale=torch.ones(6),
+        network=networks.with_random_weights(seed, config),
+        offset=cast("Tensor", np.zeros(6, np.float32)),
+        scale=cast("Tensor", np.ones(6, np.float32)),
     ).with_digest()
 
 
-def _take_statistics(network: Network, spikes: Tensor) -> None:
-    momenta = {
-        layer: layer.momentum for layer in network.modules() if isinstance(layer, nn.BatchNorm1d | nn.BatchNorm2d)
-    }
-    for norm in momenta:
-        norm.momentum = 1.0  # with less, few batches hardly move the running mean, and nothing fires
-    with torch.no_grad():
-        network.train()(spikes, network.initial_state(spikes.shape[1]))
-    for norm, momentum in momenta.items():
-        norm.momentum = momentum
+def _shapes(header: Header) -> dict[str, tuple[int, ...]]:
+    spread = header.uncertainty is not None
+    if header.config.kind == "neurove":
+        return arrays.shapes(header.config, spread=spread)
+    found: dict[str, tuple[int, ...]] = _networks().shapes(header.config, spread=spread)  # baselines run in torch alone
+    return found
 
 
-def _network(header: Header) -> Network:
-    network = kinds.make(header.config)
-    if header.uncertainty is not None and isinstance(network, NeuroVE):
-        network.add_spread()
-    return network
+def _networks() -> ModuleType:
+    """The module that needs torch."""
+    try:
+        from neurove_core.models import networks
+    except ImportError as error:
+        if error.name != "torch":
+            raise
+        raise MissingExtra("torch", "train") from None
+    return networks
 
 
-def _uncertainty(header: UncertaintyHeader | None, correlation: Tensor | None, name: str) -> Uncertainty | None:
+def _uncertainty(
+    header: UncertaintyHeader | None, correlation: NDArray[np.float32] | None, name: str
+) -> Uncertainty | None:
     if header is None or correlation is None:
         return None
     why = why_no_correlation(correlation)
     if why:
         raise BadModel(name, f"tensor {_CORRELATION!r} {why}")
     bounds = Bounds(header.uncertain_m_s, header.uncertain_rad_s)
-    return Uncertainty(correlation, header.uncertain_above, header.provenance, bounds)
+    return Uncertainty(cast("Tensor", correlation), header.uncertain_above, header.provenance, bounds)
 
 
 def _header_of(found: Uncertainty) -> UncertaintyHeader:
@@ -315,21 +363,20 @@ def _header_of(found: Uncertainty) -> UncertaintyHeader:
     )
 
 
-def _stored(network: Network) -> dict[str, Tensor]:
-    return {
-        name: tensor.contiguous()
-        for name, tensor in network.state_dict().items()
-        if not name.endswith("num_batches_tracked")
-    }
+def _stored(model: Bundle) -> Mapping[str, NDArray[Any]]:
+    if model.weights is not None:
+        return model.weights.tensors
+    from neurove_core.models.networks import arrays_of
+
+    return arrays_of(model.network)
 
 
-def _check_tensors(tensors: dict[str, Tensor], wanted: dict[str, Tensor], name: str) -> None:
+def _check_tensors(tensors: dict[str, NDArray[Any]], wanted: dict[str, tuple[int, ...]], name: str) -> None:
     for key in sorted(wanted.keys() ^ tensors.keys()):
         raise BadModel(name, f"tensor {key!r} is {'missing' if key in wanted else 'not one of this architecture'}")
     for key, tensor in tensors.items():
-        want = wanted[key]
-        if tensor.shape != want.shape or tensor.dtype != want.dtype:
-            got, needs = f"{tensor.dtype} {tuple(tensor.shape)}", f"{want.dtype} {tuple(want.shape)}"
+        if tensor.shape != wanted[key] or tensor.dtype != np.float32:
+            got, needs = f"{tensor.dtype} {tensor.shape}", f"float32 {wanted[key]}"
             raise BadModel(name, f"tensor {key!r} is {got}, its header's architecture needs {needs}")
-        if not bool(torch.isfinite(tensor).all()):
+        if not bool(np.isfinite(tensor).all()):
             raise BadModel(name, f"tensor {key!r} holds values that are not finite")

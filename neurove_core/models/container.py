@@ -11,8 +11,7 @@ import struct
 from typing import Any, Final, NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
+from numpy.typing import NDArray
 
 from neurove_core.files import pointer_fault
 from neurove_protocol.errors import BadModel, shown
@@ -73,8 +72,8 @@ def read_container(data: Data, name: str) -> Container:
     return Container(entries, 8 + length)
 
 
-def read_tensors(data: Data, name: str) -> dict[str, Tensor]:
-    """All tensors of a safetensors file, as views of its bytes; bytes that cannot be written to are copied once.
+def read_tensors(data: Data, name: str) -> dict[str, NDArray[Any]]:
+    """All tensors of a safetensors file as arrays, views of its bytes; bytes that are read-only are copied once.
 
     Raises:
         BadModel: as `read_container`; a tensor has an unknown type, a size that does not match its bytes, or the
@@ -93,8 +92,7 @@ def read_tensors(data: Data, name: str) -> dict[str, Tensor]:
         if end > len(view):
             raise _incomplete(name, f"incomplete: tensor {shown(key)} ends at byte {end}, the file has {len(view)}")
         kind, shape = container.entries[key]["dtype"], container.entries[key]["shape"]
-        array = np.frombuffer(view[end - size : end], _TYPES[kind]).reshape(shape)
-        tensors[key] = torch.from_numpy(array)
+        tensors[key] = np.frombuffer(view[end - size : end], _TYPES[kind]).reshape(shape)
     if end != len(view):
         raise _incomplete(name, f"its tensors end at byte {end}, the file has {len(view)}")
     return tensors

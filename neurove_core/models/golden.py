@@ -1,15 +1,13 @@
 """The stored golden test of a model: windows in its bundle, and the twists that its maker's machine computed for them.
 
-The digest of a bundle proves that the bytes are unchanged. The golden test shows that this machine, this torch and this
+The digest of a bundle proves that the bytes are unchanged. The golden test shows that this machine and this
 version of the program compute the same twists as the maker's. `neurove_core.self_test` records and runs it.
 """
 
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from neurove_core.config import ModelConfig
 from neurove_protocol.errors import BadModel
@@ -34,7 +32,7 @@ class Golden(NamedTuple):
     tolerance: float = TOLERANCE  # largest error of an axis, as a fraction of the bundle's scale of that axis
 
 
-def to_tensors(golden: Golden) -> dict[str, Tensor]:
+def to_tensors(golden: Golden) -> dict[str, NDArray[Any]]:
     """Store a golden test as tensors of a bundle. Most cells have no events and take one bit each.
 
     `golden.seen` has one bit per cell of (T, 2n, H, W), most significant bit first; it is 1 where there were events.
@@ -42,9 +40,9 @@ def to_tensors(golden: Golden) -> dict[str, Tensor]:
     """
     flat = golden.counts.reshape(-1)
     return {
-        _SEEN: torch.from_numpy(np.packbits(flat != 0)),
-        _COUNTS: torch.from_numpy(flat[flat != 0]),
-        _TWISTS: torch.from_numpy(np.ascontiguousarray(golden.twists)),
+        _SEEN: np.packbits(flat != 0),
+        _COUNTS: flat[flat != 0],
+        _TWISTS: np.ascontiguousarray(golden.twists),
     }
 
 
@@ -53,7 +51,9 @@ def stored_bytes(counts: NDArray[np.uint8]) -> int:
     return (counts.size + 7) // 8 + int(np.count_nonzero(counts))
 
 
-def from_tensors(tensors: dict[str, Tensor], config: ModelConfig, tolerance: float | None, name: str) -> Golden | None:
+def from_tensors(
+    tensors: dict[str, NDArray[Any]], config: ModelConfig, tolerance: float | None, name: str
+) -> Golden | None:
     """Take the golden test out of a bundle's tensors; None if it has no golden test.
 
     Args:
@@ -74,26 +74,28 @@ def from_tensors(tensors: dict[str, Tensor], config: ModelConfig, tolerance: flo
     if tolerance is None:
         raise BadModel(name, "header field golden_tolerance=missing: the bundle has the tensors of a golden test")
     twists, grid = found[_TWISTS], config.window_shape
-    windows = len(twists) if twists.dim() else 0
+    windows = len(twists) if twists.ndim else 0
     cells = windows * int(np.prod(grid))
     if not 0 < cells <= MAX_CELLS:
         raise BadModel(name, f"golden test of {windows} windows: {cells} cells, allowed are 1 to {MAX_CELLS}")
-    _require(found, _TWISTS, torch.float32, (windows, config.window.bins, 6), name)
-    if not bool(torch.isfinite(twists).all()):
+    _require(found, _TWISTS, np.float32, (windows, config.window.bins, 6), name)
+    if not bool(np.isfinite(twists).all()):
         raise BadModel(name, f"tensor {_TWISTS!r} holds values that are not finite")
-    _require(found, _SEEN, torch.uint8, ((cells + 7) // 8,), name)
-    seen = np.unpackbits(found[_SEEN].numpy())
-    _require(found, _COUNTS, torch.uint8, (int(seen.sum()),), name)
-    counts = found[_COUNTS].numpy()
+    _require(found, _SEEN, np.uint8, ((cells + 7) // 8,), name)
+    seen = np.unpackbits(found[_SEEN])
+    _require(found, _COUNTS, np.uint8, (int(seen.sum()),), name)
+    counts = found[_COUNTS]
     if seen[cells:].any() or not counts.all():
         raise BadModel(name, "golden test: a count is 0, or a bit after the last cell is set")
     flat = np.zeros(cells, np.uint8)
     flat[seen[:cells] != 0] = counts
-    return Golden(flat.reshape(windows, *grid), twists.numpy().copy(), tolerance)
+    return Golden(flat.reshape(windows, *grid), twists.copy(), tolerance)
 
 
-def _require(found: dict[str, Tensor], key: str, dtype: torch.dtype, shape: tuple[int, ...], name: str) -> None:
+def _require(
+    found: dict[str, NDArray[Any]], key: str, dtype: type[np.generic], shape: tuple[int, ...], name: str
+) -> None:
     tensor = found[key]
-    if tensor.dtype != dtype or tuple(tensor.shape) != shape:
-        got = f"{tensor.dtype} {tuple(tensor.shape)}"
-        raise BadModel(name, f"tensor {key!r} is {got}, this golden test needs {dtype} {shape}")
+    if tensor.dtype != dtype or tensor.shape != shape:
+        got = f"{tensor.dtype} {tensor.shape}"
+        raise BadModel(name, f"tensor {key!r} is {got}, this golden test needs {np.dtype(dtype)} {shape}")

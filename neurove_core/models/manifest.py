@@ -11,19 +11,19 @@ import hashlib
 import json
 from collections.abc import Iterable
 from datetime import UTC, datetime
-from typing import Annotated, Any, Final, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar
 
-from cryptography.exceptions import InvalidSignature
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 from pydantic import ConfigDict, Field, ValidationError
 
 from neurove_core.config import Config
 from neurove_core.models.bundle import MAX_BYTES, Header, read_header
 from neurove_core.models.container import Data, object_without_duplicates
 from neurove_core.models.metadata import MAX_RELEASE
-from neurove_core.models.signing_keys import key_id
 from neurove_protocol.errors import Downgrade, InvalidField, Untrusted, shown
 from neurove_protocol.fields import WrongField
+
+if TYPE_CHECKING:  # imported where a signature is made or checked: a node without trusted keys saves 6 MB
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
 
 SUFFIX: Final = ".sig"
 """Appended to the full file name of the bundle."""
@@ -60,7 +60,7 @@ class _File(_Strict):
 
 def sign(
     data: Data,
-    key: Ed25519PrivateKey,
+    key: "Ed25519PrivateKey",
     *,
     release: int | None = None,
     allow_downgrade: bool = False,
@@ -80,6 +80,8 @@ def sign(
     Raises:
         BadModel: the bytes are not a bundle. InvalidField: the release is out of bounds.
     """
+    from neurove_core.models.signing_keys import key_id
+
     header = read_header(data, name)
     release = header.release if release is None else release
     if not 0 <= release <= MAX_RELEASE:
@@ -99,7 +101,7 @@ def sign(
     return canonical(_File(manifest=text, signature=signature, key_id=made.key_id).model_dump()).encode() + b"\n"
 
 
-def verify(data: Data, signature: bytes, trusted: Iterable[Ed25519PublicKey], name: str = "bundle") -> Signed:
+def verify(data: Data, signature: bytes, trusted: Iterable["Ed25519PublicKey"], name: str = "bundle") -> Signed:
     """Verify a bundle's signature: the manifest that a trusted key signed.
 
     The bundle's content is parsed only after the signature, size and digest have been verified.
@@ -115,6 +117,8 @@ def verify(data: Data, signature: bytes, trusted: Iterable[Ed25519PublicKey], na
             `manifest`.
         BadModel: the signed bytes are not a bundle.
     """
+    from neurove_core.models.signing_keys import key_id
+
     file = _file(signature, name)
     text = file.manifest.encode()
     keys = list(trusted)
@@ -194,7 +198,9 @@ def _manifest(file: _File, name: str) -> Signed:
     return signed
 
 
-def _signed_by(key: Ed25519PublicKey, file: _File, text: bytes, name: str) -> bool:
+def _signed_by(key: "Ed25519PublicKey", file: _File, text: bytes, name: str) -> bool:
+    from cryptography.exceptions import InvalidSignature
+
     try:
         key.verify(base64.b64decode(file.signature, validate=True), text)
     except InvalidSignature:

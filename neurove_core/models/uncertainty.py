@@ -6,14 +6,16 @@ this sigma has the same 90 % interval. The true errors have heavier tails and a 
 
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from neurove_core.models.bounds import DEFAULT, UNSET, Bounds
+from neurove_core.models.lazy import TensorField, as_array
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 LEVEL: Final = 0.9
 """The share of errors that the calibration places within their intervals."""
@@ -38,15 +40,20 @@ class Uncertainty:
         bounds: absolute bounds of sigma; those of bounds.DEFAULT where they are not set.
     """
 
-    correlation: Tensor
+    correlation: "Tensor"  # given as such or as an array, see lazy.py
     uncertain_above: float
     provenance: str
     bounds: Bounds = UNSET
 
+    @property
+    def matrix(self) -> NDArray[np.float32]:
+        """The correlation as an array."""
+        return as_array(_CORRELATION.stored(self))
+
     def covariance(self, log_sigma: Array, scale: Array) -> Array:
         """D R D (6, 6) for log sigma (6) in units of the scale (6), in the scale's units squared."""
         sigma = np.exp(np.clip(log_sigma, -_MAX_LOG, _MAX_LOG)) * scale
-        covariance: Array = self.correlation.double().numpy() * np.outer(sigma, sigma)
+        covariance: Array = self.matrix.astype(np.float64) * np.outer(sigma, sigma)
         return (covariance + covariance.T) / 2  # symmetric to the last bit, as the wire format requires
 
     def is_uncertain(self, twists: Array, covariance: Array, node: Bounds = UNSET) -> bool:
@@ -71,13 +78,16 @@ class Uncertainty:
         return False
 
 
-def why_no_correlation(matrix: Tensor) -> str | None:
+_CORRELATION = TensorField(Uncertainty, "correlation")
+
+
+def why_no_correlation(matrix: NDArray[np.float32]) -> str | None:
     """Why a finite matrix (6, 6) is not a correlation matrix; None if it is one."""
-    if not torch.equal(matrix, matrix.T):
+    if not np.array_equal(matrix, matrix.T):
         return "is not symmetric"
-    if not torch.equal(torch.diagonal(matrix), torch.ones(len(matrix))):
+    if not (np.diagonal(matrix) == 1).all():
         return "has a diagonal that is not 1"
-    least = float(torch.linalg.eigvalsh(matrix.double())[0])
+    least = float(np.linalg.eigvalsh(matrix.astype(np.float64))[0])
     return None if least >= _LEAST_EIGENVALUE else f"is not positive definite: its least eigenvalue is {least:.3g}"
 
 

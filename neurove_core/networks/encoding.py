@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from neurove_core.compiled import compiled
+from neurove_core.networks import tables
 
 
 def to_spikes(counts: Tensor, encoding: str) -> Tensor:
@@ -55,5 +56,5 @@ def _encode(
                 spikes[row, cell, channel] = table[planes[row, channel, cell]]
 
 
-LOG1P = torch.log1p(torch.arange(256, dtype=torch.float32))
-BINARY = (torch.arange(256) > 0).to(torch.float32)
+LOG1P = torch.from_numpy(tables.of_encoding("log1p"))
+BINARY = torch.from_numpy(tables.of_encoding("binary"))

@@ -1,15 +1,11 @@
 """Rounding of weights and input to 8 bits, for networks with precision int8 (decision 38)."""
 
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-LEVELS: Final = 32
-"""Steps of the input per unit; log1p of a saturated count, 5.5, becomes 177."""
-
-MAX_WEIGHT: Final = 127
-"""Largest absolute value of a rounded weight, in steps."""
+from neurove_core.networks.tables import LEVELS, MAX_WEIGHT
 
 
 class Quantised(NamedTuple):

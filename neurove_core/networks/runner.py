@@ -1,7 +1,6 @@
-"""Runner: what an Estimator needs of a network. Its counts of one window per stream in, twists and next states out."""
+"""The plain Runner: the network itself, in torch."""
 
 from collections.abc import Sequence
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -10,23 +9,7 @@ from torch import Tensor
 
 from neurove_core.networks.encoding import to_spikes
 from neurove_core.networks.kinds import Network, State
-
-
-class Runner(Protocol):
-    """Encodes windows and runs a network on them. It holds no stream's state and is safe to share between threads."""
-
-    def run(
-        self, counts: Sequence[NDArray[np.uint8]], states: Sequence[State]
-    ) -> list[tuple[NDArray[np.float64], State]]:
-        """One window of each of B streams.
-
-        Args:
-            counts: B windows, each (C, H, W) event counts; see ModelConfig.input_shape.
-            states: the state of each stream, for a batch of one.
-
-        Returns:
-            for each stream its twists (n, 6) in scaled units, and its next state.
-        """
+from neurove_core.networks.neurove import NetworkState, NeuroVE
 
 
 class PlainRunner:
@@ -40,6 +23,14 @@ class PlainRunner:
         self._network = network
         self._encoding = network.config.network.encoding
 
+    def initial_state(self) -> State:
+        """The zero state of one stream."""
+        return self._network.initial_state()
+
+    def log_sigma(self, state: State) -> NDArray[np.float64] | None:
+        """Log sigma (6) of the window that led to a state; None without a spread."""
+        return log_sigma_of(self._network, state)
+
     @torch.inference_mode()
     def run(
         self, counts: Sequence[NDArray[np.uint8]], states: Sequence[State]
@@ -48,6 +39,14 @@ class PlainRunner:
         spikes = to_spikes(batch_of(counts), self._encoding)
         answers = [self._network(spikes[:, b : b + 1], state) for b, state in enumerate(states)]
         return [(twists[0, 0].double().numpy(), state) for twists, state in answers]
+
+
+def log_sigma_of(network: Network, state: State) -> NDArray[np.float64] | None:
+    """Log sigma (6) of the window that led to a state; None without a spread."""
+    if not isinstance(network, NeuroVE) or not isinstance(state, NetworkState):
+        return None
+    found = network.log_sigma(state)
+    return None if found is None else found[0].double().numpy()
 
 
 def batch_of(counts: Sequence[NDArray[np.uint8]]) -> Tensor:

@@ -141,6 +141,7 @@ class Given(NamedTuple):
     low_activity: bool
     before: Filter | None
     height_m: float = 1.0  # of the camera, or what the linear part assumes
+    knows_height: bool = True  # whether it is that of the camera
 
 
 class Refined(NamedTuple):

@@ -52,8 +52,8 @@ MOVES: Final = 20
 MIN_SHARE: Final = 0.4
 """Least velocity over depth against the angular velocity; with less, the camera turns only."""
 
-MAX_TURN_RAD_S: Final = 1.0
-"""A faster turn is left to `rotation`."""
+MAX_TURN_RAD_S: Final = 0.3
+"""A faster turn is left to `rotation`, which is exact for a hand that waves."""
 
 MAX_WAIT: Final = 6
 """Windows without a search after which the scene is forgotten."""

@@ -1,8 +1,10 @@
 """Stages of the refinement before that of the ground: the rotation, and the motion in a scene with depth.
 
 `rotation` is exact where the camera turns and translates little, `scene` where translation counts. Both run, until the
-scene shows a camera that translates; then its motion is the answer, and the rotation is searched only where it is not
-accepted. A camera that the network certainly sees move fast is a vehicle, which is left to the ground.
+scene shows a camera that translates, in two windows in a row where the rotation is accepted; then its motion is the
+answer, and the rotation is searched only where it is not accepted. A camera that the network certainly sees move fast
+is a vehicle, which is left to the ground. No scene begins where the rotation finds nothing that moves. Without a known
+height, a scene is searched for only where the parts of the image disagree about the rotation.
 """
 
 from typing import Final, NamedTuple
@@ -10,8 +12,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.refine import rotation, scene
-from neurove_core.refine.rotation import MIN_SPREAD, Filter, Given, Rate, Refined, drives, floored, spread
+from neurove_core.refine import rotation, scene, search
+from neurove_core.refine.alignment import Grid
+from neurove_core.refine.rotation import MAX_AGAINST, MIN_SPREAD, Filter, Given, Rate, Refined, drives, floored, spread
 from neurove_core.refine.scene import Moved, Scene
 
 Array = NDArray[np.float64]
@@ -28,8 +31,11 @@ MAX_ASIDE: Final = 0.7
 ASIDE: Final = 100
 """Windows for which a camera that moved aside is on no vehicle."""
 
-SEARCH_EVERY: Final = 2
-"""While nothing moves in the scene, only each second window is searched for it."""
+SEARCH_EVERY: Final = 4
+"""While no motion in a scene is accepted, only each fourth window is searched for it."""
+
+PATIENCE: Final = 5
+"""Windows without an accepted motion in which each one is still searched."""
 
 _CHANGE_GAIN: Final = 0.8  # of the change within a window over that since the window before
 _DEPTH_ERROR: Final = 0.1  # error of the angular velocity by the velocity over depth
@@ -48,6 +54,8 @@ class State(NamedTuple):
     filter: Filter | None = None  # of the rotation
     scene: Scene | None = None
     aside: int = 0  # windows for which the camera is on no vehicle
+    idle: int = PATIENCE  # windows since a motion in the scene was accepted
+    again: bool = False  # whether to look at the scene once more before it outweighs a rotation
 
 
 class Stages(NamedTuple):
@@ -63,20 +71,40 @@ def refine(given: Given, state: State) -> Stages:
     """Refine the motion of a window by its events; `given.before` is not used."""
     given = given._replace(before=state.filter)
     before, turn = state.scene, None
-    found = None if before is None or not before.moves else _in_scene(given, before, None)
+    found = None
+    if given.knows_height and before is not None and before.moves and state.idle < PATIENCE:
+        found = _in_scene(given, before, None)
     if found is None or found.outcome != "accepted":
         turn = rotation.refine(given)
-        due = given.start_us // given.window_us % SEARCH_EVERY == 0 or (before is not None and before.seen)
-        due = due or turn.outcome == "disagreeing"  # as a scene with depth is, to a search with one
-        if found is None and due and turn.motion is not None:
+        if found is None and turn.motion is not None and _is_due(given, state, turn):
             found = _in_scene(given, before, turn.motion)
     scene, aside = before if found is None else found.scene, max(state.aside - 1, 0)
-    if found is not None and found.outcome == "accepted":
+    moved = found is not None and found.outcome == "accepted"
+    again = moved and turn is not None and turn.outcome == "accepted" and state.idle >= PATIENCE and not state.again
+    if found is not None and moved and not again:
         aside = ASIDE if _is_aside(found) else aside
         turn = _turn(given, found, before)
-        return Stages(turn, _velocity(given, found), aside == 0, State(turn.filter, scene, aside))
+        return Stages(turn, _velocity(given, found), aside == 0, State(turn.filter, scene, aside, 0))
     assert turn is not None  # the rotation was searched
-    return Stages(turn, None, aside == 0, State(turn.filter, scene, aside))
+    idle = min(state.idle + 1, PATIENCE)
+    return Stages(turn, None, aside == 0, State(turn.filter, scene, aside, idle, again))
+
+
+def compile_kernels(grid: Grid) -> None:
+    """Compile all code of these stages, so that the first window does not wait for it."""
+    search.compile_kernels(grid)
+    scene.compile_kernels(grid)
+
+
+def _is_due(given: Given, state: State, turn: Refined) -> bool:
+    """Whether to search a window for a scene after its rotation."""
+    moves = state.scene is not None and state.scene.moves > 0
+    if turn.outcome == "disagreeing" and not (moves and state.idle >= PATIENCE):
+        return True  # a scene with depth disagrees with a search for one depth
+    if not given.knows_height or turn.outcome == "still":
+        return False
+    first = state.scene is not None and state.scene.seen and not moves  # seen once, to be seen again
+    return first or state.again or given.start_us // given.window_us % SEARCH_EVERY == 0
 
 
 def _in_scene(given: Given, before: Scene | None, guess: Array | None) -> Moved | None:
@@ -103,7 +131,7 @@ def _turn(given: Given, found: Moved, before: Scene | None) -> Refined:
     follows = before is not None and before.end_us == given.start_us
     change = _CHANGE_GAIN * (found.w_rad_s - before.mean[:3]) if before is not None and follows else np.zeros(3)
     covariance = found.covariance[:3, :3] + np.eye(3) * (_DEPTH_ERROR * float(np.linalg.norm(found.shift))) ** 2
-    filtered = Filter(motion, found.covariance, end_us)
+    filtered = Filter(motion, found.covariance, end_us, MAX_AGAINST)  # it outweighs no network
     rate = Rate(found.w_rad_s, covariance)
     return Refined(rate, "accepted", filtered, change, np.sqrt(np.diagonal(covariance)), motion=motion)
 

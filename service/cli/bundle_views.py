@@ -14,9 +14,9 @@ def fields(found: "Bundle", data: bytes) -> dict[str, Any]:
         found: the bundle.
         data: the bytes that it was read from.
     """
-    import safetensors.torch
+    import safetensors.numpy
 
-    tensors = safetensors.torch.load(data)
+    tensors = safetensors.numpy.load(data)
     return {
         **found.info.model_dump(),
         "size": len(data),
@@ -26,7 +26,7 @@ def fields(found: "Bundle", data: bytes) -> dict[str, Any]:
         "config": found.config.model_dump(mode="json"),
         "golden": found.golden and {"windows": len(found.golden.counts), "tolerance": found.golden.tolerance},
         "tensors": {
-            name: {"dtype": str(one.dtype).removeprefix("torch."), "shape": list(one.shape), "bytes": one.nbytes}
+            name: {"dtype": str(one.dtype), "shape": list(one.shape), "bytes": one.nbytes}
             for name, one in sorted(tensors.items())
         },
     }

@@ -27,6 +27,7 @@ from neurove_service.cli.arguments import (
     tell_faults,
 )
 from neurove_service.cli.bars import event_count
+from neurove_service.cli.extras import one_thread
 
 if TYPE_CHECKING:
     from neurove_core.estimator import Estimator
@@ -149,8 +150,6 @@ def _packets(
 
 def estimate(args: argparse.Namespace) -> int:
     """Write the estimates of a recording to a file, as the service would give them."""
-    import torch
-
     from neurove_core import models
     from neurove_core.estimator import Estimator
     from neurove_core.io.axes import with_axes
@@ -167,7 +166,7 @@ def estimate(args: argparse.Namespace) -> int:
         raise InvalidField("estimate", "RECORDING", args.source, "it never ends: give --seconds S")
     refuse_existing("estimate", "--out", path, args.source, force=args.force)
     camera = lens_of(recording, args.calibration, args.height)
-    torch.set_num_threads(1)
+    one_thread()
     estimator = Estimator(models.find(args.model), refine=args.refine == "auto")
     offline = Offline(estimator, camera, getattr(recording, "stream", _STREAM))
     told = _Told(estimator, recording)

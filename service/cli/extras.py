@@ -1,16 +1,17 @@
 """The extras of the package, and the libraries that only they install."""
 
-import importlib.util
+import os
+import sys
 from typing import Final
 
-from neurove_core.extras import MissingExtra
+from neurove_core.extras import MissingExtra, installed
 
 EXTRAS: Final[dict[str, tuple[str, ...]]] = {
-    "serve": ("cryptography", "numba", "safetensors", "torch"),
+    "serve": ("cryptography", "numba", "safetensors"),
     "recordings": ("h5py", "hdf5plugin", "lz4", "mcap", "numba", "PIL", "rosbags", "ruamel", "scipy", "zstandard"),
-    "train": ("matplotlib", "tensorboard"),
-    "experiments": ("matplotlib", "scipy"),
-    "bench": ("dv_processing", "faery", "loguru", "snntorch", "tonic"),
+    "train": ("matplotlib", "tensorboard", "torch"),
+    "experiments": ("matplotlib", "scipy", "torch"),
+    "bench": ("dv_processing", "faery", "loguru", "snntorch", "tonic", "torch"),
     "carla": ("carla",),
     "camera": ("dv_processing", "neuromorphic_drivers"),
     "metrics": ("prometheus_client",),
@@ -47,14 +48,15 @@ def missing_extra(error: ModuleNotFoundError, usual: str) -> MissingExtra | None
     return MissingExtra(module, having[0])
 
 
+def one_thread() -> None:
+    """Let torch compute in one thread, whether it is loaded already or later; a service may run without it."""
+    if (torch := sys.modules.get("torch")) is not None:
+        torch.set_num_threads(1)
+    else:
+        os.environ["OMP_NUM_THREADS"] = "1"
+
+
 def absent(extra: str) -> list[str]:
     """Modules of an extra, and of the extras that it includes, that are not installed."""
     modules = [module for name in (*_DEPENDS.get(extra, ()), extra) for module in EXTRAS[name]]
-    return [module for module in dict.fromkeys(modules) if not _installed(module)]
-
-
-def _installed(module: str) -> bool:
-    try:
-        return importlib.util.find_spec(module) is not None
-    except (ImportError, ValueError):  # hidden from import, as tests do
-        return False
+    return [module for module in dict.fromkeys(modules) if not installed(module)]

@@ -79,18 +79,17 @@ def check_engine() -> Check:
     if missing := absent("serve"):
         return Check("fast path", f"unknown: {', '.join(missing)} not installed", "info")
     from neurove_core import models
-    from neurove_core.engine.engine import Engine
+    from neurove_core.engine.array_runner import ArrayRunner
     from neurove_core.engine.vectors import has_byte_products
-    from neurove_core.networks.neurove import NeuroVE
 
-    network = models.find(models.DEFAULT).network
-    if not isinstance(network, NeuroVE):
+    weights = models.find(models.DEFAULT).weights
+    if weights is None:
         return Check("fast path", "none: the built-in model is no NeuroVE network", "info")
-    precision = network.config.network.precision
+    precision = weights.config.network.precision
     int8 = f"int8 models {'with' if has_byte_products() else 'without'} VNNI"
     if precision == "int8":
         return Check("fast path", int8, "ok")
-    if Engine(network).reads_counts:
+    if ArrayRunner(weights).is_compiled:
         return Check("fast path", f"sparse {precision}; {int8}", "ok")
     return Check("fast path", f"dense {precision}: the sparse form does not work here", "bad", "see the warning above")
 

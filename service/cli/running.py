@@ -29,6 +29,7 @@ from neurove_service.cli.arguments import (
     subcommand,
     tell_faults,
 )
+from neurove_service.cli.extras import one_thread
 from neurove_service.cli.parser import Parser
 from neurove_service.cli.waiting import Wait, add_wait
 from neurove_service.config import ClientConfig, ServiceConfig, load
@@ -53,18 +54,16 @@ def serve(args: argparse.Namespace) -> int:
     config = read()
     logs.configure(config.log_level)
     check_limits()
-
-    import torch
+    one_thread()
 
     from neurove_service.node.app import Service
     from neurove_service.node.reload import Reload
 
-    torch.set_num_threads(1)
     sys.setswitchinterval(0.0005)  # Zenoh's threads wait for ours: the default of 5 ms is a packet's period
     service = Service(config, stop)
     reloads.append(Reload(config, read, service.available))
     gc.collect()
-    gc.freeze()  # the collector would traverse all of torch at each run, with all threads stopped
+    gc.freeze()  # the collector would traverse all libraries at each run, with all threads stopped
     service.run()
     gc.freeze()  # again before the exit, which otherwise takes up to 2 s on a busy machine
     return 0

@@ -21,6 +21,7 @@ from neurove_service.cli.arguments import (
     tell_faults,
 )
 from neurove_service.cli.bars import event_count, progress
+from neurove_service.cli.extras import one_thread
 from neurove_service.cli.pools import add_pool_flags, pool_of
 from neurove_service.lifecycle import end_with_parent
 
@@ -137,8 +138,6 @@ def calibrate(args: argparse.Namespace) -> int:
 
 def evaluate(args: argparse.Namespace) -> int:
     """Compare a model's estimates with the truth: RMSE and RE as in the paper, per axis and per recording."""
-    import torch
-
     from neurove_core import models
     from neurove_core.estimator import Estimator
     from neurove_core.evaluation import evaluate as evaluation
@@ -147,7 +146,7 @@ def evaluate(args: argparse.Namespace) -> int:
     from neurove_core.io.formats.pose_files import read_truth
     from neurove_core.sources import open_source
 
-    torch.set_num_threads(1)
+    one_thread()
     estimator = Estimator(models.find(args.model), refine=args.refine == "auto")
     given = motion.twists(read_truth(args.truth)) if args.truth else None
     if args.plot:

@@ -203,7 +203,7 @@ class Rollout:
             if reply is None and was_fine:
                 continue
             silence = found.silent.get(target.node, roster.NOT_CONNECTED)
-            finding = soak.heard(reply, now_s) if reply is not None else soak.silent(now_s, silence)
+            finding = soak.heard(reply, now_s, found.asked_s) if reply is not None else soak.silent(now_s, silence)
             if finding.result == "failed":
                 self._emit("failed", node=target.node, why=finding.why)
             elif finding.result == "fine" and not was_fine:

@@ -29,6 +29,7 @@ class Roster(NamedTuple):
     silent: dict[str, str]  # node -> why it has no reply, as the predicate of a sentence
     took_s: float  # time of the query [s]
     received_bytes: int  # of the replies
+    asked_s: float = 0.0  # when the query began (monotonic) [s]; every reply was made later
 
 
 def ask(
@@ -61,7 +62,7 @@ def ask(
         for node in sorted((tokens | set(expected) | set(errors)) - replies.keys())
     }
     received = sum(len(answer.payload) for answer in answers)
-    return Roster(dict(sorted(replies.items())), silent, time.monotonic() - began, received)
+    return Roster(dict(sorted(replies.items())), silent, time.monotonic() - began, received, began)
 
 
 def _answers(

@@ -4,7 +4,7 @@ from typing import Final, Literal, NamedTuple
 
 from neurove_protocol.control import HealthReply
 
-_CLOCK_SLACK_S: Final = 5.0  # a reply may have been on its way for so long
+_CLOCK_SLACK_S: Final = 5.0  # a node may answer with a health that is somewhat older
 
 
 class Finding(NamedTuple):
@@ -35,9 +35,15 @@ class Soak:
         """What is left of the soak [s]."""
         return max(0.0, self._end_s - now_s)
 
-    def heard(self, reply: HealthReply, now_s: float) -> Finding:
-        """The finding after an answer. A node is fine only by an answer at the end of its soak or later."""
-        why = self._fault(reply, now_s)
+    def heard(self, reply: HealthReply, now_s: float, asked_s: float | None = None) -> Finding:
+        """The finding after an answer. A node is fine only by an answer at the end of its soak or later.
+
+        Args:
+            reply: the answer.
+            now_s: when it has arrived.
+            asked_s: when it was asked for; None: now.
+        """
+        why = self._fault(reply, now_s if asked_s is None else asked_s)
         self._newest = (now_s, reply)
         if why:
             return Finding("failed", why)
@@ -57,15 +63,15 @@ class Soak:
         last = f"; it was heard {now_s - self._newest[0]:.0f} s ago" if self._newest else "; it was never heard"
         return Finding("failed", f"{why} at the end of its soak{last}")
 
-    def _fault(self, reply: HealthReply, now_s: float) -> str:
+    def _fault(self, reply: HealthReply, asked_s: float) -> str:
         if reply.model.digest != self._digest:
             change = f": {reply.change}" if reply.change else ""
             return f"serves {reply.model.name} ({reply.model.digest[:12]}) again{change}"
         if self._newest is None:
             return ""
         before_s, before = self._newest
-        late = reply.uptime_s + _CLOCK_SLACK_S < before.uptime_s + (now_s - before_s)
-        if now_s < self._end_s and (late or reply.uptime_s < before.uptime_s):
+        late = reply.uptime_s + _CLOCK_SLACK_S < before.uptime_s + (asked_s - before_s)
+        if asked_s < self._end_s and (late or reply.uptime_s < before.uptime_s):
             return "started again during its soak"
         if reply.rollbacks > before.rollbacks:
             return f"rolled back automatically: {reply.change}"

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from torch import nn
 
 from neurove_core.estimator import Estimator
 from neurove_core.ingest.windows import Window
@@ -55,7 +54,7 @@ def free_bytes(meminfo: Path = _MEMINFO, cgroup: Path = _CGROUP) -> int | None:
 
 def weight_bytes(model: Bundle) -> int:
     """Size of a model's weights [bytes]."""
-    return sum(tensor.numel() * tensor.element_size() for tensor in model.network.state_dict().values())
+    return model.weight_bytes
 
 
 class Cost(NamedTuple):
@@ -69,6 +68,14 @@ def cost(model: Bundle) -> Cost:
     """What a busy window costs at least, whatever the weights: events reach the first layer, neurons are updated."""
     channels, rows, columns = model.config.input_shape
     first, neurons = 0.0, channels * rows * columns
+    if model.config.kind == "neurove":
+        for outputs in model.config.network.channels:
+            rows, columns = -(-rows // 2), -(-columns // 2)
+            neurons += outputs * rows * columns
+            first = first or _BUSY * 9 * channels * outputs * rows * columns
+        return Cost(first + _UPDATE * neurons, 4 * _COPIES_OF_STATE * neurons)
+    from torch import nn
+
     for layer in model.network.modules():
         if isinstance(layer, nn.Conv2d):
             rows, columns = -(-rows // layer.stride[0]), -(-columns // layer.stride[1])

@@ -1,10 +1,12 @@
 """Library: every model that a node can activate, found by name or digest."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from neurove_core import models
+from neurove_core.extras import installed
 from neurove_core.files import Stamp, stamp, why_unreadable
 from neurove_core.models import bundle
 from neurove_core.models.bundle import Bundle
@@ -13,6 +15,8 @@ from neurove_protocol.errors import BadModel, UnknownModel
 
 MIN_DIGEST = 8
 """Minimum number of digits of a digest that name a model."""
+
+_DIGEST: Final = re.compile(f"[0-9a-f]{{{MIN_DIGEST},64}}")
 
 Files = Callable[[], dict[str, Path]]
 """Digest and file of every model that was pushed to this node."""
@@ -62,7 +66,7 @@ class Library:
 
     def available(self) -> Available:
         """All models, and the files that are no models."""
-        found = {one.digest: one.info for one in self._in_memory()}
+        found = {one.digest: one.info for one in self._in_memory(models.built_in())}
         unreadable = {}
         if self._models_dir is not None and (why := why_unreadable(self._models_dir)):
             unreadable[str(self._models_dir)] = why
@@ -81,7 +85,8 @@ class Library:
             UnknownModel: there is none.
             BadModel: several models have this name, or the file of this name is no model.
         """
-        in_memory = {one.digest: one for one in self._in_memory() if _matches(one.info, model)}
+        given = (models.untrained(),) if model == models.RANDOM else models.shipped()
+        in_memory = {one.digest: one for one in self._in_memory(given) if _matches(one.info, model)}
         files = {}
         for name, path, digest in self._files():
             read = self._known(path, digest)
@@ -100,14 +105,16 @@ class Library:
             if found.digest != digest:
                 raise BadModel(model, f"the file changed while it was read: its sha256 is now {found.digest}")
             return found
+        if _DIGEST.fullmatch(model) and installed("torch") and _matches(models.untrained().info, model):
+            return models.untrained()  # it served before the node was started again
         raise UnknownModel(model, tuple(one.name for one in self.available().models))
 
     def is_built_in(self, digest: str) -> bool:
         """Whether a model belongs to this installation."""
         return any(one.digest == digest for one in models.built_in())
 
-    def _in_memory(self) -> list[Bundle]:
-        return [*models.built_in(), *([self._given] if self._given else [])]
+    def _in_memory(self, built_in: tuple[Bundle, ...]) -> list[Bundle]:
+        return [*built_in, *([self._given] if self._given else [])]
 
     def _files(self) -> list[tuple[str, Path, str | None]]:
         """Name and file; for pushed models also the digest that the file must have."""

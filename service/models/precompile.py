@@ -13,13 +13,14 @@ import subprocess
 import sys
 import threading
 import time
+from typing import Any
 
-import torch
+import numpy as np
 
 from neurove_core.config import ModelConfig
 from neurove_core.estimator import Estimator
 from neurove_core.models.bundle import Bundle
-from neurove_core.networks import kinds
+from neurove_core.networks.arrays import Weights, shapes
 from neurove_service import logs
 
 log = logs.get(__name__)
@@ -96,10 +97,14 @@ def _shape(config: ModelConfig) -> tuple[object, ...]:
 def main() -> None:
     """Compile the code of the configuration in the first argument."""
     os.nice(_NICE)
-    torch.set_num_threads(1)
     config = ModelConfig.model_validate_json(sys.argv[1])
-    network = kinds.make(config).eval()
-    Estimator(Bundle("compiling", False, "", config, network, torch.zeros(6), torch.ones(6))).warm_up()
+    rng = np.random.default_rng(0)
+    tensors = {
+        name: np.abs(rng.normal(0, 0.1, shape)).astype(np.float32)
+        for name, shape in shapes(config, spread=False).items()
+    }
+    given: Any = Weights(config, tensors), np.zeros(6, np.float32), np.ones(6, np.float32)
+    Estimator(Bundle("compiling", False, "", config, *given)).warm_up()
 
 
 if __name__ == "__main__":

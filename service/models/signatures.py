@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from neurove_core.models import manifest, signing_keys
+from neurove_core.models import manifest
 from neurove_core.models.container import Data
 from neurove_protocol.control import ModelInfo, SignatureState
 from neurove_protocol.errors import InvalidField, Untrusted
@@ -42,7 +42,9 @@ def verifier(keys: tuple[Path, ...]) -> Verify:
     """
     if not keys:
         return verify_nothing
-    trusted = [signing_keys.read_public(_read(path), str(path)) for path in keys]
+    from neurove_core.models import signing_keys
+
+    trusted = [signing_keys.read_public(_read(path, signing_keys.MAX_KEY_BYTES + 1), str(path)) for path in keys]
 
     def verify(data: Data, signature: bytes | None) -> Signed:
         if signature is None:
@@ -53,9 +55,9 @@ def verifier(keys: tuple[Path, ...]) -> Verify:
     return verify
 
 
-def _read(path: Path) -> bytes:
+def _read(path: Path, most: int) -> bytes:
     try:
         with path.open("rb") as file:
-            return file.read(signing_keys.MAX_KEY_BYTES + 1)
+            return file.read(most)
     except OSError as error:
         raise InvalidField("config", "trusted_keys", str(path), error.strerror or str(error)) from None

@@ -11,6 +11,9 @@ from neurove_service.page.streams import HISTORY_S, StreamView
 
 MAX_STREAMS: Final = 32
 MAX_NODES: Final = 32
+NODES_TICKS: Final = 5
+"""One of so many news has the nodes."""
+
 _FORGET_S: Final = 600.0  # a stream or a node that has been silent for so long leaves the page
 
 
@@ -23,7 +26,7 @@ class Deployment:
         self._streams: dict[str, StreamView] = {}
         self._nodes: dict[str, NodeView] = {}
         self._unreachable = "the page has not connected yet"
-        self._hidden = 0
+        self._ticks = 0
 
     def on_estimate(self, estimate: TwistEstimate) -> None:
         """Take an estimate, on Zenoh's thread."""
@@ -74,25 +77,28 @@ class Deployment:
             return name in self._streams
 
     def news(self) -> dict[str, Any]:
-        """The state now, with the points since the last call."""
-        with self._lock:
-            return self._state({name: view.drain() for name, view in self._streams.items()})
-
-    def everything(self) -> dict[str, Any]:
-        """The state now, with all points of the plotted time."""
+        """The state now, with the points since the last call; nodes change slowly, so only some news have them."""
         with self._lock:
             now_s = time.monotonic() - self._start
-            return self._state({name: view.recent(now_s) for name, view in self._streams.items()})
+            state = self._state(now_s, {name: view.drain() for name, view in self._streams.items()})
+            with_nodes = self._ticks % NODES_TICKS == 0
+            self._ticks += 1
+            return state | self._all_nodes() if with_nodes else state
 
-    def _state(self, points: dict[str, list[tuple[Any, ...]]]) -> dict[str, Any]:
+    def everything(self) -> dict[str, Any]:
+        """The state now, with all nodes, and all points of the plotted time."""
+        with self._lock:
+            now_s = time.monotonic() - self._start
+            state = self._state(now_s, {name: view.recent(now_s) for name, view in self._streams.items()})
+            return state | self._all_nodes()
+
+    def _state(self, now_s: float, points: dict[str, list[list[Any]]]) -> dict[str, Any]:
         self._forget()
-        now_s = time.monotonic() - self._start
         problems = {name: node.problem for name, node in self._nodes.items()}
         streams = [
             view.as_json(now_s, problems.get(view.node, self._unreachable)) | {"points": points.get(name, [])}
             for name, view in sorted(self._streams.items())
         ]
-        nodes = [node.as_json() for _, node in sorted(self._nodes.items())]
         reached = any(not problem for problem in problems.values())
         why = self._unreachable or ("no service answers" if not reached else "")
         return {
@@ -100,8 +106,10 @@ class Deployment:
             "history_s": HISTORY_S,
             "problem": "" if reached else why,
             "streams": streams,
-            "nodes": nodes,
         }
+
+    def _all_nodes(self) -> dict[str, Any]:
+        return {"nodes": [node.as_json() for _, node in sorted(self._nodes.items())]}
 
     def _stream(self, name: str) -> StreamView | None:
         view = self._streams.get(name)

@@ -67,7 +67,7 @@ def serve(config: ClientConfig, listening: socket.socket, access: Access, stop: 
     deployment, guard = Deployment(), Guard()
     feed = Feed(config, deployment, stop, guard)
     try:
-        asyncio.run(_serve(deployment, feed, Images(config.keys.events), listening, access, stop, guard))
+        asyncio.run(_serve(deployment, feed, Images(config.keys.events, guard), listening, access, stop, guard))
     finally:
         stop.set()
         feed.close()
@@ -109,7 +109,7 @@ async def _forget(images: Images, guard: Guard) -> None:
     while True:
         await asyncio.sleep(_FORGET_S)
         with guard.at("page images"):
-            await asyncio.to_thread(images.forget)
+            images.forget()
 
 
 def _aborting(connections: dict[Any, asyncio.Transport]) -> Callable[[Any], None]:

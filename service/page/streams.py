@@ -1,5 +1,6 @@
 """A stream as the page shows it: newest estimate and status, a bounded history, and whether it is alive."""
 
+import itertools
 import time
 from collections import deque
 from dataclasses import dataclass, field
@@ -7,7 +8,7 @@ from typing import Any, Final
 
 from neurove_protocol import TwistEstimate
 from neurove_protocol.control import StreamStatus
-from neurove_service.page.points import magnitudes, point
+from neurove_service.page.points import Point, magnitudes, point
 
 HISTORY_S: Final = 30.0
 """Time that the plots show [s]."""
@@ -43,8 +44,8 @@ class StreamView:
     estimate_at: float = 0.0
     status_at: float = 0.0
     heard_at: float = 0.0
-    points: deque[tuple[Any, ...]] = field(default_factory=lambda: deque(maxlen=MAX_POINTS))
-    fresh: deque[tuple[Any, ...]] = field(default_factory=lambda: deque(maxlen=100))
+    points: deque[Point] = field(default_factory=lambda: deque(maxlen=MAX_POINTS))
+    fresh: deque[Point] = field(default_factory=lambda: deque(maxlen=100))
 
     def on_estimate(self, estimate: TwistEstimate, at_s: float) -> None:
         """Take a new estimate; `at_s` is the arrival on the page's own clock."""
@@ -60,15 +61,15 @@ class StreamView:
         self.status, self.node = status, status.node
         self.status_at = self.heard_at = time.monotonic()
 
-    def drain(self) -> list[tuple[Any, ...]]:
+    def drain(self) -> list[list[Any]]:
         """The points since the last call."""
-        taken = list(self.fresh)
+        taken = [one.as_json() for one in self.fresh]
         self.fresh.clear()
         return taken
 
-    def recent(self, now_s: float) -> list[tuple[Any, ...]]:
+    def recent(self, now_s: float) -> list[list[Any]]:
         """The points of the plotted time."""
-        return [one for one in self.points if one[0] > now_s - HISTORY_S]
+        return [one.as_json() for one in self.points if one.at_s > now_s - HISTORY_S]
 
     def as_json(self, now_s: float, node_problem: str) -> dict[str, Any]:
         """Everything but the points.
@@ -79,7 +80,8 @@ class StreamView:
         """
         level, verdict, why = self._verdict(node_problem)
         status, estimate = self.status, self.estimate
-        rate_hz = sum(one[0] > now_s - _RATE_S for one in self.points) / _RATE_S
+        recent = itertools.takewhile(lambda one: one.at_s > now_s - _RATE_S, reversed(self.points))
+        rate_hz = sum(1 for _ in recent) / _RATE_S
         shown: dict[str, Any] = {
             "name": self.name,
             "node": self.node,

@@ -5,7 +5,6 @@ import importlib.metadata
 import importlib.resources
 import json
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import PurePosixPath
 from typing import Any, Final
 
@@ -23,7 +22,7 @@ from neurove_service import logs
 from neurove_service.page.access import COOKIE, Access, Role, same_origin
 from neurove_service.page.deployment import Deployment
 from neurove_service.page.feed import Feed
-from neurove_service.page.images import Images
+from neurove_service.page.images import MAX_WATCHED, Images
 from neurove_service.page.viewers import Viewers
 
 log = logs.get(__name__)
@@ -96,7 +95,7 @@ class Guarded:
             return PlainTextResponse("this host name does not name the page", 403)
         if scope["method"] == "POST" and not same_origin(headers.get("origin"), host):
             return PlainTextResponse("refused: another origin", 403)
-        if scope["role"] == "none" and (scope["path"] == "/feed" or scope["path"].startswith(("/image/", "/operate/"))):
+        if scope["role"] == "none" and (scope["path"] in ("/feed", "/images") or scope["path"].startswith("/operate/")):
             return PlainTextResponse("refused: open the page with its token", 401)
         return None
 
@@ -117,14 +116,13 @@ class Site:
         self._viewers, self._access = viewers, access
         self._files = static_files()
         self._changing = asyncio.Lock()
-        self._drawing = ThreadPoolExecutor(1, "page images")  # more threads cost memory and are not faster
         self._version = importlib.metadata.version("neurove")
 
     def app(self) -> ASGIApp:
         """The application."""
         routes = [
             Route("/feed", _Plain(self._follow)),
-            Route("/image/{stream}.png", self._image),
+            Route("/images", self._newer),
             Route("/session", self._session, methods=["POST"]),
             Route("/operate/activate", self._activate, methods=["POST"]),
             Route("/operate/rollback", self._rollback, methods=["POST"]),
@@ -140,15 +138,18 @@ class Site:
         about = {"version": self._version, "role": scope["role"], "operator": self._access.operator}
         await self._viewers.follow(scope, receive, send, about)
 
-    async def _image(self, request: Request) -> Response:
-        stream, transport = request.path_params["stream"], self._feed.transport
-        if transport is None or not is_name(stream) or not self._deployment.has_stream(stream):
+    async def _newer(self, request: Request) -> Response:
+        """Images of the streams `s`, in their order; `n` has the numbers of those that the browser has."""
+        names, numbers = request.query_params.getlist("s"), request.query_params.getlist("n")
+        known = zip(names[:MAX_WATCHED], (*numbers, *names), strict=False)
+        asked = {name: int(number) if number.isdecimal() else 0 for name, number in known}
+        transport = self._feed.transport
+        if transport is None or not asked or not all(map(self._shown, asked)):
             return PlainTextResponse("no such stream", 404)
-        png = self._images.fresh(stream)
-        if png is None:
-            loop = asyncio.get_running_loop()
-            png = await loop.run_in_executor(self._drawing, self._images.png, stream, transport)
-        return Response(status_code=204) if png is None else Response(png, media_type="image/png")
+        return Response(await self._images.newer(asked, transport), media_type="application/octet-stream")
+
+    def _shown(self, stream: str) -> bool:
+        return is_name(stream) and self._deployment.has_stream(stream)
 
     async def _session(self, request: Request) -> Response:
         given = await _body(request)

@@ -5,12 +5,11 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from neurove_core.carried import Carried
 from neurove_core.estimator import Estimator, StreamState, WindowEstimate
 from neurove_core.ingest.windows import Window
-from neurove_core.networks.neurove import NetworkState
+from neurove_core.networks.arrays import ArrayState
 from neurove_service.guard import Guard
 from neurove_service.streams.comparison import WindowResult
 from neurove_service.streams.ring import PackedWindow
@@ -167,9 +166,11 @@ class Lane:
 
 def _rate(state: StreamState) -> float:
     """Share of the estimator's cells that fired; 0 in a network without spiking cells."""
-    if not isinstance(state.network, NetworkState):
-        return 0.0
-    return float(torch.stack([cell.s.mean() for cell in state.network.cells]).mean())
+    network = state.network
+    if isinstance(network, ArrayState):
+        return network.rate
+    cells = getattr(network, "cells", ())
+    return float(np.mean([float(cell.s.mean()) for cell in cells])) if cells else 0.0
 
 
 def windows_to_prime(estimator: Estimator) -> int:

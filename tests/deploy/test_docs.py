@@ -3,9 +3,14 @@
 tests/test_readme.py checks commands, links and language of its pages, as of every other page.
 """
 
+import contextlib
+import functools
+import http.server
 import re
+import shutil
 import subprocess
 import sys
+import threading
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -86,3 +91,45 @@ def test_the_reference_has_shapes_units_and_errors_from_the_docstrings(site):
 def test_the_page_of_symptoms_has_a_section_for(symptom):
     headings = re.findall(r"^## (.*)$", (DOCS / "troubleshooting.md").read_text(), re.MULTILINE)
     assert any(symptom.lower() in heading.lower() for heading in headings)
+
+
+def test_no_page_loads_anything_from_another_host(site):
+    chromium = shutil.which("chromium")
+    if chromium is None:
+        pytest.skip("chromium is not installed")
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    asked = []
+    with local(site) as address, sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=chromium, args=["--no-sandbox", "--disable-gpu"], timeout=120_000
+        )
+        page = browser.new_page()
+        page.set_default_timeout(120_000)
+        page.on("request", lambda request: asked.append(request.url))
+        for name in ("protocol/index.html", "index.html", "deploy/SCALE.html", "reference/spiking.html"):
+            page.goto(f"{address}/{name}", wait_until="networkidle")
+            assert page.evaluate("[...document.images].every(one => one.complete && one.naturalWidth > 0)"), name
+        browser.close()
+    assert len(asked) > 8
+    assert [url for url in asked if not url.startswith((address, "data:", "blob:"))] == []
+
+
+@contextlib.contextmanager
+def local(folder):
+    """The site on a free port of this machine."""
+    handler = functools.partial(Quiet, directory=folder)
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}"
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+class Quiet(http.server.SimpleHTTPRequestHandler):
+    """Without a line for each request."""
+
+    def log_message(self, *_):
+        pass

@@ -6,6 +6,7 @@ import re
 import shutil
 import signal
 import socket
+import threading
 import time
 import urllib.error
 import urllib.request
@@ -64,7 +65,7 @@ class Page:
         request = urllib.request.Request(self.url.rstrip("/") + path, data, sent)
         try:
             with urllib.request.urlopen(request, timeout=60) as answer:
-                return answer.status, answer.headers, answer.read().decode()
+                return answer.status, answer.headers, answer.read().decode(errors="replace")
         except urllib.error.HTTPError as error:
             with error:
                 return error.code, error.headers, error.read().decode()
@@ -216,7 +217,7 @@ def test_a_request_from_elsewhere_or_without_a_token_changes_nothing(node):
 
 def test_every_answer_forbids_what_the_page_does_not_need(node):
     page, *_ = node
-    for path in ("/", "/main.js", "/absent", "/image/absent.png", "/image/..%2Fx.png"):
+    for path in ("/", "/main.js", "/absent", "/images?s=absent", "/images?s=..%2Fx"):
         code, headers, _ = page.request(path)
         assert code == (404 if "absent" in path or ".." in path else 200)
         policy = headers["Content-Security-Policy"]
@@ -318,6 +319,45 @@ def test_estimates_go_on_while_a_page_is_stopped_or_killed(node, number):
         process.child.kill()
 
 
+def test_estimates_go_on_while_a_page_is_flooded_and_it_recovers(node):
+    _, transport, config = node
+    with opened(config.connect[0]) as (page, _), contextlib.ExitStack() as stack:
+        host, port = page.url.removeprefix("http://").rstrip("/").split(":")
+        wait_until(lambda: page.request("/images?s=cam0&n=0")[0] == 200)
+        done = threading.Event()
+
+        def connected():
+            return stack.enter_context(socket.create_connection((host, int(port)), timeout=60))
+
+        def greedy(text):
+            """Send requests as fast as the page takes them, and read nothing; begin anew where it closes."""
+            while not done.is_set():
+                with contextlib.suppress(OSError), socket.create_connection((host, int(port)), timeout=1) as client:
+                    while not done.is_set():
+                        client.sendall(text)
+
+        for _ in range(300):  # more than the page takes; each has sent half a request
+            connected().sendall(b"GET /feed HTTP/1.1\r\n")
+        about = f"HTTP/1.1\r\nHost: {host}:{port}\r\n\r\n"
+        texts = (f"GET /images?s=cam0&n=0 {about}", f"GET /feed {about}", f"GET / {about}", "x" * 1000)
+        threads = [threading.Thread(target=greedy, args=(text.encode() * 50,)) for text in texts]
+        for thread in threads:
+            thread.start()
+        try:
+            heard = Heard(transport, config)
+            wait_until(lambda: len(heard.of("cam0")) >= 60)
+        finally:
+            done.set()
+            for thread in threads:
+                thread.join()
+        seqs = [one.seq for one in heard.of("cam0")]
+        assert seqs == sorted(set(seqs))
+        assert is_alive(transport, config)
+        stack.close()
+        wait_until(lambda: page.request("/images?s=cam0&n=0")[0] == 200)
+        assert "cam0" in [one["name"] for one in page.state()["streams"]]
+
+
 def test_the_demo_opens_a_page_and_ends_it():
     demo = Process("demo", "pattern://", "--seconds", "60", "--page")
     try:
@@ -342,10 +382,10 @@ def test_beyond_loopback_nothing_is_shown_without_the_token():
         page = Page.__new__(Page)
         page.url = f"http://127.0.0.1:{port}/"
         assert page.request("/")[0] == 200  # the empty page, which asks for the token
-        assert page.request("/feed")[0] == page.request("/image/cam0.png")[0] == 401
+        assert page.request("/feed")[0] == page.request("/images?s=cam0")[0] == 401
         assert page.request("/session", {"token": "guess"})[0] == 403
         code, headers, _ = page.request("/session", {"token": token})
         assert code == 200
         key = headers["Set-Cookie"].partition(";")[0]
-        assert page.request("/image/cam0.png", Cookie=key)[0] == 404
+        assert page.request("/images?s=cam0", Cookie=key)[0] == 404
         assert page.request("/operate/rollback", {"node": "n1"}, Cookie=key)[0] == 403

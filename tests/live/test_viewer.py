@@ -97,7 +97,9 @@ def test_a_client_receives_velocity_image_calibration_and_log_of_a_live_service(
             refused = neurove("watch", "--foxglove", address, "--connect", endpoint)
             assert (refused.returncode, refused.stderr.count("\n")) == (2, 1)
             assert f"--foxglove='{address}'" in refused.stderr
-            neurove("activate", "untrained", "--connect", endpoint, "--force", "test")
+            wait_until(
+                lambda: neurove("activate", "untrained", "--connect", endpoint, "--force", "test").returncode == 0
+            )
             while "model untrained answers now" not in client.message("/log").message:
                 pass
         finally:

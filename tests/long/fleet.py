@@ -105,7 +105,7 @@ def bad_at_a_tenth(fleet: Fleet) -> dict[str, Any]:
         "--plan",
         "1,10%,100%",
         "--soak",
-        "4s",
+        "60s",
         "--patience",
         "20s",
         "--on-failure",

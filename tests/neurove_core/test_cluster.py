@@ -118,7 +118,7 @@ def test_a_cluster_that_is_not_there_ends_in_one_line(tmp_path):
     address = f"tcp://127.0.0.1:{free_port()}"
     ended = run("simulate", "room", "--count", "1", "--out", tmp_path / "out", "--dask", address)
     assert ended.returncode == 1
-    assert ended.stderr.startswith(f"neurove: cluster {address}: no scheduler answers within 5 s")
+    assert ended.stderr.startswith(f"neurove: cluster {address}: no scheduler answers within 10 s")
     assert ended.stderr.count("\n") == 1
     ended = run("simulate", "room", "--count", "1", "--out", tmp_path, "--dask", address, "--workers", "2")
     assert ended.returncode == 2

@@ -31,7 +31,7 @@ WRONG = [
     (ModelConfig, "scales", (1,), "from at least 2 to at most 16"),
     (ModelConfig, "scales", (4, 2), "must rise"),
     (ModelConfig, "scale_bounds", (0.0, 1.0), "both must be above 0"),
-    (ModelConfig, "scale_floor", (-0.1, 1.0), "both must be at least 0"),
+    (ModelConfig, "scale_floor", -0.1, "greater than or equal to 0"),
     (NetworkConfig, "encoding", "rate", "'binary' or 'log1p'"),
     (NetworkConfig, "precision", "int4", "'float32' or 'int8'"),
     (NetworkConfig, "channels", (), "at least 1 item"),

@@ -93,10 +93,12 @@ def assert_same_estimates(got: list[WindowEstimate], want: list[WindowEstimate])
 def assert_same_state(got: StreamState, want: StreamState) -> None:
     assert got.age == want.age
     np.testing.assert_array_equal(got.lut, want.lut)
-    for field in ("membranes", "cells"):
-        for one, other in zip(chain(*getattr(got.network, field)), chain(*getattr(want.network, field)), strict=True):
-            assert torch.equal(one, other)
-    assert torch.equal(got.network.readout, want.network.readout)
+    for one, other in zip(parts(got), parts(want), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def parts(state: StreamState) -> tuple[np.ndarray, ...]:
+    return (*state.network.membranes, state.network.cells, state.network.readout)
 
 
 def differ(one: WindowEstimate, other: WindowEstimate) -> bool:

@@ -44,7 +44,7 @@ function show(state) {
   if (empty) put(byId("empty-text"), state.problem || "No stream yet. The page shows streams as soon as a driver publishes.");
   banner(empty ? "" : state.problem);
   each(streams, state.streams, byId("streams"), (one) => new StreamCard(one.name, state.history_s), (card, one) => card.show(one, state.now_s));
-  each(nodes, state.nodes, byId("nodes"), (one) => new NodeCard(one.name, change), (card, one) => card.show(one, role === "operator"));
+  if (state.nodes) each(nodes, state.nodes, byId("nodes"), (one) => new NodeCard(one.name, change), (card, one) => card.show(one, role === "operator"));
   byId("streams").classList.toggle("many", state.streams.length > 1);
   each(links, state.streams, byId("nav"), link, (one, stream) => one.show(stream));
   const bad = state.streams.filter((one) => one.level === "bad").length;

@@ -1,10 +1,45 @@
-// The event image of a stream: asked for only while the card is on screen and the page is visible, at most 10 per second.
+// The event images: asked for only while a card is on screen and the page is visible. One request has all of them; the
+// server answers it at its next round, at most ten times per second.
 import { element } from "./format.js";
 
-const PERIOD_MS = 100;
-const SHARE_MS = 50; // several pictures on screen share 20 images per second
-const looking = new Set();
 const RETRY_MS = 700;
+const MOST = 12;
+const HEAD_BYTES = 8; // number and length of an image
+const looking = new Set();
+let asking = false;
+
+async function round() {
+  if (asking || document.hidden || !looking.size) return;
+  asking = true;
+  try {
+    const asked = [...looking].slice(0, MOST);
+    const query = new URLSearchParams();
+    asked.forEach((one) => query.append("s", one.stream));
+    asked.forEach((one) => query.append("n", one.number));
+    const answer = await fetch(`/images?${query}`, { signal: AbortSignal.timeout(10000) });
+    if (!answer.ok) throw new Error(answer.statusText);
+    await show(asked, await answer.arrayBuffer());
+    setTimeout(round, 0);
+  } catch {
+    setTimeout(round, RETRY_MS);
+  } finally {
+    asking = false;
+  }
+}
+
+async function show(asked, data) {
+  const view = new DataView(data);
+  let at = 0;
+  for (const one of asked) {
+    const number = view.getUint32(at);
+    const bytes = view.getUint32(at + 4);
+    at += HEAD_BYTES;
+    if (bytes) one.draw(await createImageBitmap(new Blob([new Uint8Array(data, at, bytes)], { type: "image/png" })), number);
+    at += bytes;
+  }
+}
+
+document.addEventListener("visibilitychange", round);
 
 export class Picture {
   constructor(stream) {
@@ -16,57 +51,31 @@ export class Picture {
     const legend = element("span");
     legend.append(element("b", "on", "brighter "), element("b", "off", "darker"));
     this.root.append(this.canvas, legend);
-    this.seen = false;
-    this.closed = false;
     this.number = 0;
-    this.busy = false;
+    this.drawn = 0;
     this.observer = new IntersectionObserver(([entry]) => {
-      this.seen = entry.isIntersecting;
-      if (this.seen) looking.add(this);
+      if (entry.isIntersecting) looking.add(this);
       else looking.delete(this);
-      this.next(0);
+      round();
     });
     this.observer.observe(this.root);
-    this.onVisible = () => this.next(0);
-    document.addEventListener("visibilitychange", this.onVisible);
   }
 
-  next(delayMs) {
-    if (this.busy || this.closed || !this.seen || document.hidden) return;
-    this.busy = true;
-    setTimeout(() => this.load(), delayMs);
-  }
-
-  load() {
-    const started = performance.now();
-    const image = new Image();
-    const done = (delayMs) => {
-      this.busy = false;
-      this.next(delayMs);
-    };
-    image.onload = () => {
-      this.draw(image);
-      done(Math.max(PERIOD_MS, SHARE_MS * looking.size) - (performance.now() - started));
-    };
-    image.onerror = () => done(RETRY_MS);
-    this.number += 1;
-    image.src = `/image/${encodeURIComponent(this.stream)}.png?n=${this.number}`;
-  }
-
-  draw(image) {
-    if (this.canvas.width !== image.naturalWidth || this.canvas.height !== image.naturalHeight) {
-      this.canvas.width = image.naturalWidth;
-      this.canvas.height = image.naturalHeight;
-      this.root.style.aspectRatio = `${image.naturalWidth} / ${image.naturalHeight}`;
+  draw(image, number) {
+    this.number = number;
+    this.drawn += 1;
+    if (this.canvas.width !== image.width || this.canvas.height !== image.height) {
+      this.canvas.width = image.width;
+      this.canvas.height = image.height;
+      this.root.style.aspectRatio = `${image.width} / ${image.height}`;
     }
     this.canvas.getContext("2d").drawImage(image, 0, 0);
-    this.root.dataset.images = String(this.number);
+    image.close();
+    this.root.dataset.images = String(this.drawn);
   }
 
   close() {
-    this.closed = true;
     looking.delete(this);
     this.observer.disconnect();
-    document.removeEventListener("visibilitychange", this.onVisible);
   }
 }

@@ -86,6 +86,23 @@ def test_a_vehicle_that_drives_fast_is_not_searched():
     assert all(one.state.scene is None for one in found)
 
 
+def test_without_a_height_a_scene_is_searched_only_where_the_parts_of_the_image_disagree():
+    turning = events_of(STILL, np.array([0.1, -0.5, 0.2]), 8)
+    assert any(one.state.scene is not None for one in refined(turning))
+    assert all(one.state.scene is None for one in refined(turning, knows_height=False))
+
+
+def test_a_motion_in_a_scene_is_no_steady_turn_that_outweighs_a_fast_vehicle():
+    samples = events_of((0.6, 0.0, 0.0), STILL, 16)
+    state = refined(samples)[-1].state
+    assert state.idle == 0
+    fast = np.array([0.0, 0, 8, 0, 0, 0])
+    start_us = state.scene.end_us
+    one = stages.refine(Given(start_us, WINDOW_US, samples[-1], VIEW, fast, UNSURE / 100, False, None), state)
+    assert one.velocity is None
+    assert one.turn.outcome != "accepted"
+
+
 def test_a_gap_forgets_the_scene():
     samples = events_of((0.6, 0.0, 0.0), STILL, 16)
     state = refined(samples)[-1].state

@@ -31,6 +31,16 @@ def test_evaluate_prints_a_table_and_draws(trained, run, tmp_path):
     assert {file.suffix for file in (tmp_path / "plots").iterdir()} == {".png", ".svg"}
 
 
+def test_processes_give_the_figures_of_this_process(run):
+    words = ("evaluate", "untrained", SOURCE, SOURCE.replace("seed=3", "seed=20320"), "--json")
+    (_, here, _), (code, there, err) = run(*words), run(*words, "--workers", "2")
+    found, wanted = json.loads(there), json.loads(here)
+    assert (code, "evaluated 2/2" in err) == (0, True), err
+    for figure in ("windows", "rmse_v_l_m_s", "per_axis", "firing_rate", "source_share"):
+        assert found[figure] == wanted[figure]
+    assert [one["name"] for one in found["recordings"]] == [one["name"] for one in wanted["recordings"]]
+
+
 @pytest.mark.parametrize(
     ("source", "why"),
     [("pattern://", "it never ends"), ("sim://street", "it never ends"), ("sim://nowhere?seconds=1", "nowhere")],

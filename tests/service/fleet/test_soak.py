@@ -44,6 +44,11 @@ def test_a_process_that_started_again_fails(soak, uptime_s, at_s):
     assert soak.heard(heard(uptime_s), at_s).why == "started again during its soak"
 
 
+def test_an_answer_that_was_long_on_its_way_is_no_restart(soak):
+    soak.heard(heard(100.0), 1001.0)
+    assert soak.heard(heard(101.5), 1030.0, asked_s=1002.0).result == "soaking"
+
+
 def test_an_automatic_rollback_between_two_answers_fails(soak):
     soak.heard(heard(100.0), 1001.0)
     assert soak.heard(heard(101.0, rollbacks=3, change="x"), 1002.0).why == "rolled back automatically: x"

@@ -1,11 +1,11 @@
 """Probation after a model change, and the ways back: the estimates, window by window."""
 
 import contextlib
-from dataclasses import replace
 
+import numpy as np
 import pytest
-import torch
 
+from neurove_core.engine.array_runner import ArrayRunner
 from neurove_protocol.errors import (
     NothingBefore,
     Untrained,
@@ -68,6 +68,13 @@ def test_a_rollback_after_probation_primes_the_old_model(slots):
     assert motion(after) == motion(never[-len(after) :])  # the ring has all windows so far: exact here
 
 
+class NotFinite(ArrayRunner):
+    """A model that computes nan."""
+
+    def run(self, counts, states):
+        return [(np.full_like(twists, np.nan), state) for twists, state in super().run(counts, states)]
+
+
 class Poisoned:
     """Makes a running model fail: values that are not finite, or an exception, from now on."""
 
@@ -76,8 +83,8 @@ class Poisoned:
 
     def now(self):
         if self.how == "nan":
-            self.estimator.network.readout.bias.data.fill_(float("nan"))
-            self.estimator.__init__(replace(self.estimator.bundle, scale=torch.full((6,), float("nan"))))
+            model = self.estimator.bundle
+            self.estimator.__init__(model, NotFinite(model.weights))
         else:
             self.estimator.follow = self._raise
 

@@ -7,7 +7,7 @@ import pytest
 
 from neurove_protocol import Trace, Twist, TwistEstimate
 from neurove_protocol.control import HealthReply, Losses, ModelInfo, StreamStatus
-from neurove_service.page.deployment import MAX_NODES, MAX_STREAMS, Deployment
+from neurove_service.page.deployment import MAX_NODES, MAX_STREAMS, NODES_TICKS, Deployment
 from neurove_service.page.points import magnitudes
 from neurove_service.page.viewers import message
 
@@ -98,7 +98,7 @@ def test_model_changes_are_a_history_with_reasons_newest_first():
     deployment.on_health([health("two", 1, "activated by an operator")])
     deployment.on_health([health("one", 2, "rolled back: diverged")])
     deployment.on_health([health("one", 0, uptime_s=1.0)])  # 5 s before
-    (node,) = deployment.news()["nodes"]
+    (node,) = deployment.everything()["nodes"]
     assert [(one["model"], one["reason"]) for one in node["history"]] == [
         ("one", "the service started again"),
         ("one", "rolled back: diverged"),
@@ -111,13 +111,13 @@ def test_a_node_that_leaves_is_gone_and_comes_back():
     deployment = Deployment()
     deployment.on_token("n1", True)
     deployment.on_health([health()])
-    assert deployment.news()["nodes"][0]["verdict"] == "ok"
+    assert deployment.everything()["nodes"][0]["verdict"] == "ok"
     deployment.on_token("n1", False)
-    state = deployment.news()
+    state = deployment.everything()
     assert state["nodes"][0]["verdict"] == "gone"
     assert state["problem"]
     deployment.on_token("n1", True)
-    state = deployment.news()
+    state = deployment.everything()
     assert (state["nodes"][0]["verdict"], state["problem"]) == ("ok", "")
 
 
@@ -127,7 +127,7 @@ def test_streams_nodes_and_texts_are_bounded():
         deployment.on_estimate(estimate(f"s{number}"))
         deployment.on_token(f"n{number}", True)
     deployment.on_status(status("s0", "unstable", "x" * 100_000))
-    state = deployment.news()
+    state = deployment.everything()
     assert [len(state["streams"]), len(state["nodes"])] == [MAX_STREAMS, MAX_NODES]
     assert all(len(one["why"]) <= 400 for one in state["streams"])
 
@@ -142,3 +142,11 @@ def test_no_text_from_the_network_begins_another_event():
     assert len(sent.rstrip("\n").splitlines()) == 2
     data = json.loads(sent.splitlines()[1].removeprefix("data: "))
     assert data["streams"][0]["model"] == data["nodes"][0]["model"]["name"] == HOSTILE
+
+
+def test_news_have_the_nodes_every_half_second_and_the_first_message_has_them_always():
+    deployment = Deployment()
+    deployment.on_health([health()])
+    with_nodes = ["nodes" in deployment.news() for _ in range(2 * NODES_TICKS)]
+    assert with_nodes == ([True] + [False] * (NODES_TICKS - 1)) * 2
+    assert "nodes" in deployment.everything()

@@ -1,0 +1,145 @@
+"""The Runner of a NeuroVE network that was read from a file: numpy and compiled code, without torch.
+
+Answers equal those of `FastRunner` bit for bit, where that one runs over spike lists; widths that are no multiples of
+LANES, which it computes dense, differ by rounding. Where the compiled kernels do not work, and inside `plain()`, the
+same is computed in plain numpy.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from neurove_core.engine import array_folding, array_plain
+from neurove_core.engine.array_folding import ArrayLayer
+from neurove_core.engine.cells import flattened_weights, run_cells
+from neurove_core.engine.fallback import reason_of, vectors_work, warn_once
+from neurove_core.engine.spike_lists import SpikeList
+from neurove_core.networks import tables
+from neurove_core.networks.arrays import Array, ArrayState, Weights, map_sizes
+from neurove_core.spiking.plain import is_plain
+
+Counts = NDArray[np.uint8]
+_Step = Callable[..., tuple[SpikeList, Array]]
+
+
+class _Compiled(NamedTuple):
+    """The compiled forms of extractor and projection."""
+
+    first: _Step
+    later: Sequence[_Step]
+    project: Callable[[SpikeList], Array]
+
+
+class ArrayRunner:
+    """Runs windows of a network, several streams in one batch; see `Runner`.
+
+    Answers to several streams equal those to each alone bit for bit.
+
+    Args:
+        weights: of the network, of kind neurove. They are copied into the layout of the compiled code.
+    """
+
+    def __init__(self, weights: Weights) -> None:
+        self._config, net = weights.config, weights.config.network
+        self._decay, self._v_th = np.float32(net.decay), np.float32(net.v_th)
+        self._layers, self._projection = array_folding.convolutions(weights), array_folding.projection(weights)
+        self._cells, self._readout = array_folding.cells(weights), array_folding.readout(weights)
+        self._between = array_folding.between(weights)
+        kappa = tables.sigmoid(float(weights.tensors["kappa_logit"]))
+        self._constants = np.array([net.alpha, net.v_th, kappa], np.float32)
+        self._flat = flattened_weights(None, self._cells, self._between, self._readout)
+        self._sizes = map_sizes(weights.config)[1:]
+        self._compiled = _compiled(self._layers, self._projection, net.encoding)
+        self._spread = weights.spread
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether extractor and projection run in compiled code."""
+        return self._compiled is not None
+
+    def initial_state(self) -> ArrayState:
+        """The zero state of one stream."""
+        net = self._config.network
+        maps = zip(self._layers, self._sizes, strict=True)
+        membranes = tuple(np.zeros((1, *size, layer.outputs), np.float32) for layer, size in maps)
+        cells = np.zeros((3 * net.cells, 1, net.hidden), np.float32)
+        return ArrayState(membranes, cells, np.zeros((1, self._readout.bias.size), np.float32), net.channels)
+
+    def log_sigma(self, state: ArrayState) -> NDArray[np.float64] | None:
+        """Log sigma (6) of the window that led to a state; None without a spread."""
+        if not self._spread:
+            return None
+        return state.readout[0, 6 * self._config.window.bins :].astype(np.float64)
+
+    def run(
+        self, counts: Sequence[Counts], states: Sequence[ArrayState]
+    ) -> list[tuple[NDArray[np.float64], ArrayState]]:
+        """One window of each stream; see `Runner.run`."""
+        together = np.ascontiguousarray(counts[0])[None] if len(counts) == 1 else np.stack(counts)
+        before = [np.concatenate(maps) for maps in zip(*(state.membranes for state in states), strict=True)]
+        extract = self._plainly if is_plain() or self._compiled is None else self._fast
+        rows, after = extract(together, before)
+        found = []
+        for b, state in enumerate(states):
+            twists, cells, y = self._answer(rows[b : b + 1, : self._config.network.features], state)
+            # copied, because a view would keep the memory of all streams
+            own = tuple(v[b : b + 1].copy() if len(states) > 1 else v for v in after)
+            found.append((twists, ArrayState(own, cells, y, state.channels)))
+        return found
+
+    def _fast(self, counts: Counts, before: list[Array]) -> tuple[Array, list[Array]]:
+        """Currents (B, F) of the projection, and the potentials of each block after the step."""
+        assert self._compiled is not None
+        spikes, v = self._compiled.first(counts, before[0], self._decay, self._v_th)
+        after = [v]
+        for layer, membrane in zip(self._compiled.later, before[1:], strict=True):
+            spikes, v = layer(spikes, membrane, self._decay, self._v_th)
+            after.append(v)
+        return self._compiled.project(spikes), after
+
+    def _plainly(self, counts: Counts, before: list[Array]) -> tuple[Array, list[Array]]:
+        net = self._config.network
+        table = tables.of_encoding(net.encoding)
+        if net.precision == "int8":
+            table = tables.codes_of(net.encoding).astype(np.float32)
+        x: NDArray[np.generic] = table[counts.transpose(0, 2, 3, 1)]
+        after = []
+        for layer, membrane in zip(self._layers, before, strict=True):
+            currents = array_plain.convolve(x.astype(np.float32), layer)
+            x, v = array_plain.fire(currents, membrane, self._decay, self._v_th)
+            after.append(v)
+        return array_plain.project(x.astype(np.bool_), self._projection), after
+
+    def _answer(self, rows: Array, state: ArrayState) -> tuple[NDArray[np.float64], Array, Array]:
+        """Twists (n, 6), and the state of cells and readout after them."""
+        cells, y = state.cells.copy(), state.readout.copy()
+        if is_plain():
+            given = self._cells, self._between, self._readout, self._constants
+            answers = array_plain.run_cells(rows, *given, cells, y)[None]
+        else:
+            answers = np.empty((1, *y.shape), np.float32)
+            run_cells(np.ascontiguousarray(rows), self._flat, 0, self._constants, cells, y, answers)
+        bins = self._config.window.bins
+        return answers[0, 0, : 6 * bins].reshape(bins, 6).astype(np.float64), cells, y
+
+
+def _compiled(layers: list[ArrayLayer], projection: ArrayLayer, encoding: str) -> _Compiled | None:
+    """The compiled forms where they work and equal plain numpy bit for bit, else None with one warning."""
+    if not vectors_work():
+        return None
+    try:
+        from neurove_core.engine.array_fast import FirstLayer, ListLayer, ListProjection, fits
+
+        if not fits(layers, projection):
+            return None
+        first, later = FirstLayer(layers[0], encoding), [ListLayer(layer) for layer in layers[1:]]
+        project = ListProjection(projection)
+        if first.agrees() and all(layer.agrees() for layer in later) and project.agrees():
+            return _Compiled(first, later, project)
+        reason = "its results differ"
+    except Exception as error:  # noqa: BLE001  # numba raises anything while it compiles
+        reason = reason_of(error)
+    warn_once("layers over spike lists", reason)
+    return None
