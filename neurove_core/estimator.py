@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.extras import installed
 from neurove_core.geometry.tables import TABLES
 from neurove_core.ingest import windows
 from neurove_core.ingest.channels import Recent, remembered, with_history
@@ -28,6 +27,7 @@ from neurove_core.refine.ground import GroundState
 from neurove_core.refine.rotation import Given, Rate
 from neurove_core.refine.rotation import Refined as RotationFound
 from neurove_core.refine.view import View
+from neurove_core.running import form_of, runner_of
 from neurove_core.timescales import Answer, Longer, chosen, followed, jobs, slowed, watched
 from neurove_protocol import CameraInfo, Events, Sensor
 from neurove_protocol.errors import BadModel
@@ -131,7 +131,8 @@ class Estimator:
         self._refines = refine and bundle.uncertainty is not None and bundle.metadata.refine == "auto"
         self._bounds = bounds
         self.config = bundle.config
-        self._runner: Runner = runner or _runner_of(bundle)
+        self._runner: Runner = runner or runner_of(bundle)
+        self.form = form_of(self._runner)  # of the engine, and why this one serves
         self._offset, self._scale = bundle.scaling
 
     def initial_state(self, sensor: Sensor, camera: CameraInfo | None = None) -> StreamState:
@@ -312,22 +313,6 @@ class Estimator:
             covariance=covariance,
             uncertain=self.is_uncertain(twists, covariance),
         )
-
-
-def _runner_of(bundle: Bundle) -> Runner:
-    """The fastest runner of a model: on arrays, whether it was read from a file or is in memory; baselines in torch.
-
-    Both run the same code, so a golden test that was recorded of a model in memory holds for its file.
-    """
-    if bundle.config.kind == "neurove":
-        from neurove_core.engine.array_runner import ArrayRunner
-
-        found = ArrayRunner(bundle.current_weights)
-        if found.is_compiled or not installed("torch"):
-            return found  # else torch is faster than plain numpy
-    from neurove_core.engine.runner import runner_of
-
-    return runner_of(bundle.network.eval().requires_grad_(requires_grad=False))
 
 
 def _begin(push: Push, pushed: Pushed) -> _Progress:

@@ -254,6 +254,7 @@ class HealthReply(Message):
     missing_streams: Annotated[tuple[Name, ...], Field(strict=False)] = ()  # expected, and without packets now
     namesakes: Count = 0  # other nodes of this name on the network
     labels: Labels = Field(default_factory=dict)  # of its configuration, such as its site
+    form: str = ""  # of the engine that serves the active model, and why
 
 
 class ModelsReply(Message):

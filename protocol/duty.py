@@ -1,6 +1,5 @@
 """Messages of nodes that stand by for each other: role, state, take; drain; and the rule that a consumer follows."""
 
-from collections import deque
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
@@ -14,8 +13,8 @@ MAX_STATE_BYTES = 33 << 20
 QUIET_NS = 10_000_000_000
 """After this time without an estimate a consumer accepts any term: the nodes may have restarted with another clock."""
 
-REMEMBERED = 64
-"""Windows that a consumer remembers, to take none of them again from the next node."""
+AGAIN_US = 5_000_000
+"""At the begin of a term, windows up to this much before the newest one are not taken again."""
 
 Role = Literal["answers", "follows", "listens", "absent"]
 """A node publishes the estimates of a stream; it keeps its own and hears those of another node; it knows no node that
@@ -109,8 +108,8 @@ class Newest:
     def __init__(self) -> None:
         self._term = -1
         self._at_ns = 0
-        self._taken: deque[int] = deque(maxlen=REMEMBERED)  # starts of the newest windows
-        self._answered: frozenset[int] = frozenset()  # those before the term, until its first new window
+        self._newest_us = 0  # start of the newest window that was taken
+        self._begins = False  # no new window of the term was taken yet
 
     def takes(self, term: int | None, start_us: int, now_ns: int) -> bool:
         """Whether to take an estimate.
@@ -125,9 +124,9 @@ class Newest:
         if term < self._term and now_ns - self._at_ns < QUIET_NS:
             return False
         if term != self._term:
-            self._term, self._answered = term, frozenset(self._taken)
-        if start_us in self._answered:
+            self._begins = self._term >= 0
+            self._term = term
+        if self._begins and 0 <= self._newest_us - start_us < AGAIN_US:
             return False
-        self._at_ns, self._answered = now_ns, frozenset()
-        self._taken.append(start_us)
+        self._at_ns, self._begins, self._newest_us = now_ns, False, start_us
         return True

@@ -117,6 +117,10 @@ class Keys:
         """Liveliness token of a node that serves a stream."""
         return self._of_node(node, f"serves/{stream if stream == '*' else check_name('stream', stream)}")
 
+    def shares(self, node: str = "*", capacity: int | str = "*") -> str:
+        """Liveliness token of a node that shares streams, with its capacity."""
+        return self._of_node(node, f"shares/{capacity if capacity == '*' else check_name('capacity', str(capacity))}")
+
     def duty(self, node: str = "*") -> str:
         """Queryable: whether a node answers or follows a stream; between nodes that stand by for each other."""
         return self._of_node(node, "duty/role")
@@ -144,6 +148,21 @@ class Keys:
         if not key.startswith(head) or not leaf:
             raise InvalidField("key", "key", key, f"{head}<node>/<message>")
         return check_name("node", name)
+
+    def shared_of(self, key: str) -> tuple[str, int]:
+        """Node and capacity of a key from `shares`.
+
+        >>> Keys().shared_of("neurove/v1/@node/n1/shares/2")
+        ('n1', 2)
+
+        Raises:
+            InvalidField: it is another key.
+        """
+        node = self.node_of(key)
+        leaf = key.removeprefix(f"{self.prefix}/@node/{node}/shares/")
+        if not re.fullmatch("[0-9]{1,4}", leaf):
+            raise InvalidField("key", "key", key, f"{self.prefix}/@node/<node>/shares/<capacity>")
+        return node, int(leaf)
 
     def served_of(self, key: str) -> str:
         """The stream of a key from `serves`.

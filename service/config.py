@@ -78,6 +78,7 @@ def _standby(value: object) -> object:
 
 
 Endpoints = Annotated[tuple[Annotated[str, AfterValidator(check_endpoint)], ...], NoDecode, BeforeValidator(_listed)]
+Pattern = Annotated[str, Field(pattern=r"^[A-Za-z0-9_.*-]{1,64}$")]
 GivenPath = Annotated[Path, BeforeValidator(_given)]
 Names = Annotated[
     tuple[Annotated[str, AfterValidator(lambda name: check_name("expect_streams", name))], ...],
@@ -179,6 +180,19 @@ class ServiceConfig(_Settings):
         description="Stand by for other nodes on the same streams: one answers, the others follow and take over. lot: "
         "any node may answer first; last or true: the other nodes take precedence; off or false: answer every stream.",
     )
+    streams: Annotated[tuple[Pattern, ...], NoDecode, BeforeValidator(_listed)] = Field(
+        ("*",), min_length=1, description="Patterns of the names of the streams that this node serves, such as left_*."
+    )
+    copies: int = Field(
+        0,
+        ge=0,
+        le=16,
+        description="Share the streams: so many of the nodes that are alive serve each stream; 0: every node. It needs "
+        "standby.",
+    )
+    capacity: int = Field(
+        1, ge=1, le=1000, description="Share of the streams that this node takes, relative to others."
+    )
     max_packet_events: int = Field(
         1_000_000,
         ge=1,
@@ -252,6 +266,13 @@ class ServiceConfig(_Settings):
                 f"{mode} mode needs an endpoint to listen on or to connect to: nothing could reach this node"
             )
         return connect
+
+    @field_validator("copies")
+    @classmethod
+    def _sharing_needs_standby(cls, copies: int, info: ValidationInfo) -> int:
+        if copies and info.data.get("standby") == "off":
+            raise ValueError("it needs standby, so that streams move between nodes without a gap")
+        return copies
 
     @property
     def state_folder(self) -> Path | None:

@@ -67,8 +67,8 @@ def _rules(role: str, name: str, prefix: str, domain: int) -> list[Rule]:
     results = [f"{prefix}/*/velocity", f"{prefix}/*/status"]
     asked = [f"{node}/health", f"{node}/models"]
     change, chunks = f"{node}/model/**", f"{prefix}/@push/**"
-    duty, drain = f"{node}/duty/**", f"{node}/drain"
-    own = f"{prefix}/@node/{name}"
+    duty, drain = f"{node}/duty/*", f"{node}/drain"
+    own, shared = f"{prefix}/@node/{name}", [f"{node}/serves/*", f"{node}/shares/*"]
     if role == "driver":  # events, camera and IMU of its own stream
         published = [f"{prefix}/{name}/{kind}" for kind in ("events", "camera", "imu")]
         return [
@@ -81,13 +81,13 @@ def _rules(role: str, name: str, prefix: str, domain: int) -> list[Rule]:
             *_asks([camera, chunks, duty]),  # the nodes that stand by for each other
             *_publishes(results, heard_as=results),
             *_answers(
-                [f"{own}/health", f"{own}/models", f"{own}/model/**", f"{own}/duty/**", f"{own}/drain"],
+                [f"{own}/health", f"{own}/models", f"{own}/model/**", f"{own}/duty/*", f"{own}/drain"],
                 asked_as=[*asked, change, duty, drain],
             ),
             (IN, ["reply"], [change, duty]),  # an error reply has the key of the query, maybe for all nodes
-            (IN, ["liveliness_query", "declare_liveliness_subscriber"], [f"{own}/instance/*", f"{node}/serves/*"]),
-            (OUT, ["liveliness_token"], [f"{own}/instance/*", f"{node}/serves/*"]),
-            (IN, ["liveliness_token"], [f"{own}/alive", f"{own}/serves/*", f"{own}/instance/*"]),
+            (IN, ["liveliness_query", "declare_liveliness_subscriber"], [f"{own}/instance/*", *shared]),
+            (OUT, ["liveliness_token"], [f"{own}/instance/*", *shared]),
+            (IN, ["liveliness_token"], [f"{own}/alive", f"{own}/serves/*", f"{own}/instance/*", f"{own}/shares/*"]),
         ]
     if role == "ros":  # a node of ROS 2: everything of its domain, and nothing of ours
         return _ros(domain)

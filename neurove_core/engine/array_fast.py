@@ -7,6 +7,7 @@ neurons fire.
 This module needs vectors.py: import it only where `fallback.vectors_work()`.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any, Final
 
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 
 from neurove_core.engine import array_plain, sparse_int8_kernels, sparse_kernels
 from neurove_core.engine.array_folding import ArrayLayer
-from neurove_core.engine.spike_lists import SPARE, SpikeList, empty_list, in_groups, output_shape
+from neurove_core.engine.spike_lists import SpikeList, empty_list, fill_spikes, in_groups, list_of, output_shape
 from neurove_core.engine.tiles import tile_of
 from neurove_core.engine.vectors import cells_tile, has_byte_products, list_tile
 from neurove_core.networks import tables
@@ -25,6 +26,8 @@ Counts = NDArray[np.uint8]
 
 _CHUNK: Final = 512  # inputs of the projection whose weights stay in the second-level cache
 _NO_VALUES: Final = np.empty(0, np.float32)
+_NO_COUNTS: Final = np.empty(0, np.uint8)
+_EXACT: Final = 1 << 24  # integers below this are exact in float32
 _SILENT: Final = np.float32(0), np.float32(np.inf)  # no neuron fires, and the potentials equal the currents
 
 
@@ -117,6 +120,110 @@ class ListLayer:
         return True
 
 
+class DenseLayer:
+    """A later block over all neurons, which is faster where many fire; its sums equal those of `ListLayer`.
+
+    Args:
+        layer: its weights.
+    """
+
+    def __init__(self, layer: ArrayLayer) -> None:
+        self._layer, self._widths = layer, (layer.weight.shape[2], layer.outputs)
+        self._tile, self._firing = cells_tile(layer.outputs), tile_of(layer.outputs)
+        whole = layer.factor is None
+        self._weight = layer.weight.reshape(-1) if whole else in_groups(layer.weight, 4 if has_byte_products() else 2)
+
+    def __call__(self, spikes: SpikeList, v: Array, decay: np.float32, v_th: np.float32) -> tuple[SpikeList, Array]:
+        """Potentials v (B, H', W', C') before the step to spikes and potentials after it."""
+        shape = output_shape(spikes.shape, self._widths, v)
+        (indices, starts), after = empty_list(shape), np.empty_like(v)
+        written: Any = v, after, decay, v_th, indices, starts
+        factor, offset = self._layer.factor, self._layer.offset
+        maps = np.zeros((spikes.shape[0], math.prod(spikes.shape[1:])), np.float32 if factor is None else np.uint8)
+        fill_spikes(spikes.indices, spikes.starts, maps)
+        if factor is None:
+            given: Any = spikes.shape, maps.reshape(-1), _NO_COUNTS, _NO_VALUES, self._weight, offset
+            count = sparse_kernels.convolve_values(self._tile, self._firing, *given, *written)
+        else:
+            codes = np.ascontiguousarray(maps.reshape(spikes.shape).transpose(0, 3, 1, 2))
+            count = sparse_int8_kernels.convolve_codes(self._tile, codes, self._weight, factor, offset, *written)
+        return SpikeList(indices, starts, shape, count), after
+
+
+class WideFirstLayer:
+    """The first block of an int8 model with its integers in float32, where all sums are exact; see `is_exact`.
+
+    Args:
+        layer: its weights, with a factor.
+        encoding: `encoding` of NetworkConfig.
+    """
+
+    def __init__(self, layer: ArrayLayer, encoding: str) -> None:
+        self._layer, self._inputs = layer, layer.weight.shape[2]
+        self._tile, self._firing = cells_tile(layer.outputs), tile_of(layer.outputs)
+        self._table, self._weight = tables.codes_of(encoding).astype(np.float32), _wide(layer)
+        self._none = np.zeros(layer.outputs, np.float32)
+
+    def __call__(self, counts: Counts, v: Array, decay: np.float32, v_th: np.float32) -> tuple[SpikeList, Array]:
+        """Potentials v (B, H', W', C') before the step to spikes and potentials after it."""
+        maps, channels, rows, columns = counts.shape
+        given = maps, rows, columns, channels
+        shape = output_shape(given, (self._inputs, self._layer.outputs), v)
+        lists, sums = empty_list(shape), np.empty_like(v)
+        layer: Any = given, _NO_VALUES, counts.reshape(-1), self._table, self._weight, self._none
+        written: Any = np.zeros_like(v), sums, *_SILENT, *lists
+        sparse_kernels.convolve_values(self._tile, self._firing, *layer, *written)
+        return _fired(self._firing, self._layer, sums, shape, v, decay, v_th)
+
+
+class WideListLayer:
+    """A later block of an int8 model with its integers in float32, where all sums are exact; see `is_exact`.
+
+    Args:
+        layer: its weights, with a factor.
+    """
+
+    def __init__(self, layer: ArrayLayer) -> None:
+        self._layer, self._widths = layer, (layer.weight.shape[2], layer.outputs)
+        self._tile, self._firing, self._weight = list_tile(layer.outputs), tile_of(layer.outputs), _wide(layer)
+        self._none = np.zeros(layer.outputs, np.float32)
+
+    def __call__(self, spikes: SpikeList, v: Array, decay: np.float32, v_th: np.float32) -> tuple[SpikeList, Array]:
+        """Potentials v (B, H', W', C') before the step to spikes and potentials after it."""
+        shape = output_shape(spikes.shape, self._widths, v)
+        lists, sums = empty_list(shape), np.empty_like(v)
+        given: Any = self._tile, spikes.indices, spikes.starts, spikes.shape, self._weight, self._none
+        written: Any = np.zeros_like(v), sums, *_SILENT, *lists
+        sparse_kernels.convolve_list(*given, *written)
+        return _fired(self._firing, self._layer, sums, shape, v, decay, v_th)
+
+
+def is_exact(layers: Sequence[ArrayLayer]) -> bool:
+    """Whether float32 holds every integer sum of these convolutions."""
+    tops = [255, *[1] * (len(layers) - 1)]
+    return all(_largest_sum(layer) * top < _EXACT for layer, top in zip(layers, tops, strict=True))
+
+
+def _wide(layer: ArrayLayer) -> Array:
+    return layer.weight.astype(np.float32).reshape(-1)
+
+
+def _fired(
+    tile: tuple[int, ...],
+    layer: ArrayLayer,
+    sums: Array,
+    shape: tuple[int, int, int, int],
+    v: Array,
+    decay: np.float32,
+    v_th: np.float32,
+) -> tuple[SpikeList, Array]:
+    """Spikes and potentials of integer sums in float32."""
+    assert layer.factor is not None
+    (indices, starts), after = empty_list(shape), np.empty_like(v)
+    given = tile, sums.reshape(-1), layer.factor, layer.offset, v, after, decay, v_th, indices, starts
+    return SpikeList(indices, starts, shape, sparse_int8_kernels.fire_sums(*given)), after
+
+
 class ListProjection:
     """The projection: the spikes of (R, H, W, C) to currents (R, F).
 
@@ -156,17 +263,6 @@ def fits(layers: Sequence[ArrayLayer], projection: ArrayLayer) -> bool:
         and all(_largest_sum(layer) < 1 << 31 for layer in layers)
         and _largest_sum(projection) < 1 << 31
     )
-
-
-def list_of(maps: NDArray[np.bool_]) -> SpikeList:
-    """The spike list of maps (R, H, W, C)."""
-    flat = maps.reshape(maps.shape[0], -1)
-    found = np.nonzero(flat)[1]
-    indices = np.zeros(found.size + SPARE, np.int32)
-    indices[: found.size] = found
-    cells = np.count_nonzero(maps.reshape(-1, maps.shape[3]), axis=1)
-    starts = np.concatenate([[0], np.cumsum(cells)]).astype(np.int32)
-    return SpikeList(indices, starts, maps.shape, found.size)
 
 
 def _largest_sum(layer: ArrayLayer) -> int:

@@ -6,7 +6,8 @@ same is computed in plain numpy.
 """
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from functools import partial
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from neurove_core.engine import array_folding, array_plain
 from neurove_core.engine.array_folding import ArrayLayer
 from neurove_core.engine.cells import flattened_weights, run_cells
+from neurove_core.engine.choice import VARIABLE, Choice, fastest, pinned
 from neurove_core.engine.fallback import reason_of, vectors_work, warn_once
 from neurove_core.engine.spike_lists import SpikeList
 from neurove_core.networks import tables
@@ -21,6 +23,7 @@ from neurove_core.networks.arrays import Array, ArrayState, Weights, map_sizes
 from neurove_core.spiking.plain import is_plain
 
 Counts = NDArray[np.uint8]
+_TIMED: Final = 4  # windows that are timed
 _Step = Callable[..., tuple[SpikeList, Array]]
 
 
@@ -53,11 +56,45 @@ class ArrayRunner:
         self._sizes = map_sizes(weights.config)[1:]
         self._compiled = _compiled(self._layers, self._projection, net.encoding)
         self._spread = weights.spread
+        self.choice = (
+            Choice("sparse", "not timed") if self._compiled else Choice("plain", "no compiled form works here")
+        )
 
     @property
     def is_compiled(self) -> bool:
         """Whether extractor and projection run in compiled code."""
         return self._compiled is not None
+
+    def choose(self, windows: Counts | None) -> None:
+        """Serve by the form that the environment names, else by the fastest one; every form gives the same answers.
+
+        Args:
+            windows: (T, C, H, W) network input of the windows to time; None where there are none.
+
+        Raises:
+            InvalidField: the environment names a form that there is not.
+        """
+        asked = pinned()
+        if self._compiled is None:
+            return
+        forms = _forms(self._compiled, self._layers, self._config.network.encoding)
+        if asked is not None:
+            why = f"named by {VARIABLE}" if asked in forms else f"{VARIABLE}={asked} does not fit this model"
+            self.choice = Choice(asked if asked in forms else "sparse", why)
+        elif windows is None:
+            self.choice = Choice("sparse", "the model has no golden windows to time")
+        else:
+            some = windows[:_TIMED]
+            self.choice = fastest({name: partial(self._features, form, some) for name, form in forms.items()})
+        self._compiled = forms[self.choice.form]
+
+    def _features(self, form: "_Compiled", windows: Counts) -> Array:
+        """Currents of the projection and potentials of all blocks over consecutive windows, from the zero state."""
+        membranes, found = list(self.initial_state().membranes), []
+        for counts in windows:
+            rows, membranes = self._over(form, np.ascontiguousarray(counts)[None], membranes)
+            found += [rows, *membranes]
+        return np.concatenate([part.reshape(-1) for part in found])
 
     def initial_state(self) -> ArrayState:
         """The zero state of one stream."""
@@ -92,12 +129,15 @@ class ArrayRunner:
     def _fast(self, counts: Counts, before: list[Array]) -> tuple[Array, list[Array]]:
         """Currents (B, F) of the projection, and the potentials of each block after the step."""
         assert self._compiled is not None
-        spikes, v = self._compiled.first(counts, before[0], self._decay, self._v_th)
+        return self._over(self._compiled, counts, before)
+
+    def _over(self, form: "_Compiled", counts: Counts, before: list[Array]) -> tuple[Array, list[Array]]:
+        spikes, v = form.first(counts, before[0], self._decay, self._v_th)
         after = [v]
-        for layer, membrane in zip(self._compiled.later, before[1:], strict=True):
+        for layer, membrane in zip(form.later, before[1:], strict=True):
             spikes, v = layer(spikes, membrane, self._decay, self._v_th)
             after.append(v)
-        return self._compiled.project(spikes), after
+        return form.project(spikes), after
 
     def _plainly(self, counts: Counts, before: list[Array]) -> tuple[Array, list[Array]]:
         net = self._config.network
@@ -123,6 +163,17 @@ class ArrayRunner:
             run_cells(np.ascontiguousarray(rows), self._flat, 0, self._constants, cells, y, answers)
         bins = self._config.window.bins
         return answers[0, 0, : 6 * bins].reshape(bins, 6).astype(np.float64), cells, y
+
+
+def _forms(sparse: _Compiled, layers: list[ArrayLayer], encoding: str) -> dict[str, _Compiled]:
+    """All compiled forms of a network, by name; the usual one first."""
+    from neurove_core.engine.array_fast import DenseLayer, WideFirstLayer, WideListLayer, is_exact
+
+    forms = {"sparse": sparse, "dense": sparse._replace(later=[DenseLayer(layer) for layer in layers[1:]])}
+    if layers[0].factor is not None and is_exact(layers):
+        later = [WideListLayer(layer) for layer in layers[1:]]
+        forms["float32"] = _Compiled(WideFirstLayer(layers[0], encoding), later, sparse.project)
+    return forms
 
 
 def _compiled(layers: list[ArrayLayer], projection: ArrayLayer, encoding: str) -> _Compiled | None:

@@ -36,14 +36,17 @@ def to_maps(spikes: SpikeList, kind: type[np.generic] = np.float32) -> "Tensor":
 
 def to_list(maps: "Tensor") -> SpikeList:
     """The spike list of maps (R, C, H, W); the inverse of `to_maps`."""
-    rows = channels_last(maps)
-    flat = rows.reshape(rows.shape[0], -1)
-    found = np.nonzero(flat)[1]
+    return list_of(channels_last(maps))
+
+
+def list_of(maps: NDArray[Any]) -> SpikeList:
+    """The spike list of maps (R, H, W, C), channels last."""
+    found = np.nonzero(maps.reshape(maps.shape[0], -1))[1]
     indices = np.zeros(found.size + SPARE, np.int32)
     indices[: found.size] = found
-    cells = np.count_nonzero(rows.reshape(-1, rows.shape[3]), axis=1)
+    cells = np.count_nonzero(maps.reshape(-1, maps.shape[3]), axis=1)
     starts = np.concatenate([[0], np.cumsum(cells)]).astype(np.int32)
-    return SpikeList(indices, starts, rows.shape, found.size)
+    return SpikeList(indices, starts, maps.shape, found.size)
 
 
 def output_shape(given: tuple[int, ...], weights: tuple[int, int], v: Array) -> tuple[int, int, int, int]:

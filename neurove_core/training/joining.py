@@ -13,6 +13,7 @@ import socket
 from collections.abc import Iterator
 from dataclasses import replace
 from datetime import timedelta
+from pathlib import Path
 from typing import Final
 
 import numpy as np
@@ -23,6 +24,9 @@ from neurove_core.training.ranks import LostRank, Ranks, device_of, first_words
 from neurove_protocol.errors import InvalidField
 
 _TIMEOUT: Final = timedelta(minutes=10)  # of one exchange; a closed connection is detected at once
+STORE: Final = "NEUROVE_TRAINING_STORE"
+"""Environment variable of processes on one machine: the folder of the files through which they find each other."""
+
 _PLACE: Final = ("RANK", "WORLD_SIZE", "MASTER_ADDR", "MASTER_PORT")
 
 
@@ -74,7 +78,7 @@ def joined(device: str) -> Iterator[Ranks]:
         if loopback:  # otherwise the ports of gloo would be open to the network
             os.environ.setdefault("GLOO_SOCKET_IFNAME", loopback)
     try:
-        dist.init_process_group("gloo", init_method="env://", timeout=_TIMEOUT)
+        _connect(ranks)
     except (RuntimeError, ValueError) as error:
         raise LostRank(ranks.rank, f"cannot reach the others ({first_words(error)})") from error
     try:
@@ -88,6 +92,17 @@ def joined(device: str) -> Iterator[Ranks]:
         yield ranks
     finally:
         dist.destroy_process_group()
+
+
+def _connect(ranks: Ranks) -> None:
+    folder = os.environ.get(STORE)
+    if folder is None:
+        dist.init_process_group("gloo", init_method="env://", timeout=_TIMEOUT)
+        return
+    round_ = _whole("TORCHELASTIC_RESTART_COUNT", 0)  # a file holds what the processes of one start have said
+    path = str(Path(folder) / f"round{round_}")
+    store = dist.FileStore(path, ranks.count)  # type: ignore[attr-defined]  # gap in the stubs of torch
+    dist.init_process_group("gloo", store=store, rank=ranks.rank, world_size=ranks.count, timeout=_TIMEOUT)
 
 
 def _on_loopback(host: str) -> bool:

@@ -15,7 +15,7 @@ EXTRAS: Final[dict[str, tuple[str, ...]]] = {
     "carla": ("carla",),
     "camera": ("dv_processing", "neuromorphic_drivers"),
     "metrics": ("prometheus_client",),
-    "page": ("PIL", "starlette", "uvicorn"),
+    "page": ("starlette", "uvicorn"),
     "foxglove": ("foxglove",),
     "ros2": ("xxhash",),
     "cluster": ("dask", "distributed"),

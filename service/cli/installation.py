@@ -79,19 +79,15 @@ def check_engine() -> Check:
     if missing := absent("serve"):
         return Check("fast path", f"unknown: {', '.join(missing)} not installed", "info")
     from neurove_core import models
-    from neurove_core.engine.array_runner import ArrayRunner
     from neurove_core.engine.vectors import has_byte_products
+    from neurove_core.estimator import Estimator
 
-    weights = models.find(models.DEFAULT).weights
-    if weights is None:
-        return Check("fast path", "none: the built-in model is no NeuroVE network", "info")
-    precision = weights.config.network.precision
+    model = models.find(models.DEFAULT)
+    form = Estimator(model).form
     int8 = f"int8 models {'with' if has_byte_products() else 'without'} VNNI"
-    if precision == "int8":
-        return Check("fast path", int8, "ok")
-    if ArrayRunner(weights).is_compiled:
-        return Check("fast path", f"sparse {precision}; {int8}", "ok")
-    return Check("fast path", f"dense {precision}: the sparse form does not work here", "bad", "see the warning above")
+    if form.startswith(("plain", "torch")):
+        return Check("fast path", f"{form}: the compiled forms do not work here", "bad", "see the warning above")
+    return Check("fast path", f"{form}; {model.config.network.precision}; {int8}", "ok")
 
 
 def check_cameras(devices: Path = DEVICES, nodes: Path = NODES) -> Check:

@@ -49,7 +49,23 @@ def health_table(replies: list[HealthReply]) -> RenderableType:
         if reply.streams:
             parts.append(_streams_table(reply.streams))
             parts.extend(Text(note, style="yellow") for status in reply.streams for note in status_notes(status))
+            parts.extend(Text(duty, style="dim") for duty in map(_duty_text, reply.streams) if duty)
     return Group(*parts)
+
+
+def _duty_text(status: StreamStatus) -> str:
+    """What a node does on a stream that several nodes can answer; empty where it alone serves it."""
+    standby = status.standby
+    if standby is None:
+        return ""
+    drained = ", is drained" if standby.draining else ""
+    if standby.role == "answers":
+        nodes = "1 other node serves" if standby.followers == 1 else f"{standby.followers} other nodes serve"
+        return f"{status.stream}: this node answers, {nodes} it{drained}"
+    if standby.role == "follows":
+        state = "with equal state" if standby.equal else "its state is not equal yet"
+        return f"{status.stream}: follows {standby.leader}, {state}{drained}"
+    return f"{status.stream}: hears no node that answers{drained}"
 
 
 def _streams_table(streams: tuple[StreamStatus, ...]) -> Table:

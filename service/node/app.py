@@ -27,6 +27,7 @@ from neurove_service.node.handlers import Handlers
 from neurove_service.node.housekeeping import Housekeeping
 from neurove_service.node.namesakes import Namesakes
 from neurove_service.node.outlets import open_outlet, route
+from neurove_service.node.sharing import Moving, Sharing
 from neurove_service.node.snapshot import Snapshot
 from neurove_service.node.watchdog import Watchdog
 from neurove_service.streams.comparison import TrialLimits
@@ -83,6 +84,10 @@ def _fellows(config: ServiceConfig, transport: Transport) -> Fellows | None:
     if config.standby == "off":
         return None
     return Fellows(transport, config.keys, config.node, reluctant=config.standby == "last")
+
+
+def _sharing(config: ServiceConfig) -> Sharing:
+    return Sharing(config.node, config.streams, config.copies, config.capacity)
 
 
 def _housekeeping(
@@ -159,13 +164,14 @@ class Service:
                 return
             raise
         with opened as transport:
-            fellows = _fellows(self._config, transport)
+            fellows, sharing = _fellows(self._config, transport), _sharing(self._config)
             registry = StreamRegistry(
                 self._slot,
                 _stream_settings(self._config),
                 lambda name: open_outlet(transport, self._keys, self._config.node, name),
                 self._guard,
                 fellows.open_duty if fellows else alone,
+                sharing.takes,
             )
             namesakes = Namesakes(transport, self._keys, self._config.node)
             namesakes.join(self._stop, allowed=self._config.allow_same_name)
@@ -174,6 +180,8 @@ class Service:
             )
             if fellows:
                 fellows.join()
+                sharing.join(transport, self._keys)
+                Moving(sharing, registry, fellows, self._guard).start(self._stop)
             handlers = self._declare(transport, registry, watch)
             self._log_ready()
             housekeeping = _housekeeping(self._config, transport, registry, watch, self._guard)

@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 
 from neurove_protocol import TwistEstimate
-from neurove_protocol.codec import Message
+from neurove_protocol.codec import Message, MessageT
 from neurove_protocol.duty import (
     DrainReply,
     DrainRequest,
@@ -73,14 +73,14 @@ class Fellows:
 
     def roles(self, stream: str, timeout_s: float) -> list[DutyReply]:
         """What the other nodes do on a stream, as far as they reply in time."""
-        replies = [DutyReply.decode(one) for one in self._ask(self._keys.duty(), DutyRequest(stream=stream), timeout_s)]
+        replies = self._ask(self._keys.duty(), DutyRequest(stream=stream), DutyReply, timeout_s)
         return [one for one in replies if one.node != self._node]
 
     def state(self, stream: str, node: str, digest: str) -> StateReply | None:
         """The state of a stream on another node."""
         request = StateRequest(stream=stream, digest=digest)
-        replies = self._ask(self._keys.state(node), request, _STATE_S)
-        return StateReply.decode(replies[0]) if replies else None
+        replies = self._ask(self._keys.state(node), request, StateReply, _STATE_S)
+        return replies[0] if replies else None
 
     def drain(self, *, resume: bool = False, patience_s: float = _TAKE_S) -> DrainReply:
         """Hand over every stream that this node answers to a node that follows it; `resume` ends the draining.
@@ -105,6 +105,16 @@ class Fellows:
         log.info("drained" if not resume else "draining ended", handed=len(handed), kept=len(kept))
         return DrainReply(node=self._node, handed=handed, kept=kept)
 
+    def leaves(self, stream: str) -> bool:
+        """Hand over a stream if this node answers it; whether another node answers it now."""
+        pair = self._pairs.get(stream)
+        if pair is None:
+            return False
+        if pair.reply().role == "answers":
+            node, _ = self._hand_over(stream, pair, _TAKE_S)
+            return bool(node)
+        return pair.reply().role == "follows"
+
     def _hand_over(self, stream: str, pair: Pair, patience_s: float) -> tuple[str, str]:
         """Hand over one stream; the node that answers it now, or why there is none."""
         others = self.roles(stream, patience_s) if self.names(stream) else []
@@ -117,6 +127,7 @@ class Fellows:
         self._ask(
             self._keys.take(target),
             TakeRequest(stream=stream, node=self._node, term=resigned.term, start_us=resigned.start_us),
+            DutyReply,
             patience_s,
         )
         if not pair.flows:
@@ -135,12 +146,20 @@ class Fellows:
         if self._pairs.get(stream) is closed:
             del self._pairs[stream]
 
-    def _ask(self, key: str, request: Message, timeout_s: float) -> list[bytes]:
+    def _ask(self, key: str, request: Message, reply: type[MessageT], timeout_s: float) -> list[MessageT]:
+        """The replies of the nodes; one that refuses, or whose reply cannot be read, costs itself."""
         try:
-            return [one.payload for one in self._transport.ask(key, request.encode(), timeout_s)]
+            answers = self._transport.ask(key, request.encode(), timeout_s)
         except NeuroVEError as error:  # a node refused
             log.debug("no answer", key=key, why=error.message)
             return []
+        found = list[MessageT]()
+        for answer in answers:
+            try:
+                found.append(reply.decode(answer.payload))
+            except NeuroVEError as error:
+                log.warning("reply refused", key=answer.key, why=error.message)
+        return found
 
     def _on_estimate(self, key: str, payload: bytes, _received_ns: int, _sent_us: int | None) -> None:
         pair = self._pairs.get(self._keys.stream_of(key))

@@ -101,6 +101,7 @@ class Handlers:
             change=self._slot.last_change,
             rollbacks=self._slot.rollbacks,
             labels=self._labels,
+            form=active.estimator.form,
         )
 
     def models(self, request: bytes) -> bytes:

@@ -82,9 +82,9 @@ class Following:
         self._heard.clear()
         return kept
 
-    def drop(self) -> None:
-        """Forget what is kept: it is older than a long pause."""
-        self._kept.clear()
+    def renew(self, now_ns: int) -> None:
+        """Wait anew for what is kept: a long pause says nothing about the other node."""
+        self._kept = deque(((own, now_ns) for own, _ in self._kept), maxlen=KEPT)
 
     def seq_of(self, own: TwistEstimate) -> int:
         """The number of an estimate on the wire: it goes on where the other node stopped."""
@@ -170,4 +170,5 @@ class Sync:
         except NeuroVEError as error:
             log.warning("state refused", stream=self._stream, leader=reply.node, why=error.message)
             return False
+        log.info("state taken", stream=self._stream, leader=reply.node)
         return True

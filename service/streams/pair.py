@@ -8,6 +8,7 @@ A node that was suspended may have been superseded without having heard of it. S
 of `DOUBT_WINDOWS` in its own work asks the others before it publishes.
 """
 
+import math
 import threading
 import time
 from collections import deque
@@ -41,9 +42,7 @@ class Resigned(NamedTuple):
 
 
 class Pair:
-    """The duty of one node on one stream.
-
-    The worker calls `answer`, `turn`, `wait_s` and `close`; the other methods are for any thread.
+    """The duty of one node on one stream; `answer`, `turn`, `wait_s`, `close` are the worker's, others for any thread.
 
     Args:
         tenure: the role of this node.
@@ -63,12 +62,10 @@ class Pair:
     ) -> None:
         self._tenure, self._peers, self._wake, self._now_ns, self._on_close = tenure, peers, wake, now_ns, on_close
         self._stream = tenure.stream
-        self._following = Following()
-        self._sync = Sync(self._stream)
+        self._following, self._sync = Following(), Sync(tenure.stream)
         self._calls: deque[Callable[[], None]] = deque()  # from other threads, for the worker
         self._turned_ns = self._answered_ns = now_ns()
-        self._pause_ns = 0  # longest pause of the worker since the last answer
-        self._window_ns = 50_000_000
+        self._pause_ns, self._window_ns = 0, 50_000_000  # longest pause of the worker since the last answer
         self._last: TwistEstimate | None = None  # published last
 
     @property
@@ -77,7 +74,7 @@ class Pair:
         return self._now_ns() - self._answered_ns < LONG_PAUSE_NS
 
     def heard(self, estimate: TwistEstimate) -> None:
-        """Another node has published an estimate of the stream."""
+        """Another node has published an estimate."""
         self._call(lambda: self._hear(estimate))
 
     def gone(self, node: str) -> None:
@@ -125,7 +122,7 @@ class Pair:
         """The state of the stream for a follower; None if this node has no such state, or is stuck."""
         found = self._sync.ask(digest, timeout_s, self._wake)
         about = {"node": self._tenure.node, "stream": self._stream, "digest": digest}
-        return None if found is None else StateReply.model_validate(about | found._asdict())
+        return StateReply.model_validate(about | found._asdict()) if found else None
 
     def status(self) -> StandbyStatus:
         """For the status of the stream."""
@@ -152,7 +149,7 @@ class Pair:
             self._confirm(pause_ns)
             self._run_calls()
         elif not self._tenure.answers and pause_ns > LONG_PAUSE_NS:
-            self._following.drop()
+            self._following.renew(self._turned_ns)
             self._tenure.set_patience()
         if self._tenure.answers:
             return [self._stamped(estimate)]
@@ -166,17 +163,13 @@ class Pair:
         self._sync.serve(stream)
         leader = self._tenure.leader
         if self._tenure.role == "follows" and self._following.wants_state(self._now_ns()):
-            if self._sync.fetch(stream, lambda digest: self._peers.state(self._stream, leader, digest)):
-                log.info("state taken", stream=self._stream, leader=leader)
-            self._turned_ns = self._now_ns()
+            self._sync.fetch(stream, lambda digest: self._peers.state(self._stream, leader, digest))
+            self._note_pause()
         return [] if self._tenure.answers else self._due()
 
     def wait_s(self, most_s: float) -> float:
         """Until the oldest estimate that is kept is late."""
-        since_ns = self._following.since_ns
-        if self._tenure.answers or since_ns is None:
-            return most_s
-        return min(most_s, max(0.0, (since_ns + self._tenure.patience_ns(self._window_ns) - self._now_ns()) / 1e9))
+        return most_s if self._tenure.answers else min(most_s, max(0.0, self._due_in_s))
 
     def close(self) -> None:
         """The worker has ended."""
@@ -196,10 +189,17 @@ class Pair:
         self._pause_ns, self._turned_ns = max(self._pause_ns, now_ns - self._turned_ns), now_ns
         return self._pause_ns
 
+    @property
+    def _due_in_s(self) -> float:
+        """When this node takes over, unless another estimate is heard; infinite if nothing is kept [s]."""
+        since_ns = self._following.since_ns
+        patience_ns = self._tenure.patience_ns(self._window_ns, equal=self._following.equal)
+        return math.inf if since_ns is None else (since_ns + patience_ns - self._now_ns()) / 1e9
+
     def _due(self) -> list[TwistEstimate]:
-        """What to publish: nothing, or all that is kept, if this node takes over now."""
-        since_ns, tenure = self._following.since_ns, self._tenure
-        if since_ns is None or self._now_ns() - since_ns < tenure.patience_ns(self._window_ns):
+        """All that is kept, if this node takes over now."""
+        tenure = self._tenure
+        if self._due_in_s > 0:
             return []
         tenure.take_over("no other node answers" if tenure.role == "listens" else f"{tenure.leader} is late")
         if self._following.other_model:

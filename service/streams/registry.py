@@ -50,6 +50,7 @@ class StreamRegistry:
         open_outlet: opens the outlet of a stream, by its name; called on the thread of the worker.
         guard: counts internal errors.
         open_duty: opens the duty of a stream.
+        takes: whether this node takes a stream, by its name; the packets of the others are ignored.
     """
 
     def __init__(
@@ -59,7 +60,9 @@ class StreamRegistry:
         open_outlet: Callable[[str], Outlet],
         guard: Guard | None = None,
         open_duty: OpenDuty = alone,
+        takes: Callable[[str], bool] = lambda _: True,
     ) -> None:
+        self._takes = takes
         self._models, self._settings, self._open_outlet, self._open_duty = models, settings, open_outlet, open_duty
         self._guard = guard or Guard()
         self._workers: dict[str, StreamWorker] = {}
@@ -127,6 +130,10 @@ class StreamRegistry:
             log.info("stream evicted", stream=name, idle_s=self._settings.idle_evict_s)
         return idle
 
+    def release(self, name: str) -> None:
+        """End the worker of a stream that another node serves."""
+        self._end([name])
+
     def close(self) -> None:
         """End all workers and start no new ones."""
         with self._lock:
@@ -147,7 +154,7 @@ class StreamRegistry:
 
     def _worker_of(self, name: str) -> StreamWorker | None:
         worker = self._workers.get(name)
-        if worker is not None or self._closed:
+        if worker is not None or self._closed or not self._takes(name):
             return worker
         if len(self._workers) >= self._settings.max_streams:
             self._refuse(name)
@@ -182,7 +189,7 @@ class StreamRegistry:
 
     def _end(self, names: list[str]) -> None:
         with self._lock:
-            ending = [self._workers.pop(name) for name in names]
+            ending = [self._workers.pop(name) for name in names if name in self._workers]
         for worker in ending:
             worker.stop()
         deadline = time.monotonic() + _JOIN_S  # for all together

@@ -2,6 +2,7 @@
 
 import hashlib
 import time
+import zlib
 from collections.abc import Callable, Sequence
 from typing import Final, Protocol
 
@@ -16,6 +17,7 @@ LATE_WINDOWS: Final = 1.5
 DRAINING: Final = 4.0
 """A node that is drained waits so many times longer before it takes over again."""
 
+_COLD: Final = 20  # times the patience of a node whose state is not that of the others
 _RELUCTANT: Final = 2  # ranks behind the other nodes
 
 
@@ -35,8 +37,9 @@ class Peers(Protocol):
 class Tenure:
     """The role of one node on one stream; only the worker of the stream changes it.
 
-    A term is the time of taking over in milliseconds since 1970, or one more than the newest term if that is later. So
-    it rises when all nodes restart, too.
+    A term is the time of taking over in microseconds since 1970, with the last three digits drawn from the name of the
+    node, or one more than the newest term if that is later. So it rises when all nodes restart, too, and two nodes that
+    take over in one millisecond have different terms.
 
     Args:
         node: name of this node.
@@ -59,9 +62,10 @@ class Tenure:
         """Whether this node answers the stream."""
         return self.role == "answers"
 
-    def patience_ns(self, window_ns: int) -> float:
-        """How long the estimates of another node may be missing [ns]."""
-        return self._patience * LATE_WINDOWS * window_ns
+    def patience_ns(self, window_ns: int, *, equal: bool) -> float:
+        """How long the estimates of another node may be missing [ns]; longer unless the state is that of the others."""
+        cold = not equal and bool(self._peers.names(self.stream))
+        return self._patience * LATE_WINDOWS * window_ns * (_COLD if cold else 1)
 
     def hear(self, sender: str, term: int, now_ns: int) -> bool:
         """Another node has published; False if it does not know yet that it was superseded."""
@@ -94,7 +98,7 @@ class Tenure:
 
     def take_over(self, why: str, *, unix_ms: Callable[[], int] = lambda: time.time_ns() // 1_000_000) -> None:
         """This node answers from now on, in a new term."""
-        self.term = max(self.term + 1, unix_ms())
+        self.term = max(self.term + 1, 1000 * unix_ms() + zlib.crc32(self.node.encode()) % 1000)
         self.role, self.leader = "answers", self.node
         log.warning("answers the stream", stream=self.stream, term=self.term, why=why)
 
@@ -113,8 +117,8 @@ def ranked(stream: str, nodes: set[str]) -> list[str]:
     """Nodes in the order in which they answer a stream: rendezvous hashing, the same on every node.
 
     >>> ranked("cam0", {"n1", "n2", "n3"})
-    ['n3', 'n2', 'n1']
+    ['n3', 'n1', 'n2']
     >>> [one for one in ranked("cam0", {"n1", "n2", "n3", "n4"}) if one != "n4"]
-    ['n3', 'n2', 'n1']
+    ['n3', 'n1', 'n2']
     """
     return sorted(nodes, key=lambda node: hashlib.sha256(f"{stream} {node}".encode()).digest())

@@ -207,6 +207,7 @@ EXAMPLES: dict[str, Fields] = {
         "missing_streams": ["cam1"],
         "namesakes": 1,
         "labels": {"site": "hall-2"},
+        "form": "sparse (fastest)",
     },
     "ModelsRequest": {"v": 1},
     "ModelsReply": {
@@ -508,6 +509,7 @@ ANY: dict[str, st.SearchStrategy[Fields]] = {
             "missing_streams": st.lists(names, max_size=2),
             "namesakes": counts,
             "labels": st.dictionaries(names, names, max_size=3),
+            "form": sentences,
         }
     ),
     "ModelsRequest": st.just({}),

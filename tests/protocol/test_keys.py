@@ -26,6 +26,7 @@ NODE_KEYS: list[Callable[..., str]] = [
     Keys.state,
     Keys.take,
     Keys.drain,
+    Keys.shares,
 ]
 NO_NAMES = ["", "*", "**", "@node", "@", "a/b", "/", "a/", "/a", "..", ".", "-", "$*", "a$*", "a b", "#", "?", "a" * 65]
 NO_NAMES += ["a\n", "\n", "caf\u00e9", "\u0661", "a\x00"]
@@ -34,7 +35,7 @@ prefixes = st.lists(st.sampled_from(["neurove", "v1", "site-1", "_", "."]), min_
 
 def test_the_lists_of_this_test_are_complete() -> None:
     built = {name for name, member in inspect.getmembers(Keys, inspect.isfunction) if not name.startswith("_")}
-    assert built - {"stream_of", "node_of", "served_of", "chunks"} == {
+    assert built - {"stream_of", "node_of", "served_of", "shared_of", "chunks"} == {
         build.__name__ for build in (*STREAM_KEYS, *NODE_KEYS)
     }
 

@@ -70,6 +70,7 @@ FREE_MAPS = (
 )
 DEFAULTED = {"release", "figures", "signature"}  # of a ModelInfo
 DEFAULTED |= {
+    "form",
     "recovered_packets",
     "uncounted_packets",
     "refused_cameras",

@@ -40,10 +40,10 @@ def test_the_kernels_of_the_refinement_and_their_plain_form_have_equal_results()
     assert whole.name == "refinement of a window of 5,000 events"
 
 
-def test_every_round_runs_all_functions_in_turn():
+def test_every_round_runs_all_functions_once():
     calls = []
     times = interleaved({name: lambda name=name: calls.append(name) for name in "ab"}, rounds=2, warm_up=1)
-    assert calls == ["a", "b"] * 3
+    assert [set(calls[i : i + 2]) for i in (0, 2, 4)] == [{"a", "b"}] * 3
     assert set(times) == {"a", "b"}
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import safetensors.torch
+import torch
 
 from neurove_core.training import data, joining
 from neurove_core.training.batches import Segment, draw
@@ -34,6 +35,7 @@ def error_of(call, *arguments) -> str:
 
 def main(folder: Path, out: Path) -> None:
     config = TrainingConfig.model_validate_json((out / "config.json").read_text())
+    torch.set_num_threads(1)  # as the command does: another number of threads adds in another order
     with joining.joined("cpu") as ranks:
         sequences = data.Cache(folder, config).open()
         run = TrainingRun.begin(one_update(config), sequences, ranks)

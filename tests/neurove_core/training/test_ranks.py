@@ -1,5 +1,6 @@
 """Distributed training: all processes have the same bits, take the step of one process, and survive a lost process."""
 
+import contextlib
 import copy
 import json
 import os
@@ -45,6 +46,19 @@ def free_port():
 
 def children_of(pid):
     return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+def listens_beyond_loopback(pid):
+    """The ports of a process that other machines can reach."""
+    open_files = []
+    for one in Path(f"/proc/{pid}/fd").iterdir():
+        with contextlib.suppress(FileNotFoundError):  # it was closed meanwhile
+            open_files.append(str(one.readlink()))
+    tables = [Path(f"/proc/net/{name}").read_text().splitlines()[1:] for name in ("tcp", "tcp6")]
+    rows = [line.split() for table in tables for line in table]
+    ours = [row[1] for row in rows if row[3] == "0A" and f"socket:[{row[9]}]" in open_files]
+    loopback = ("0100007F", "00000000000000000000000001000000", "0000000000000000FFFF00000100007F")
+    return [address for address in ours if address.split(":")[0] not in loopback]
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +133,8 @@ def test_a_run_that_lost_a_process_starts_again_and_ends_with_the_weights_of_an_
     command = [sys.executable, "-m", "neurove_service.cli", *words, "--calibration-sequences", "0", "--devices", "2"]
     with subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True) as run:
         wait_until(lambda: (out / CHECKPOINT).exists() or run.poll() is not None)
-        (first, *_) = children_of(run.pid)
+        (first, *_) = children = children_of(run.pid)
+        assert [port for pid in (run.pid, *children) for port in listens_beyond_loopback(pid)] == []
         os.kill(first, signal.SIGKILL)
         _, errors = run.communicate(timeout=300)
     assert run.returncode == 0, errors

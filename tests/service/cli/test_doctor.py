@@ -22,6 +22,7 @@ def test_without_a_service_the_connection_is_bad_and_the_advice_says_what_to_do(
     assert checks["extra serve"] == {"what": "extra serve", "state": "installed", "level": "ok", "advice": ""}
     assert {"compiled kernels", "processor", "fast path"} <= checks.keys()
     assert "float32" in checks["fast path"]["state"]
+    assert "golden windows" in checks["fast path"]["state"]
 
 
 def test_the_table_has_one_row_for_each_check(run):

@@ -5,7 +5,7 @@ import io
 import pytest
 from rich.console import Console
 
-from neurove_protocol.control import HealthReply, Losses, ModelInfo, ModelsReply
+from neurove_protocol.control import HealthReply, Losses, ModelInfo, ModelsReply, StandbyStatus
 from neurove_service.cli.views import health_table, models_table
 from neurove_service.node.health import stream_status
 from neurove_service.streams.stream import Stream
@@ -57,6 +57,35 @@ def test_health_shows_verdict_reason_and_streams(stream):
         "cam0: lossy: ",
     ):
         assert word in text
+
+
+@pytest.mark.parametrize(
+    ("standby", "line"),
+    [
+        ({"role": "answers", "leader": "n1", "followers": 1}, "cam0: this node answers, 1 other node serves it"),
+        ({"role": "follows", "leader": "n2", "equal": True}, "cam0: follows n2, with equal state"),
+        (
+            {"role": "follows", "leader": "n2", "draining": True},
+            "cam0: follows n2, its state is not equal yet, is drained",
+        ),
+        ({"role": "listens", "leader": None}, "cam0: hears no node that answers"),
+    ],
+)
+def test_health_says_what_a_node_does_on_a_stream_with_standby(stream, standby, line):
+    found = StandbyStatus.model_validate({"term": 7, "equal": False} | standby)
+    status = stream_status("n1", stream).model_copy(update={"standby": found})
+    reply = HealthReply(
+        node="n1",
+        ok=True,
+        why="ok",
+        uptime_s=1.0,
+        version="1",
+        model=INFO,
+        epoch=1,
+        refused_streams=0,
+        streams=(status,),
+    )
+    assert line in drawn(health_table([reply])).splitlines()
 
 
 def test_models_marks_active_and_previous_and_names_unreadable_files():

@@ -1,0 +1,35 @@
+"""Terms: which node answers a stream."""
+
+from neurove_protocol.duty import Newest
+from neurove_service.streams.tenure import Tenure
+
+
+class NoPeers:
+    """A node that knows no other node yet."""
+
+    def names(self, _stream):
+        return ()
+
+    def roles(self, _stream, _timeout_s):
+        return []
+
+    def state(self, _stream, _node, _digest):
+        return None
+
+
+def test_of_two_nodes_that_take_over_in_one_millisecond_a_consumer_hears_one():
+    nodes = [Tenure(name, "cam0", NoPeers()) for name in ("a", "b")]
+    for node in nodes:
+        node.take_over("a test", unix_ms=lambda: 1_764_000_000_000)
+    consumer = Newest()
+    starts = (0, 20_000, 40_000)
+    taken = [start for node in nodes for start in starts if consumer.takes(node.term, start, 0)]
+    assert taken == list(starts)
+
+
+def test_a_term_rises_though_the_clock_goes_back():
+    node = Tenure("a", "cam0", NoPeers())
+    node.take_over("a test", unix_ms=lambda: 1_764_000_000_000)
+    before = node.term
+    node.take_over("a test", unix_ms=lambda: 1_763_000_000_000)
+    assert node.term == before + 1
