@@ -393,7 +393,7 @@ def _over_ground(
     known = estimate.twists.mean(axis=0), sigma, state.ground
     measured = estimate.covariance[3:, 3:] if estimate.source == "refined" else None
     answer = ground.refine(events, estimate.start_us, estimate.end_us, state.camera, *known, measured)
-    state = state._replace(ground=answer.state)
+    state = state._replace(ground=answer.state, stages=state.stages.after_ground(answer.outcome))
     if answer.outcome not in ("accepted", "turning") or answer.motion is None:
         return estimate, state
     twist, after = answer.motion.twist, answer.state

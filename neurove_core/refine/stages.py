@@ -3,7 +3,8 @@
 `rotation` is exact where the camera turns and translates little, `scene` where translation counts. Both run, until the
 scene shows a camera that translates, in two windows in a row where the rotation is accepted; then its motion is the
 answer, and the rotation is searched only where it is not accepted. A camera that the network certainly sees move fast
-is a vehicle, which is left to the ground. No scene begins where the rotation finds nothing that moves. Without a known
+is a vehicle, which is left to the ground. So is a camera that is on a vehicle by the outcomes over the ground, see
+`vehicle`: there no scene is searched for. No scene begins where the rotation finds nothing that moves. Without a known
 height, a scene is searched for only where the parts of the image disagree about the rotation.
 """
 
@@ -12,8 +13,9 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.refine import rotation, scene, search
+from neurove_core.refine import rotation, scene, search, vehicle
 from neurove_core.refine.alignment import Grid
+from neurove_core.refine.ground import Outcome
 from neurove_core.refine.rotation import MAX_AGAINST, MIN_SPREAD, Filter, Given, Rate, Refined, drives, floored, spread
 from neurove_core.refine.scene import Moved, Scene
 
@@ -56,6 +58,11 @@ class State(NamedTuple):
     aside: int = 0  # windows for which the camera is on no vehicle
     idle: int = PATIENCE  # windows since a motion in the scene was accepted
     again: bool = False  # whether to look at the scene once more before it outweighs a rotation
+    odds: float = vehicle.START  # that the camera is on a vehicle, see `vehicle`
+
+    def after_ground(self, outcome: Outcome) -> "State":
+        """The state after the outcome over the ground of the same window."""
+        return self._replace(odds=vehicle.judged(self.odds, outcome))
 
 
 class Stages(NamedTuple):
@@ -70,6 +77,9 @@ class Stages(NamedTuple):
 def refine(given: Given, state: State) -> Stages:
     """Refine the motion of a window by its events; `given.before` is not used."""
     given = given._replace(before=state.filter)
+    if given.knows_height and state.odds >= 0:
+        turn = rotation.refine(given)
+        return Stages(turn, None, True, State(turn.filter, odds=state.odds))
     before, turn = state.scene, None
     found = None
     if given.knows_height and before is not None and before.moves and state.idle < PATIENCE:
@@ -84,10 +94,10 @@ def refine(given: Given, state: State) -> Stages:
     if found is not None and moved and not again:
         aside = ASIDE if _is_aside(found) else aside
         turn = _turn(given, found, before)
-        return Stages(turn, _velocity(given, found), aside == 0, State(turn.filter, scene, aside, 0))
+        return Stages(turn, _velocity(given, found), aside == 0, State(turn.filter, scene, aside, 0, odds=state.odds))
     assert turn is not None  # the rotation was searched
     idle = min(state.idle + 1, PATIENCE)
-    return Stages(turn, None, aside == 0, State(turn.filter, scene, aside, idle, again))
+    return Stages(turn, None, aside == 0, State(turn.filter, scene, aside, idle, again, state.odds))
 
 
 def compile_kernels(grid: Grid) -> None:
