@@ -51,9 +51,9 @@ def test_the_state_of_the_refinement_goes_along():
     size = 6 + scene.COLUMNS * scene.ROWS
     moving = scene.Scene(np.arange(float(size)), np.eye(size), 2_000_000, seen=True, moves=7)
     turning = Filter(np.arange(6.0), np.eye(6), 2_000_000, 1)
-    state = state._replace(stages=Stages(turning, moving, aside=12, idle=2, again=True))
+    state = state._replace(stages=Stages(turning, moving, aside=12, idle=2, again=True, odds=-2.5))
     got = carried.decode(carried.encode(state), state).stages
-    assert (got.aside, got.idle, got.again, got.scene.seen, got.scene.moves) == (12, 2, True, True, 7)
+    assert (got.aside, got.idle, got.again, got.odds, got.scene.seen, got.scene.moves) == (12, 2, True, -2.5, True, 7)
     assert (got.filter.end_us, got.filter.against, got.scene.end_us) == (2_000_000, 1, 2_000_000)
     for one, two in zip(
         (got.filter.motion, got.scene.mean, got.scene.covariance), (turning.motion, *moving), strict=False

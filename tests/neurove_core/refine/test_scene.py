@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from neurove_core.ingest.sample import Sample
-from neurove_core.refine import scene, stages
+from neurove_core.refine import rotation, scene, stages
 from neurove_core.refine.alignment import Grid, Rays
 from neurove_core.refine.rotation import Given
 from neurove_core.refine.stages import State
@@ -38,9 +38,13 @@ def events_of(v, w, windows, slope=0.4, points=700):
     return [Sample((events.t[p] % WINDOW_US).astype(np.int32), events.x[p], events.y[p]) for p in parts]
 
 
-def refined(samples, twist=(0.0,) * 6, **fields):
+FREE = State(odds=-1.0)
+"""Of a camera that the ground did not explain."""
+
+
+def refined(samples, twist=(0.0,) * 6, state=FREE, **fields):
     """Answers of `stages.refine` for windows in a row."""
-    found, state = [], State()
+    found = []
     for number, sample in enumerate(samples):
         known = {"covariance": UNSURE, "low_activity": False, "before": None} | fields
         one = stages.refine(Given(number * WINDOW_US, WINDOW_US, sample, VIEW, np.array(twist, float), **known), state)
@@ -86,10 +90,42 @@ def test_a_vehicle_that_drives_fast_is_not_searched():
     assert all(one.state.scene is None for one in found)
 
 
+def test_on_a_vehicle_no_scene_is_searched_and_the_rotation_is_that_of_the_rotation_alone():
+    samples = events_of((0.6, 0.0, 0.0), STILL, 6)
+    found = refined(samples, state=State())
+    assert all(one.velocity is None and one.level and one.state.scene is None for one in found)
+    before = None
+    for number, (one, sample) in enumerate(zip(found, samples, strict=True)):
+        given = Given(number * WINDOW_US, WINDOW_US, sample, VIEW, np.zeros(6), UNSURE, False, before)
+        alone = rotation.refine(given)
+        before = alone.filter
+        np.testing.assert_array_equal(one.turn.rate.w_rad_s, alone.rate.w_rad_s)
+
+
+def test_a_camera_that_is_taken_from_its_vehicle_is_noticed_and_one_that_is_put_back_as_well():
+    state = State()
+    for _ in range(200):
+        state = state.after_ground("accepted")
+    for _ in range(20):  # it is turned and tilted in a hand
+        state = state.after_ground("tilting")
+    samples = events_of((0.6, 0.0, 0.0), STILL, 16)
+    assert refined(samples, state=state)[-1].velocity is not None
+    for _ in range(100):
+        state = state.after_ground("accepted")
+    assert refined(samples, state=state)[-1].velocity is None
+
+
+def test_a_few_refused_windows_do_not_take_a_camera_from_its_vehicle():
+    state = State()
+    for outcome in ("noise", "few events", "accepted", "contradicted", "accepted", "tilting", "accepted", "noise"):
+        state = state.after_ground(outcome)
+    assert refined(events_of((0.6, 0.0, 0.0), STILL, 2), state=state)[-1].state.scene is None
+
+
 def test_without_a_height_a_scene_is_searched_only_where_the_parts_of_the_image_disagree():
     turning = events_of(STILL, np.array([0.1, -0.5, 0.2]), 8)
     assert any(one.state.scene is not None for one in refined(turning))
-    assert all(one.state.scene is None for one in refined(turning, knows_height=False))
+    assert all(one.state.scene is None for one in refined(turning, state=State(), knows_height=False))
 
 
 def test_a_motion_in_a_scene_is_no_steady_turn_that_outweighs_a_fast_vehicle():
