@@ -78,8 +78,8 @@ def refine(given: Given, state: State) -> Stages:
     """Refine the motion of a window by its events; `given.before` is not used."""
     given = given._replace(before=state.filter)
     if given.knows_height and state.odds >= 0:
-        turn = rotation.refine(given)
-        return Stages(turn, None, True, State(turn.filter, odds=state.odds))
+        alone = rotation.refine(given)
+        return Stages(alone, None, True, State(alone.filter, odds=state.odds))
     before, turn = state.scene, None
     found = None
     if given.knows_height and before is not None and before.moves and state.idle < PATIENCE:
