@@ -18,6 +18,7 @@ from neurove_core.refine.ground_sway import Sway
 from neurove_core.refine.rotation import Filter
 from neurove_core.refine.scene import Scene
 from neurove_core.refine.stages import State as Stages
+from neurove_core.refine.standing import Standing
 from neurove_core.timescales import Longer
 from neurove_protocol.errors import InvalidField, NeuroVEError
 
@@ -25,7 +26,8 @@ MAX_BYTES: Final = 32 << 20
 """Cap of the bytes of one stream's state."""
 
 _KINDS: Final[dict[str, Any]] = {
-    kind.__name__: kind for kind in (ArrayState, Filter, GroundEvents, GroundState, Longer, Scene, Stages, Sway)
+    kind.__name__: kind
+    for kind in (ArrayState, Filter, GroundEvents, GroundState, Longer, Scene, Stages, Standing, Sway)
 }
 _DTYPES: Final = ("|u1", "|i1", "|b1", "<u2", "<i2", "<u4", "<i4", "<i8", "<u8", "<f4", "<f8")
 _PARTS: Final = ("network", "age", "end_us", "stages", "ground", "recent", "longer")

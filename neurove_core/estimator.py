@@ -15,13 +15,12 @@ from neurove_core.geometry.tables import TABLES
 from neurove_core.ingest import windows
 from neurove_core.ingest.channels import Recent, remembered, with_history
 from neurove_core.ingest.windows import Pushed, Window, WindowsState
-from neurove_core.ingest.wire import read_packet
 from neurove_core.io.packets import slices
 from neurove_core.io.recording import Recording
 from neurove_core.models.bounds import UNSET, Bounds
 from neurove_core.models.bundle import PER_HEIGHT, Bundle, LinearUnit
 from neurove_core.networks.arrays import Runner, State
-from neurove_core.refine import errors, ground
+from neurove_core.refine import errors, ground, standing
 from neurove_core.refine import stages as refining
 from neurove_core.refine.ground import GroundState
 from neurove_core.refine.rotation import Given, Rate
@@ -29,9 +28,10 @@ from neurove_core.refine.rotation import Refined as RotationFound
 from neurove_core.refine.view import View
 from neurove_core.running import form_of, runner_of
 from neurove_core.timescales import Answer, Longer, chosen, followed, jobs, slowed, watched
+from neurove_core.warming import compile_refinement, warm_camera, warm_events
 from neurove_protocol import CameraInfo, Events, Sensor
 from neurove_protocol.errors import BadModel
-from neurove_protocol.events import EventPacket, PacketLimits, WireEvents, encode_packet
+from neurove_protocol.events import WireEvents
 from neurove_protocol.velocity import Source
 
 _STREAM = "cam0"
@@ -219,6 +219,7 @@ class Estimator:
             estimate: the network's.
             state: of the stream.
         """
+        estimate, state = _held(window, estimate, state)
         if window.sample is None or state.view is None or estimate.covariance is None:
             return estimate, state
         known_m = state.camera.height_m if state.camera else None
@@ -288,7 +289,7 @@ class Estimator:
             BadModel: the model computes numbers that are not finite.
         """
         sensor = Sensor(self.config.canonical.width, self.config.canonical.height)
-        if not _is_finite(self, self.initial_state(sensor, _warm_camera(sensor) if self._refines else None)):
+        if not _is_finite(self, self.initial_state(sensor, warm_camera(sensor) if self._refines else None)):
             raise BadModel(self.bundle.name, "it computes numbers that are not finite")
 
     def _covariance(self, answer: Answer, metres: NDArray[np.float64]) -> NDArray[np.float64] | None:
@@ -337,15 +338,29 @@ def _with_rate(
 def _is_finite(estimator: Estimator, state: StreamState) -> bool:
     """Whether the estimates of some events are finite; this compiles all code."""
     if state.view is not None:
-        refining.compile_kernels(state.view.grid)
-        ground.compile_kernels(_warm_camera(state.sensor))
-    for given in _warm_events(state.sensor, estimator.config.window.duration_us):
+        compile_refinement(state.view, warm_camera(state.sensor))
+    for given in warm_events(state.sensor, estimator.config.window.duration_us):
         answer = estimator.push(given, state._replace(windows=WindowsState()), 0)
         state = answer.state
         finite = all(np.isfinite(estimate.twists).all() for estimate in answer.estimates)
         if not (finite and state.network.finite()):  # a membrane of nan never fires, so the answer does not show it
             return False
     return True
+
+
+def _held(window: Window, estimate: WindowEstimate, state: StreamState) -> Refined:
+    """The network's estimate by what is known of a stop too, see `refine.standing`."""
+    if window.sample is None or state.view is None or state.camera is None or estimate.covariance is None:
+        return estimate, state
+    if state.camera.height_m is None:
+        return estimate, state
+    share = (window.events - window.outside) / max(state.low_activity_below, 1.0)
+    about = estimate.end_us, share, state.camera.height_m, state.ground.standing
+    found = standing.hold(estimate.twists, estimate.covariance, *about)
+    state = state._replace(ground=state.ground._replace(standing=found.standing))
+    if found.standing.sigma_m_s is None:
+        return estimate, state
+    return estimate._replace(twists=found.twists, covariance=found.covariance, source="refined"), state
 
 
 def _turned(estimate: WindowEstimate, found: RotationFound, velocity: refining.Velocity | None) -> WindowEstimate:
@@ -391,7 +406,8 @@ def _over_ground(
     events = ground.events_of(state.view, window.sample, window.start_us)
     sigma = np.sqrt(np.diagonal(estimate.covariance)[3:]) if sigma_rad_s is None else sigma_rad_s
     known = estimate.twists.mean(axis=0), sigma, state.ground
-    measured = estimate.covariance[3:, 3:] if estimate.source == "refined" else None
+    turned = estimate.source == "refined" and not estimate.low_activity
+    measured = estimate.covariance[3:, 3:] if turned else None
     answer = ground.refine(events, estimate.start_us, estimate.end_us, state.camera, *known, measured)
     state = state._replace(ground=answer.state, stages=state.stages.after_ground(answer.outcome))
     if answer.outcome not in ("accepted", "turning") or answer.motion is None:
@@ -403,30 +419,6 @@ def _over_ground(
         rate = Rate(twist[3:], covariance[3:, 3:])
         twists, covariance = _with_rate(estimate.twists, estimate.covariance, rate, np.zeros(3))
     return estimate._replace(twists=twists, covariance=covariance, source="refined"), state
-
-
-def _warm_events(sensor: Sensor, duration_us: int) -> tuple[Events, WireEvents]:
-    """The events of four windows, as columns and in the layout of a packet."""
-    t = np.arange(0, 4 * duration_us, max(1, duration_us // 500))
-    rng = np.random.default_rng(0)
-    x, y, p = (rng.integers(0, high, t.size) for high in (sensor.width, sensor.height, 2))
-    events = Events.from_columns(t, x, y, p)
-    data = encode_packet(EventPacket("warm", 0, sensor, 0, events))
-    return events, read_packet(data, PacketLimits(max_side_px=max(sensor.width, sensor.height))).events
-
-
-def _warm_camera(sensor: Sensor) -> CameraInfo:
-    focal, middle_x, middle_y = float(sensor.width), sensor.width / 2, sensor.height / 2
-    return CameraInfo(
-        stream="warm",
-        lens="pinhole",
-        width=sensor.width,
-        height=sensor.height,
-        fx=focal,
-        fy=focal,
-        cx=middle_x,
-        cy=middle_y,
-    )
 
 
 def _to_metres(camera: CameraInfo | None, unit: LinearUnit) -> NDArray[np.float64]:

@@ -114,8 +114,9 @@ class _Maps:
         if self._left < 0:
             raise ValueError(f"more than {MAX_MAPS} maps")
         fields = dict(pairs)
-        if not all(isinstance(key, str) for key in fields):
-            raise ValueError("a key of a map is not a string")
+        for key in fields:
+            if not isinstance(key, str):
+                raise ValueError("a key of a map is not a string")
         if len(fields) != len(pairs):
             raise ValueError("duplicate key in a map")
         return fields

@@ -39,7 +39,8 @@ class DutyReply(Message):
     role: Role
     term: Count = 0  # the newest that it knows
     leader: Name | None = None  # the node that answers; None if it knows none
-    equal: bool = False  # its newest estimates were those of the leader, bit for bit
+    equal: bool = False  # its newest estimates were those of the leader, bit for bit, and it is not behind
+    missed_us: Int64 | None = None  # start of the newest window of which it missed packets; None if it missed none
     draining: bool = False
     digest: str = ""  # of its model; empty before the first window
 

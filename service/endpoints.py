@@ -7,6 +7,7 @@ from typing import Final
 PROTOCOLS: Final = ("tcp", "udp", "tls", "quic", "ws", "unixsock-stream")
 """Protocols of the installed Zenoh; each also in zenoh_config."""
 
+_SYSTEM_ERROR: Final = re.compile(r"([^:\[\]]+) \(os error \d+\)")
 _EXAMPLE: Final = "such as tcp/127.0.0.1:7447"
 _HOST_PORT: Final = re.compile(r"(?:\[[0-9A-Fa-f:.%\w]+\]|[^\s:/\[\]]+):(\d{1,5})")
 
@@ -101,3 +102,9 @@ def unreached(connect: tuple[str, ...]) -> str:
     secured = any(endpoint.startswith(("tls/", "quic/")) for endpoint in connect)
     refused = ", or one side refuses the other's certificate (zenoh_config)" if secured else ""
     return f"no process listens at {', '.join(connect)}{refused}"
+
+
+def reason(error: Exception) -> str:
+    """The error of the operating system in one of Zenoh if there is one, or its text without source locations."""
+    system = _SYSTEM_ERROR.search(str(error))
+    return system[1].strip() if system else str(error).split(" at /", maxsplit=1)[0].removesuffix(".")

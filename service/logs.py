@@ -4,17 +4,34 @@ A log line never waits for its reader, is bounded in length, and one kind of lin
 """
 
 import atexit
+import contextlib
 import logging
 import os
 import sys
-from collections.abc import MutableMapping
+from collections.abc import Iterator, MutableMapping
 from pathlib import Path
 from typing import Any, Final, TextIO
 
-import structlog
-
 from neurove_service.log_writer import Limiter, LogWriter
 from neurove_service.output import printable, unfiltered
+
+
+@contextlib.contextmanager
+def _hidden(name: str) -> Iterator[None]:
+    """Let an import of this package fail, as if it were not installed."""
+    absent = object()
+    before = sys.modules.get(name, absent)
+    sys.modules[name] = None  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        del sys.modules[name]
+        if before is not absent:
+            sys.modules[name] = before  # type: ignore[assignment]
+
+
+with _hidden("rich"):  # structlog would load it for the tracebacks of a terminal: 3.7 MiB in every process
+    import structlog
 
 MAX_VALUE: Final = 300
 """Most characters of a value in a line; what comes from outside may be longer."""

@@ -7,14 +7,14 @@ callbacks that only append, every query answered, every session closed.
 import atexit
 import contextlib
 import json
-import re
+import os
 import struct
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import Any, NamedTuple, Self
+from types import MappingProxyType, TracebackType
+from typing import Any, Final, Literal, NamedTuple, Self
 
 import zenoh
 
@@ -23,12 +23,12 @@ from neurove_protocol.errors import Busy, InternalError, NeuroVEError
 from neurove_protocol.events import MAX_PACKET_BYTES
 from neurove_service import logs
 from neurove_service.desk import Desk
-from neurove_service.endpoints import unreached, where
+from neurove_service.endpoints import reason, unreached, where
 from neurove_service.guard import Guard
 
 log = logs.get(__name__)
 
-_SETTINGS = {
+_SETTINGS: Mapping[str, object] = {
     "scouting/multicast/enabled": False,
     "transport/shared_memory/enabled": False,  # leaks 17 MiB per publisher restart in this version
     "transport/link/rx/max_message_size": MAX_PACKET_BYTES,
@@ -38,9 +38,13 @@ _SETTINGS = {
     "transport/link/tx/queue/size/data_high": 16,  # 2 by default, and an estimate, being express, fills one alone
     "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 20_000,  # us: ride out a stall of the receiver
 }
+TIMESTAMPS: Final = {"timestamping/enabled": True}  # messages carry the time of publishing, as ROS 2 expects
+SMALL_BATCHES: Final = {"transport/link/tx/batch_size": 1 << 14}  # a packet that waits holds the buffer of its batch
 _RETRY_S = 0.5
 _SENT = struct.Struct("<q")  # the attachment of a packet: time of sending [us]
-_SYSTEM_ERROR = re.compile(r"([^:\[\]]+) \(os error \d+\)")
+Haste = Literal["bulk", "usual", "urgent"]
+_P = zenoh.Priority
+_PRIORITIES: dict[Haste, zenoh.Priority] = {"bulk": _P.DATA_LOW, "usual": _P.DATA, "urgent": _P.INTERACTIVE_HIGH}
 
 OnSample = Callable[[str, bytes, int], None]
 """Key, payload, and time of reception (monotonic) [ns]. Runs on Zenoh's thread: it must only append and return."""
@@ -140,7 +144,7 @@ class Transport:
         try:
             self.session.close()  # type: ignore[no-untyped-call]  # gap in Zenoh's stubs
         except zenoh.ZError as error:  # a link that cannot deliver what waits
-            log.warning("the session did not close in order", why=_reason(error))
+            log.warning("the session did not close in order", why=reason(error))
 
     def publisher(self, key: str, schema: str, *, urgent: bool = False) -> Publisher:
         """Declare a publisher.
@@ -150,12 +154,11 @@ class Transport:
             schema: Zenoh Encoding of its messages.
             urgent: for estimates: sent before ordinary data and never batched.
         """
-        priority = zenoh.Priority.DATA_HIGH if urgent else zenoh.Priority.DATA
         declared = self.session.declare_publisher(
             key,
             encoding=zenoh.Encoding(schema),
             congestion_control=zenoh.CongestionControl.DROP,
-            priority=priority,
+            priority=zenoh.Priority.DATA_HIGH if urgent else zenoh.Priority.DATA,
             express=urgent,
         )
         return Publisher(declared)
@@ -262,14 +265,15 @@ class Transport:
         thread.start()
         self._answering.append((queryable, desk, thread))
 
-    def ask(self, key: str, request: bytes, timeout_s: float, *, bulk: bool = False) -> list[Reply]:
+    def ask(self, key: str, request: bytes, timeout_s: float, haste: Haste = "usual") -> list[Reply]:
         """Query a key expression and wait for all replies.
 
         Args:
             key: key expression.
             request: payload of the query.
             timeout_s: replies after this time are ignored [s].
-            bulk: the reply is large and not urgent: query and reply have a lower priority than all other data.
+            haste: `bulk`: query and reply have a lower priority than all other data. `urgent`: they overtake all data,
+                and are dropped where a peer that hangs has filled its link.
 
         Returns:
             replies in order of arrival; empty if no peer answered in time.
@@ -277,8 +281,7 @@ class Transport:
         Raises:
             PeerError: a peer refused; it has the code and the reason of the peer.
         """
-        priority = zenoh.Priority.DATA_LOW if bulk else zenoh.Priority.DATA
-        return list(_query(self.session, key, request, timeout_s, priority, zenoh.ConsolidationMode.AUTO))
+        return list(_query(self.session, key, request, timeout_s, haste, zenoh.ConsolidationMode.AUTO))
 
     def ask_streaming(self, key: str, request: bytes, timeout_s: float) -> Iterator[Reply]:
         """Query one node and yield every reply as it arrives; replies with PROGRESS_SCHEMA precede the last one.
@@ -286,7 +289,7 @@ class Transport:
         Raises:
             PeerError: as ask.
         """
-        return _query(self.session, key, request, timeout_s, zenoh.Priority.DATA, zenoh.ConsolidationMode.NONE)
+        return _query(self.session, key, request, timeout_s, "usual", zenoh.ConsolidationMode.NONE)
 
     def token(self, key: str) -> Callable[[], None]:
         """Declare a liveliness token; call the result to undeclare it."""
@@ -336,7 +339,7 @@ def _query(
     key: str,
     request: bytes,
     timeout_s: float,
-    priority: zenoh.Priority,
+    haste: Haste,
     mode: zenoh.ConsolidationMode,
 ) -> Iterator[Reply]:
     channel: Any = zenoh.handlers.FifoChannel(64)
@@ -345,9 +348,9 @@ def _query(
         channel,
         payload=request,
         timeout=timeout_s,
-        priority=priority,
+        priority=_PRIORITIES[haste],
         consolidation=mode,
-        congestion_control=zenoh.CongestionControl.BLOCK,
+        congestion_control=zenoh.CongestionControl.DROP if haste == "urgent" else zenoh.CongestionControl.BLOCK,
     )
     for reply in replies:
         if reply.ok is not None:
@@ -386,7 +389,7 @@ def open_transport(
     patience_s: float = 0.0,
     stop: threading.Event | None = None,
     guard: Guard | None = None,
-    timestamps: bool = False,
+    more: Mapping[str, object] = MappingProxyType({}),
 ) -> Transport:
     """Open a session.
 
@@ -398,13 +401,13 @@ def open_transport(
         patience_s: how long a client retries while no process listens [s].
         stop: ends the retries early.
         guard: counts internal errors of what is called for a message or a query.
-        timestamps: whether messages carry the time of publishing, as ROS 2 expects.
+        more: TIMESTAMPS, SMALL_BATCHES, or other settings of Zenoh.
 
     Raises:
         Unreachable: no process listened for that time.
         EndpointError: the session cannot be opened, and a retry cannot help.
     """
-    config = _session_config(mode, listen, connect, config_file, timestamps)
+    config = _session_config(mode, listen, connect, config_file, more)
     stop = stop or threading.Event()
     deadline = time.monotonic() + patience_s
     waiting = False
@@ -413,9 +416,7 @@ def open_transport(
             return Transport(zenoh.open(config), guard)
         except zenoh.ZError as error:
             if not str(error).startswith("Unable to connect"):  # Zenoh has one error class and no codes
-                raise EndpointError(
-                    f"cannot open a Zenoh session: {where(listen, connect)}: {_reason(error)}"
-                ) from None
+                raise EndpointError(f"cannot open a Zenoh session: {where(listen, connect)}: {reason(error)}") from None
         if time.monotonic() >= deadline or stop.is_set():
             raise Unreachable(unreached(connect))
         if not waiting:
@@ -425,7 +426,7 @@ def open_transport(
 
 
 def _session_config(
-    mode: str, listen: tuple[str, ...], connect: tuple[str, ...], config_file: Path | None, timestamps: bool
+    mode: str, listen: tuple[str, ...], connect: tuple[str, ...], config_file: Path | None, more: Mapping[str, object]
 ) -> zenoh.Config:
     try:
         config = zenoh.Config.from_file(str(config_file)) if config_file else zenoh.Config()
@@ -434,15 +435,14 @@ def _session_config(
             config.insert_json5("listen/endpoints", json.dumps(listen))
         if connect or not config_file:
             config.insert_json5("connect/endpoints", json.dumps(connect))
-        for key, value in (_SETTINGS | ({"timestamping/enabled": True} if timestamps else {})).items():
+        for key, value in {**_SETTINGS, **more}.items():
             config.insert_json5(key, json.dumps(value))
     except zenoh.ZError as error:
         place = f"zenoh_config={config_file}" if config_file else where(listen, connect)
-        raise EndpointError(f"cannot configure Zenoh: {place}: {_reason(error)}") from None
+        raise EndpointError(f"cannot configure Zenoh: {place}: {reason(error)}") from None
     return config
 
 
-def _reason(error: zenoh.ZError) -> str:
-    """The error of the operating system if there is one, or Zenoh's text without its source locations."""
-    system = _SYSTEM_ERROR.search(str(error))
-    return system[1].strip() if system else str(error).split(" at /", maxsplit=1)[0].removesuffix(".")
+def receive_on_one_thread() -> None:
+    """Let Zenoh receive on one thread instead of two, in a process with one session; call it before the first one."""
+    os.environ.setdefault("ZENOH_RUNTIME", "(rx: (worker_threads: 1))")

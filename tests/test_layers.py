@@ -37,7 +37,8 @@ MAY_IMPORT = {
     "neurove_core.refine": "compiled geometry ingest",
     "neurove_core.inertial": "",
     "neurove_core.running": "extras ingest networks engine models",
-    "neurove_core.estimator": "geometry ingest networks models io refine running timescales",
+    "neurove_core.warming": "compiled config geometry ingest networks engine models refine running",
+    "neurove_core.estimator": "geometry ingest networks models io refine running timescales warming",
     "neurove_core.self_test": "config models estimator",
     "neurove_core.aided": "estimator inertial",
     "neurove_core.carried": "spiking networks refine estimator timescales",
@@ -83,7 +84,7 @@ MAY_IMPORT = {
     ),
     "neurove_service.models": (
         "core:config core:extras core:files core:ingest core:networks core:models core:estimator core:self_test"
-        " logs guard streams"
+        " core:warming logs guard streams"
     ),
     "neurove_service.metrics": "logs guard",
     "neurove_service.clients": (
@@ -92,8 +93,8 @@ MAY_IMPORT = {
     ),
     "neurove_service.ros2": "core:extras core:geometry core:io core:io.formats clock_offset guard logs transport",
     "neurove_service.node": (
-        "core:files core:geometry core:models logs guard lifecycle latency endpoints config transport streams models "
-        "metrics"
+        "core:compiled core:files core:geometry core:models logs guard lifecycle latency endpoints config transport "
+        "streams models metrics"
     ),
     "neurove_service.fleet": "core:files logs config labels transport clients",
     "neurove_service.page": "logs config guard transport clients",

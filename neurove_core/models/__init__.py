@@ -57,6 +57,14 @@ def untrained() -> "Bundle":
     return bundle.untrained(name=RANDOM)
 
 
+def file_of(model: str) -> Path:
+    """The file of the built-in model of this name, such as `default`; else `model` as a path, which may not exist."""
+    from neurove_core.models import bundle
+
+    built_in_files = {file.stem: file for file in Path(__file__).parent.glob(f"*{bundle.SUFFIX}")}
+    return built_in_files.get(model, Path(model))
+
+
 def find(model: str) -> "Bundle":
     """Load a model by the name of a built-in one, such as `default`, or by the path of its bundle.
 

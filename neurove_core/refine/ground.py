@@ -27,13 +27,14 @@ from neurove_core.refine import ground_kernels as kernels
 from neurove_core.refine.ground_kernels import Image, Rays
 from neurove_core.refine.ground_search import UNKNOWNS, Prior, climb, motion_of, objective
 from neurove_core.refine.ground_sway import Sway, swayed
+from neurove_core.refine.standing import Standing, answered, outweighs
 from neurove_core.refine.view import View
 from neurove_protocol import CameraInfo
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
-Outcome = Literal["accepted", "turning", "tilting", "few events", "noise", "contradicted"]
+Outcome = Literal["accepted", "turning", "tilting", "few events", "noise", "contradicted", "standing"]
 
 SPAN_US: Final = 200_000
 """Time whose events are used. One constant motion is assumed."""
@@ -129,6 +130,7 @@ class GroundState(NamedTuple):
     calm_us: int = SPAN_US  # time since the camera last pitched or rolled, at most SPAN_US
     sway: Sway = Sway()
     tilt: float = 0.0  # mean square rate of pitch and roll before the search [rad^2/s^2]
+    standing: Standing = Standing()
 
 
 class GroundMotion(NamedTuple):
@@ -196,7 +198,8 @@ def refine(
         - the ground has few events, as one of one colour: only the angular velocity is known ("turning");
         - its events do not belong together ("noise"), as those of a stationary camera;
         - it is more than MAX_SIGMAS from what was known before, or its angular velocity more than MAX_RATE_SIGMAS from
-          the measured one ("contradicted"), as that of a camera whose height changes.
+          the measured one ("contradicted"), as that of a camera whose height changes;
+        - it is less certain than that the vehicle stands ("standing").
     """
     recent = state.recent if state.end_us in (None, start_us) else ()
     window_us = end_us - start_us
@@ -226,14 +229,22 @@ def refine(
         return Answer("noise", found, state._replace(last=None))
     if found.distance > MAX_SIGMAS or _distance(found, twist, measured) > MAX_RATE_SIGMAS:
         return Answer("contradicted", found, state._replace(last=None))
+    if outweighs(state.standing, math.sqrt(found.covariance[2, 2])):
+        return Answer("standing", found, state._replace(last=None))
     if near < max(LEAST_EVENTS, LEAST_SHARE * far):
         twist, sway = swayed(found.twist, state.pitch, state.sway)
         return Answer("turning", found._replace(twist=twist), state._replace(last=None, sway=sway))
     pitch, pitch_sigma = _learned(state, found.pitch, pitch_sigma, 1 / len(used))
     twist, sway = swayed(found.twist, found.pitch, state.sway)
+    standing = answered(state.standing, end_us, float(np.linalg.norm(unknowns[:3])))
     walls = np.clip(np.array(state.walls) + unknowns[7:] / height_m, *_WALL_SPAN)
     state = state._replace(
-        last=unknowns[:6], pitch=pitch, pitch_sigma=pitch_sigma, walls=(float(walls[0]), float(walls[1])), sway=sway
+        last=unknowns[:6],
+        pitch=pitch,
+        pitch_sigma=pitch_sigma,
+        walls=(float(walls[0]), float(walls[1])),
+        sway=sway,
+        standing=standing,
     )
     return Answer("accepted", found._replace(twist=twist), state)
 

@@ -21,6 +21,7 @@ EVIDENCE: Final[dict[Outcome, float]] = {
     "few events": 0.0,
     "noise": 0.0,
     "contradicted": -0.65,
+    "standing": 0.0,
 }
 """Logarithm of the likelihood ratio of each outcome, vehicle over free camera, by the length of the runs in which it
 comes. A window without events that move says nothing. Measured on own seeds, see decision 131."""

@@ -10,6 +10,7 @@ import numpy as np
 
 from neurove_protocol.errors import InvalidField
 from neurove_service.cli.arguments import (
+    add_force,
     add_lens_flags,
     check_folder,
     command,
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from neurove_core.geometry.mounting import Mounting
 
 NOT_BETTER = 1
-"""Exit code if the adapted model is not better on the held-out pieces; then nothing is written without --force."""
+"""Exit code if the adapted model is not better; nothing is written then without --accept-worse."""
 
 
 def adapt(args: argparse.Namespace) -> int:
@@ -75,7 +76,7 @@ def adapt(args: argparse.Namespace) -> int:
         print("\n".join(notes), flush=True)
     with progress() as show_task:
         found = run(prepared, start, config, folder, recipe, show_task)
-    written = found.better or args.force
+    written = found.better or args.accept_worse
     if written:
         bundle.save(found.bundle, args.out)
     report = {
@@ -127,7 +128,7 @@ def _table(report: dict[str, Any]) -> Iterator[str]:
     if report["written"]:
         yield f"wrote {report['written']}, {report['digest'][:12]}"
     else:
-        yield "nothing is written; --force writes the bundle anyway"
+        yield "nothing is written; --accept-worse writes the bundle anyway"
 
 
 def _row(name: str, before: float | None, after: float | None) -> str:
@@ -176,7 +177,7 @@ def add_adapt(parser: argparse.ArgumentParser) -> None:
     command(parser, adapt)
     parser.epilog = (
         "Exit codes: 0 the bundle is written; 1 the adapted model is not better on the held-out pieces, and nothing is "
-        "written without --force; 2 wrong usage, such as a truth whose times do not overlap with the events."
+        "written without --accept-worse; 2 wrong usage, such as a truth whose times do not overlap with the events."
     )
     about = "recordings of one robot with one camera, in any supported format"
     parser.add_argument("recordings", nargs="+", metavar="RECORDING", help=about)
@@ -217,9 +218,9 @@ def add_adapt(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--work", type=Path, metavar="DIR", help="folder for sequences and checkpoint; default runs/adapt-NAME"
     )
-    parser.add_argument(
-        "--force", action="store_true", help="write even if it is not better, and replace an existing file"
-    )
+    about = "write the bundle even if it is not better on the held-out pieces"
+    parser.add_argument("--accept-worse", action="store_true", help=about)
+    add_force(parser, "FILE")
     parser.add_argument("--sensor", type=sensor_size, metavar="WxH", help="sensor size, if the recording lacks it")
     parser.add_argument("--events-topic", metavar="T", help="event stream to read; default: the recording's first")
     about = "unit of the event times: s, ms, us or ns; default: that of the recording's layout"

@@ -203,6 +203,13 @@ def _read(path: Path, most: int) -> bytes:
         raise InvalidField("bundle", "file", str(path), error.strerror or str(error)) from None
 
 
+def _file(text: str) -> Path:
+    """The file of a bundle, from its path or from the name of a built-in model."""
+    from neurove_core import models
+
+    return models.file_of(text)
+
+
 def _bundle(path: Path) -> bytes:
     from neurove_core.models import bundle
 
@@ -251,14 +258,16 @@ def add_bundle(parser: Parser) -> None:
     one.add_argument("--seed", type=seed, default=0, metavar="N", help="seed of the weights; default 0")
     add_force(one, "FILE")
     one = subcommand(commands, "inspect", inspect)
-    one.add_argument("file", type=Path, metavar="BUNDLE", help="bundle to show, with BUNDLE.sig if it exists")
+    about = "bundle to show, with BUNDLE.sig if it exists; a file or a built-in name such as `default`"
+    one.add_argument("file", type=_file, metavar="BUNDLE", help=about)
     _add_trust(one, default=[])
     one = subcommand(commands, "average", average)
-    one.add_argument("files", type=Path, nargs="+", metavar="BUNDLE", help="2 to 8 bundles of one network")
+    about = "2 to 8 bundles of one network: files or built-in names"
+    one.add_argument("files", type=_file, nargs="+", metavar="BUNDLE", help=about)
     one.add_argument("--out", type=Path, required=True, metavar="FILE", help="bundle to write")
     add_force(one, "FILE")
     one = subcommand(commands, "scale", scale)
-    one.add_argument("file", type=Path, metavar="BUNDLE", help="trained bundle")
+    one.add_argument("file", type=_file, metavar="BUNDLE", help="trained bundle: a file or a built-in name")
     about = "longer windows, in windows, rising, such as 2 4 8; none: one window only"
     one.add_argument("--scales", type=int, nargs="*", required=True, metavar="N", help=about)
     about = "greatest linear (1/s for a model per height, else m/s) and angular [rad/s] speed, times the scale"

@@ -144,7 +144,7 @@ def _link(
     """The link to ROS."""
     from neurove_service.ros2.rclpy_link import RclpyLink
     from neurove_service.ros2.zenoh_link import ZenohLink
-    from neurove_service.transport import open_transport
+    from neurove_service.transport import TIMESTAMPS, open_transport
 
     name = "bridge_" + "_".join(topics.stream for topics in cameras)
     if args.via == "rclpy":
@@ -156,7 +156,7 @@ def _link(
         patience_s=wait.left_s,
         stop=stop,
         guard=guard,
-        timestamps=True,
+        more=TIMESTAMPS,
     )
     return ZenohLink(transport, args.domain, args.namespace, name[:64], args.distro, guard)
 

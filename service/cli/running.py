@@ -56,13 +56,14 @@ def serve(args: argparse.Namespace) -> int:
     check_limits()
     one_thread()
 
+    from neurove_service.node import memory
     from neurove_service.node.app import Service
     from neurove_service.node.reload import Reload
 
     sys.setswitchinterval(0.0005)  # Zenoh's threads wait for ours: the default of 5 ms is a packet's period
     service = Service(config, stop)
     reloads.append(Reload(config, read, service.available))
-    gc.collect()
+    memory.release_memory()
     gc.freeze()  # the collector would traverse all libraries at each run, with all threads stopped
     service.run()
     gc.freeze()  # again before the exit, which otherwise takes up to 2 s on a busy machine

@@ -2,15 +2,20 @@
 
 import argparse
 import json
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from neurove_protocol.errors import InvalidField
 from neurove_service.cli.arguments import command
 from neurove_service.cli.bars import progress
 from neurove_service.cli.extras import absent
+from neurove_service.cli.processors import FILE, PROCESSORS, settings_for, write_settings
 
 _SCENES: Final = ("street", "room", "wall")
 """Scenes of the simulator that together run all of its loops."""
@@ -27,6 +32,8 @@ class _Step(NamedTuple):
 
 def warm_up(args: argparse.Namespace) -> int:
     """Compile ahead what serve, demo, drive and simulate run, and say where it is kept."""
+    if args.cpu or args.out:
+        return _elsewhere(args)
     from neurove_core.compiled import work
     from neurove_service import logs
 
@@ -51,6 +58,31 @@ def warm_up(args: argparse.Namespace) -> int:
     said = f"compiled {found.compiled} functions" if found.compiled else "nothing to compile"
     print(f"{said}, {found.loaded} were in the cache, {took_s:.1f} s")
     print(f"cache: {', '.join(map(str, caches)) or 'none: set NUMBA_CACHE_DIR to a folder that can be written'}")
+    return 0
+
+
+def _elsewhere(args: argparse.Namespace) -> int:
+    """Compile for a named processor, or into a folder, in a process that is set up so."""
+    if args.out is None:
+        raise InvalidField("warm-up", "--out", "", "a folder, because --cpu makes code that this machine does not use")
+    settings = settings_for(args.cpu, args.out)
+    try:
+        args.out.mkdir(parents=True, exist_ok=True)
+        written = write_settings(settings, args.out)
+    except OSError as error:
+        raise InvalidField("warm-up", "--out", str(args.out), f"a folder to write; {error.strerror}") from error
+    command = [sys.executable, "-m", "neurove_service.cli", "warm-up", "--model", str(args.model), "--json"]
+    child = subprocess.run(command, env=os.environ | settings, stdout=subprocess.PIPE, text=True, check=False)
+    if child.returncode != 0:
+        return child.returncode
+    found = json.loads(child.stdout)
+    if args.json:
+        print(json.dumps(found | {"settings": settings, "file": str(written)}))
+        return 0
+    print(f"compiled {found['compiled']} functions, {found['loaded']} were in the cache, {found['seconds']} s")
+    print(f"cache: {args.out}; a service uses it with the environment in {written}:")
+    for name, value in settings.items():
+        print(f"  {name}={value}")
     return 0
 
 
@@ -87,4 +119,16 @@ def _roots(folders: tuple[Path, ...]) -> list[Path]:
 def add_warm_up(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `neurove warm-up`."""
     about = "bundle that will be served, or the name of a built-in model; default `default`"
-    command(parser, warm_up).add_argument("--model", metavar="BUNDLE", default="default", help=about)
+    made = command(parser, warm_up)
+    made.add_argument("--model", metavar="BUNDLE", default="default", help=about)
+    made.add_argument(
+        "--cpu",
+        metavar="NAME",
+        help=f"compile for this processor instead of the one of this machine; needs --out ({', '.join(PROCESSORS)})",
+    )
+    made.add_argument(
+        "--out",
+        metavar="DIR",
+        type=Path,
+        help=f"folder for the compiled code, and for {FILE}, the environment in which a service uses it",
+    )

@@ -2,7 +2,8 @@
 
 import threading
 from collections import defaultdict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import TypeVar
 
 from neurove_protocol import TwistEstimate
@@ -28,7 +29,7 @@ from neurove_protocol.errors import EXIT_FAILURE, NeuroVEError
 from neurove_service import logs
 from neurove_service.clients.transit import Transit
 from neurove_service.config import ClientConfig
-from neurove_service.transport import Transport, Unreachable, open_transport
+from neurove_service.transport import OnSample, Transport, Unreachable, open_transport
 
 log = logs.get(__name__)
 
@@ -58,13 +59,19 @@ class SeveralNodes(NeuroVEError):
     code = "several_nodes"
 
 
-def connect(config: ClientConfig, patience_s: float = CONNECT_S, stop: threading.Event | None = None) -> Transport:
+def connect(
+    config: ClientConfig,
+    patience_s: float = CONNECT_S,
+    stop: threading.Event | None = None,
+    more: Mapping[str, object] = MappingProxyType({}),
+) -> Transport:
     """Open a session with a service or a router.
 
     Args:
         config: endpoints, and Zenoh's configuration.
         patience_s: how long to retry while nothing listens there.
         stop: ends the retries.
+        more: settings of the session, as for `open_transport`.
 
     Raises:
         NoService: nothing listens at the endpoints. EndpointError: an endpoint or the configuration is wrong.
@@ -76,6 +83,7 @@ def connect(config: ClientConfig, patience_s: float = CONNECT_S, stop: threading
             config_file=config.zenoh_config,
             patience_s=patience_s,
             stop=stop,
+            more=more,
         )
     except Unreachable as error:
         raise NoService(f"no service: {error.message}; start one with `neurove serve`") from None
@@ -270,10 +278,7 @@ def listen(
     on_estimate: Callable[[TwistEstimate], None],
     on_status: Callable[[StreamStatus], None],
 ) -> None:
-    """Receive every estimate and status; a message that cannot be decoded is logged and ignored.
-
-    Where several nodes can answer a stream, each window comes once: see `duty.Newest`.
-    An estimate that waited on its way is flagged `late`, and its `host.age_ns` counts until its arrival: see `Transit`.
+    """Receive every estimate and status; see `readers`.
 
     Args:
         transport: an open session; the subscriptions last as long as it.
@@ -281,13 +286,30 @@ def listen(
         on_estimate: called on Zenoh's thread.
         on_status: called on Zenoh's thread.
     """
+    read_estimate, read_status = readers(lambda estimate, _: on_estimate(estimate), on_status)
+    transport.subscribe(config.keys.velocity(), read_estimate)
+    transport.subscribe(config.keys.status(), read_status)
+
+
+def readers(
+    on_estimate: Callable[[TwistEstimate, int], None], on_status: Callable[[StreamStatus], None]
+) -> tuple[OnSample, OnSample]:
+    """What takes the bytes of an estimate and of a status; a message that cannot be decoded is logged and ignored.
+
+    Where several nodes can answer a stream, each window comes once: see `duty.Newest`.
+    An estimate that waited on its way is flagged `late`, and its `host.age_ns` counts until its arrival: see `Transit`.
+
+    Args:
+        on_estimate: called with an estimate and its time of reception (monotonic) [ns].
+        on_status: called with a status.
+    """
     transit, rules = Transit(), defaultdict[str, Newest](Newest)
 
     def take(estimate: TwistEstimate, at_ns: int) -> None:
         if rules[estimate.stream].takes(estimate.term, estimate.start_us, at_ns):
-            on_estimate(transit.arrived(estimate, at_ns))
+            on_estimate(transit.arrived(estimate, at_ns), at_ns)
 
-    def decoded(kind: type[ReplyT], use: Callable[[ReplyT, int], None]) -> Callable[[str, bytes, int], None]:
+    def decoded(kind: type[ReplyT], use: Callable[[ReplyT, int], None]) -> OnSample:
         def on_sample(key: str, payload: bytes, received_ns: int) -> None:
             try:
                 use(kind.decode(payload), received_ns)
@@ -296,5 +318,4 @@ def listen(
 
         return on_sample
 
-    transport.subscribe(config.keys.velocity(), decoded(TwistEstimate, take))
-    transport.subscribe(config.keys.status(), decoded(StreamStatus, lambda one, _: on_status(one)))
+    return decoded(TwistEstimate, take), decoded(StreamStatus, lambda one, _: on_status(one))

@@ -1,10 +1,11 @@
-"""Compile a network's code in a process of its own, so that a change of model does not hold up the streams.
+"""Compile a network's code in other processes: the streams do not wait, and the node does not keep the memory.
 
 numba compiles for seconds in Python code. In the process of the node each step of a stream would wait for its turn in
 between. The child compiles into the cache on disk, at low priority; the node then reads the cache. Networks of a known
-shape need none of this.
+shape need none of this. At a start with an empty cache, children compile the parts of all code at the same time.
 
-`python -m neurove_service.models.precompile CONFIG` takes the configuration of the model as JSON.
+`python -m neurove_service.models.precompile CONFIG [PART...]` takes the configuration of the model as JSON. It lowers
+its priority where it names no part.
 """
 
 import math
@@ -13,14 +14,11 @@ import subprocess
 import sys
 import threading
 import time
-from typing import Any
-
-import numpy as np
+from collections.abc import Sequence
+from typing import Final
 
 from neurove_core.config import ModelConfig
-from neurove_core.estimator import Estimator
-from neurove_core.models.bundle import Bundle
-from neurove_core.networks.arrays import Weights, shapes
+from neurove_core.warming import PARTS, compile_part, is_cold
 from neurove_service import logs
 
 log = logs.get(__name__)
@@ -30,6 +28,7 @@ CHILD_BYTES = 512 << 20
 """Memory of the child [bytes]; with less free memory the node compiles by itself."""
 
 _POLL_S = 0.05
+_START_S = 300.0  # most for an empty cache, on a slow machine
 _NICE = 5
 _WIDE_CELLS = 1 << 16  # indices of more cells need another type
 
@@ -61,10 +60,36 @@ def in_child(config: ModelConfig, stop: threading.Event, timeout_s: float = TIME
     Returns:
         Whether the child has compiled it; if not, the log has the reason, and the first use compiles it.
     """
-    command = [sys.executable, "-P", "-m", "neurove_service.models.precompile", config.model_dump_json()]
+    return _finish([_start(config, ())], stop, timeout_s)
+
+
+def at_start(config: ModelConfig, free_bytes: int | None) -> None:
+    """Compile all code for the first model of a node in children, where the cache is empty.
+
+    What they do not compile, the node compiles by itself.
+
+    Args:
+        config: of the model.
+        free_bytes: free memory [bytes]; it limits the number of children.
+    """
+    if config.kind != "neurove" or not is_cold():
+        return
+    most = len(_GROUPS) if free_bytes is None else free_bytes // CHILD_BYTES
+    if most and (os.cpu_count() or 1) > 1:
+        groups = _GROUPS[min(most, len(_GROUPS)) - 1]
+        _finish([_start(config, parts) for parts in groups], threading.Event(), _START_S)
+
+
+_GROUPS: Final = ((PARTS,), (PARTS[:1], PARTS[1:]), tuple((part,) for part in PARTS))
+"""The parts that one, two or three children compile. Three keep two cores busy to the end."""
+
+
+def _start(config: ModelConfig, parts: Sequence[str]) -> subprocess.Popen[bytes] | None:
+    """A child that compiles; None, with the reason in the log, where it cannot start."""
+    command = [sys.executable, "-P", "-m", "neurove_service.models.precompile", config.model_dump_json(), *parts]
     # with the same paths of modules: the cache is by path
     try:
-        child = subprocess.Popen(
+        return subprocess.Popen(
             command,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
@@ -73,17 +98,26 @@ def in_child(config: ModelConfig, stop: threading.Event, timeout_s: float = TIME
         )
     except OSError as error:
         log.warning("code is compiled by the node itself", why=error.strerror or str(error))
-        return False
-    deadline = time.monotonic() + timeout_s
-    while child.poll() is None and time.monotonic() < deadline and not stop.wait(_POLL_S):
-        pass
-    if child.poll() is None:
-        child.kill()
-    _, errors = child.communicate()
-    if child.returncode != 0:
-        last = errors.decode(errors="replace").strip().splitlines()[-1:] or [f"exit code {child.returncode}"]
-        log.warning("code is compiled by the node itself", why=last[0][:200])
-    return child.returncode == 0
+        return None
+
+
+def _finish(children: Sequence[subprocess.Popen[bytes] | None], stop: threading.Event, timeout_s: float) -> bool:
+    """Wait for children, and end them at the stop or after the timeout; whether all of them have compiled."""
+    deadline, good = time.monotonic() + timeout_s, True
+    for child in children:
+        if child is None:
+            good = False
+            continue
+        while child.poll() is None and time.monotonic() < deadline and not stop.wait(_POLL_S):
+            pass
+        if child.poll() is None:
+            child.kill()
+        _, errors = child.communicate()
+        if child.returncode != 0:
+            last = errors.decode(errors="replace").strip().splitlines()[-1:] or [f"exit code {child.returncode}"]
+            log.warning("code is compiled by the node itself", why=last[0][:200])
+            good = False
+    return good
 
 
 def _shape(config: ModelConfig) -> tuple[object, ...]:
@@ -95,16 +129,12 @@ def _shape(config: ModelConfig) -> tuple[object, ...]:
 
 
 def main() -> None:
-    """Compile the code of the configuration in the first argument."""
-    os.nice(_NICE)
-    config = ModelConfig.model_validate_json(sys.argv[1])
-    rng = np.random.default_rng(0)
-    tensors = {
-        name: np.abs(rng.normal(0, 0.1, shape)).astype(np.float32)
-        for name, shape in shapes(config, spread=False).items()
-    }
-    given: Any = Weights(config, tensors), np.zeros(6, np.float32), np.ones(6, np.float32)
-    Estimator(Bundle("compiling", False, "", config, *given)).warm_up()
+    """Compile the code of the configuration in the first argument: of the parts that follow, or of a new network."""
+    config, *parts = sys.argv[1:]
+    if not parts:
+        os.nice(_NICE)
+    for part in parts or PARTS[:2]:
+        compile_part(part, ModelConfig.model_validate_json(config))
 
 
 if __name__ == "__main__":

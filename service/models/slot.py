@@ -9,7 +9,7 @@ from neurove_protocol.control import ModelInfo
 from neurove_protocol.errors import Untrained
 from neurove_service import logs
 from neurove_service.guard import Guard
-from neurove_service.models import admission, restart
+from neurove_service.models import admission, precompile, restart
 from neurove_service.models.change import Change, Context, Rules
 from neurove_service.models.library import Available, Files, Library, nothing_pushed
 from neurove_service.models.plan import Plan, SharedPlan
@@ -62,9 +62,10 @@ class ModelSlot:
         library = Library(models_dir, pushed)
         active, previous = (restart.kept(library, digest, trained_only) if digest else None for digest in kept)
         first = restart.first(library, model, active, trained_only)
+        takes = "up to 30 s at the first start on a machine"
+        log.info("compiling the kernels of the model; `ready` follows", model=first.name, takes=takes)
+        precompile.at_start(first.config, free_bytes())
         estimator = Estimator(first, bounds=rules.bounds, refine=rules.refine)
-        name, takes = estimator.bundle.name, "up to 30 s at the first start on a machine"
-        log.info("compiling the kernels of the model; `ready` follows", model=name, takes=takes)
         estimator.warm_up()
         self._shared = SharedPlan(Serving(estimator, 0), previous)
         self._shared.shapes.add(estimator.config)

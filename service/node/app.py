@@ -245,7 +245,7 @@ class Service:
         """Answers pushes by pulling the bundle from the client that pushes it."""
 
         def pull(digest: str, request: ChunkRequest) -> bytes | None:
-            answers = transport.ask(self._keys.chunks(digest), request.encode(), _CHUNK_S, bulk=True)
+            answers = transport.ask(self._keys.chunks(digest), request.encode(), _CHUNK_S, haste="bulk")
             return answers[0].payload if answers else None
 
         return lambda request, report: handlers.push(request, report, pull, self._stop)

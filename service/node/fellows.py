@@ -82,6 +82,11 @@ class Fellows:
         replies = self._ask(self._keys.state(node), request, StateReply, _STATE_S)
         return replies[0] if replies else None
 
+    def take(self, stream: str, node: str, term: int, last_us: int | None, timeout_s: float) -> bool:
+        """Ask a node to answer a stream after a window of this node; whether it replies."""
+        request = TakeRequest(stream=stream, node=self._node, term=term, start_us=last_us)
+        return bool(self._ask(self._keys.take(node), request, DutyReply, timeout_s))
+
     def drain(self, *, resume: bool = False, patience_s: float = _TAKE_S) -> DrainReply:
         """Hand over every stream that this node answers to a node that follows it; `resume` ends the draining.
 
@@ -124,12 +129,7 @@ class Fellows:
         target, resigned = ready[0], pair.resign(patience_s)
         if resigned is None:
             return "", "this node did not stop to answer"
-        self._ask(
-            self._keys.take(target),
-            TakeRequest(stream=stream, node=self._node, term=resigned.term, start_us=resigned.start_us),
-            DutyReply,
-            patience_s,
-        )
+        self.take(stream, target, resigned.term, resigned.start_us, patience_s)
         if not pair.flows:
             return target, ""
         deadline = time.monotonic() + 5 * patience_s
@@ -149,7 +149,7 @@ class Fellows:
     def _ask(self, key: str, request: Message, reply: type[MessageT], timeout_s: float) -> list[MessageT]:
         """The replies of the nodes; one that refuses, or whose reply cannot be read, costs itself."""
         try:
-            answers = self._transport.ask(key, request.encode(), timeout_s)
+            answers = self._transport.ask(key, request.encode(), timeout_s, "urgent" if reply is DutyReply else "usual")
         except NeuroVEError as error:  # a node refused
             log.debug("no answer", key=key, why=error.message)
             return []

@@ -1,4 +1,4 @@
-"""Housekeeping: status messages and eviction of idle streams."""
+"""Housekeeping: status messages, eviction of idle streams, and memory."""
 
 import threading
 import time
@@ -7,6 +7,7 @@ from collections.abc import Callable
 from neurove_protocol.control import StreamStatus
 from neurove_service import logs
 from neurove_service.guard import Guard
+from neurove_service.node.memory import CompilerPages
 from neurove_service.streams.registry import StreamRegistry
 from neurove_service.transport import Publisher
 
@@ -17,6 +18,8 @@ _TICK_S = 0.1
 
 class Housekeeping:
     """Publishes the status of every stream on a change of its verdict and once per period; evicts idle streams.
+
+    Once per period it also returns the pages of the compiler, see `memory.CompilerPages`.
 
     An internal error costs one stream one message.
 
@@ -40,6 +43,7 @@ class Housekeeping:
         self._open_publisher, self._period_s = open_publisher, period_s
         self._guard = guard
         self._publishers: dict[str, Publisher] = {}
+        self._pages = CompilerPages()
         self._reported: dict[str, str] = {}  # stream -> verdict of its newest status message
         self._next_status_s = self.beat_s = time.monotonic()  # beat_s: when the loop turned last
 
@@ -61,6 +65,8 @@ class Housekeeping:
                     self._report(status)
         if due:
             self._evict()
+            with self._guard.at("pages of the compiler"):
+                self._pages.release()
 
     def _report(self, status: StreamStatus) -> None:
         name, before = status.stream, self._reported.get(status.stream)

@@ -1,4 +1,4 @@
-"""Deployment: streams and nodes as the page knows them, filled by Zenoh's threads and read by the web server."""
+"""Deployment: streams and nodes as the page knows them, filled by the feed and read by the web server."""
 
 import threading
 import time
@@ -28,14 +28,14 @@ class Deployment:
         self._unreachable = "the page has not connected yet"
         self._ticks = 0
 
-    def on_estimate(self, estimate: TwistEstimate) -> None:
-        """Take an estimate, on Zenoh's thread."""
+    def on_estimate(self, estimate: TwistEstimate, received_ns: int) -> None:
+        """Take an estimate that was received at this time of the monotonic clock [ns]."""
         with self._lock:
             if view := self._stream(estimate.stream):
-                view.on_estimate(estimate, time.monotonic() - self._start)
+                view.on_estimate(estimate, received_ns / 1e9, self._start)
 
     def on_status(self, status: StreamStatus) -> None:
-        """Take a status, on Zenoh's thread."""
+        """Take a status."""
         with self._lock:
             if view := self._stream(status.stream):
                 view.on_status(status)

@@ -2,6 +2,7 @@
 
 import contextlib
 import threading
+from collections import deque
 from collections.abc import Callable
 from typing import Final
 
@@ -12,9 +13,12 @@ from neurove_service.clients import ask
 from neurove_service.config import ClientConfig
 from neurove_service.guard import Guard
 from neurove_service.page.deployment import Deployment
-from neurove_service.transport import Transport
+from neurove_service.transport import SMALL_BATCHES, OnSample, Transport
 
 log = logs.get(__name__)
+
+MAX_ARRIVED: Final = 4096
+"""Messages that wait to be decoded; of more, the oldest ones are dropped."""
 
 _HEALTH_S: Final = 0.4
 _MODELS_S: Final = 4.0
@@ -22,7 +26,7 @@ _RETRY_S: Final = 0.5
 
 
 class Feed:
-    """Fills a deployment from Zenoh, on threads of its own, until the stop event.
+    """Fills a deployment from Zenoh until the stop event: `take` with what is published, threads with replies.
 
     Args:
         config: endpoints and prefix.
@@ -37,8 +41,9 @@ class Feed:
     def __init__(self, config: ClientConfig, deployment: Deployment, stop: threading.Event, guard: Guard) -> None:
         self._config, self._deployment, self._stop, self._guard = config, deployment, stop, guard
         self.transport: Transport | None = None
+        self._arrived: deque[tuple[OnSample, tuple[str, bytes, int]]] = deque(maxlen=MAX_ARRIVED)
         with contextlib.suppress(ask.NoService):
-            self._take(ask.connect(config, patience_s=0))
+            self._take(ask.connect(config, patience_s=0, more=SMALL_BATCHES))
         self._threads = [
             threading.Thread(target=work, name=name, daemon=True)
             for name, work in (("page health", self._poll_health), ("page models", self._poll_models))
@@ -52,6 +57,16 @@ class Feed:
             thread.join(timeout=2)
         if self.transport is not None:
             self.transport.close()
+
+    def take(self) -> None:
+        """Put the messages that have arrived into the deployment; called ten times per second.
+
+        Zenoh's threads only append, so that they do not wait for Python at each message.
+        """
+        for _ in range(len(self._arrived)):
+            read, sample = self._arrived.popleft()
+            with self._guard.at("page message"):
+                read(*sample)
 
     def activate(self, node: str, model: str, expect: str | None) -> str:
         """Change the model of a node; returns one sentence.
@@ -81,7 +96,9 @@ class Feed:
 
     def _take(self, transport: Transport) -> None:
         keys, deployment = self._config.keys, self._deployment
-        ask.listen(transport, self._config, deployment.on_estimate, deployment.on_status)
+        readers = ask.readers(deployment.on_estimate, deployment.on_status)
+        for key, read in zip((keys.velocity(), keys.status()), readers, strict=True):
+            transport.subscribe(key, lambda *sample, read=read: self._arrived.append((read, sample)))
         transport.watch_tokens(keys.alive(), lambda key, present: deployment.on_token(keys.node_of(key), present))
         self.transport = transport
         deployment.unreachable("")
@@ -96,7 +113,7 @@ class Feed:
 
     def _connect(self) -> None:
         try:
-            self._take(ask.connect(self._config, patience_s=_RETRY_S, stop=self._stop))
+            self._take(ask.connect(self._config, patience_s=_RETRY_S, stop=self._stop, more=SMALL_BATCHES))
         except NeuroVEError as error:
             self._deployment.unreachable(error.message)
             self._stop.wait(_RETRY_S)

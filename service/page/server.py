@@ -18,6 +18,7 @@ from neurove_service.page.feed import Feed
 from neurove_service.page.images import Images
 from neurove_service.page.viewers import MAX_VIEWERS, Viewers
 from neurove_service.page.web import Site
+from neurove_service.transport import receive_on_one_thread
 
 MAX_CONNECTIONS: Final = 8 * MAX_VIEWERS
 """Connections at once; a browser opens up to six."""
@@ -64,6 +65,7 @@ def serve(config: ClientConfig, listening: socket.socket, access: Access, stop: 
     Raises:
         EndpointError: an endpoint or the configuration is wrong.
     """
+    receive_on_one_thread()
     deployment, guard = Deployment(), Guard()
     feed = Feed(config, deployment, stop, guard)
     try:
@@ -83,7 +85,7 @@ async def _serve(
     guard: Guard,
 ) -> None:
     connections: dict[Any, asyncio.Transport] = {}
-    viewers = Viewers(deployment, stop, _aborting(connections), guard)
+    viewers = Viewers(deployment, feed.take, stop, _aborting(connections), guard)
     settings = uvicorn.Config(
         Site(deployment, feed, images, viewers, access).app(),
         http=_protocol(connections),

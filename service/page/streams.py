@@ -1,6 +1,5 @@
 """A stream as the page shows it: newest estimate and status, a bounded history, and whether it is alive."""
 
-import itertools
 import time
 from collections import deque
 from dataclasses import dataclass, field
@@ -45,15 +44,17 @@ class StreamView:
     status_at: float = 0.0
     heard_at: float = 0.0
     points: deque[Point] = field(default_factory=lambda: deque(maxlen=MAX_POINTS))
+    recent_s: deque[float] = field(default_factory=lambda: deque(maxlen=MAX_POINTS))  # arrivals that make the rate
     fresh: deque[Point] = field(default_factory=lambda: deque(maxlen=100))
 
-    def on_estimate(self, estimate: TwistEstimate, at_s: float) -> None:
-        """Take a new estimate; `at_s` is the arrival on the page's own clock."""
-        self.estimate, self.estimate_at = estimate, time.monotonic()
-        self.heard_at = self.estimate_at
+    def on_estimate(self, estimate: TwistEstimate, at: float, start: float) -> None:
+        """Take a new estimate that arrived at `at`; `start` is the zero of the page's own clock."""
+        self.estimate = estimate
+        self.estimate_at = self.heard_at = at
         self.node = estimate.node or self.node
-        new = point(estimate, at_s)
+        new = point(estimate, at - start)
         self.points.append(new)
+        self.recent_s.append(new.at_s)
         self.fresh.append(new)
 
     def on_status(self, status: StreamStatus) -> None:
@@ -80,15 +81,15 @@ class StreamView:
         """
         level, verdict, why = self._verdict(node_problem)
         status, estimate = self.status, self.estimate
-        recent = itertools.takewhile(lambda one: one.at_s > now_s - _RATE_S, reversed(self.points))
-        rate_hz = sum(1 for _ in recent) / _RATE_S
+        while self.recent_s and self.recent_s[0] <= now_s - _RATE_S:
+            self.recent_s.popleft()
         shown: dict[str, Any] = {
             "name": self.name,
             "node": self.node,
             "level": level,
             "verdict": verdict,
             "why": clipped(why),
-            "rate_hz": round(rate_hz, 1),
+            "rate_hz": round(len(self.recent_s) / _RATE_S, 1),
             "age_s": round(time.monotonic() - self.estimate_at, 2) if estimate else None,
         }
         if estimate is not None:

@@ -1,9 +1,10 @@
 """Viewers: the browsers that follow the page, each with a bounded queue; one that does not read is dropped."""
 
 import asyncio
+import contextlib
 import json
 import threading
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from typing import Any, Final
 
 from starlette.types import Receive, Scope, Send
@@ -20,6 +21,11 @@ QUEUE_TICKS: Final = 40
 
 TICK_S: Final = 0.1
 
+READ_S: Final = 10.0
+"""A browser that reads no image for this time is disconnected [s]."""
+
+_IMAGES: Final = [(b"content-type", b"application/octet-stream"), (b"cache-control", b"no-store")]
+
 Abort = Callable[[Any], None]
 """Closes the connection of a client address at once."""
 
@@ -35,15 +41,19 @@ class Viewers:
 
     Args:
         deployment: what is shown.
-        about: constant facts for the first message of a viewer, from its role.
+        take: puts what has arrived into the deployment.
         stop: ends the loop and the answers.
         abort: closes a connection.
         guard: counts internal errors.
     """
 
-    def __init__(self, deployment: Deployment, stop: threading.Event, abort: Abort, guard: Guard) -> None:
-        self._deployment, self._stop, self._abort, self._guard = deployment, stop, abort, guard
+    def __init__(
+        self, deployment: Deployment, take: Callable[[], None], stop: threading.Event, abort: Abort, guard: Guard
+    ) -> None:
+        self._deployment, self._take = deployment, take
+        self._stop, self._abort, self._guard = stop, abort, guard
         self._viewers: set[_Viewer] = set()
+        self._watching = 0
 
     @property
     def count(self) -> int:
@@ -54,11 +64,43 @@ class Viewers:
         """Send the news ten times per second until the stop event; without a viewer nothing is encoded."""
         while not self._stop.is_set():
             await asyncio.sleep(TICK_S)
+            self._take()
             if self._viewers:
                 with self._guard.at("page news"):
                     self._send(message("news", self._deployment.news()))
         for viewer in list(self._viewers):
             self._drop(viewer)
+
+    async def watch(self, scope: Scope, receive: Receive, send: Send, images: AsyncIterator[bytes]) -> None:
+        """Answer a request with images until the browser leaves; one that takes none for a while is disconnected."""
+        if self._watching >= MAX_VIEWERS:
+            await _refuse(send)
+            return
+        self._watching += 1
+        sending = asyncio.create_task(self._send_images(scope, send, images))
+        leaving = asyncio.create_task(_left(receive))
+        try:
+            await asyncio.wait((sending, leaving), return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            self._watching -= 1
+            leaving.cancel()
+            sending.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await sending
+
+    async def _send_images(self, scope: Scope, send: Send, images: AsyncIterator[bytes]) -> None:
+        with self._guard.at("page images"):
+            await send({"type": "http.response.start", "status": 200, "headers": _IMAGES})
+            try:
+                async for data in images:
+                    if self._stop.is_set():
+                        break
+                    async with asyncio.timeout(READ_S):
+                        await send({"type": "http.response.body", "body": data, "more_body": True})
+                await send({"type": "http.response.body", "body": b""})
+            except TimeoutError:
+                log.warning("viewer dropped: it does not read", client=str(scope.get("client")))
+                self._abort(scope.get("client"))
 
     def _send(self, data: bytes) -> None:
         for viewer in list(self._viewers):
@@ -96,10 +138,15 @@ class Viewers:
             gone.cancel()
 
 
-async def _gone(receive: Receive, viewer: _Viewer) -> None:
-    """Wait until the browser has left, then end its answer."""
+async def _left(receive: Receive) -> None:
+    """Wait until the browser has left."""
     while (await receive())["type"] != "http.disconnect":
         pass
+
+
+async def _gone(receive: Receive, viewer: _Viewer) -> None:
+    """Wait until the browser has left, then end its answer."""
+    await _left(receive)
     while not viewer.queue.empty():
         viewer.queue.get_nowait()
     viewer.queue.put_nowait(None)

@@ -4,13 +4,13 @@ import asyncio
 import importlib.metadata
 import importlib.resources
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import PurePosixPath
 from typing import Any, Final
 
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
-from starlette.datastructures import Headers, MutableHeaders
+from starlette.datastructures import Headers, MutableHeaders, QueryParams
 from starlette.requests import ClientDisconnect, Request, cookie_parser
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route
@@ -121,14 +121,13 @@ class Site:
     def app(self) -> ASGIApp:
         """The application."""
         routes = [
-            Route("/feed", _Plain(self._follow)),
-            Route("/images", self._newer),
             Route("/session", self._session, methods=["POST"]),
             Route("/operate/activate", self._activate, methods=["POST"]),
             Route("/operate/rollback", self._rollback, methods=["POST"]),
             Route("/{path:path}", self._file),
         ]
-        return Guarded(Starlette(routes=routes), self._access)
+        lasting = {"/feed": self._follow, "/images": self._watch}
+        return Guarded(_Lasting(lasting, Starlette(routes=routes)), self._access)
 
     async def _file(self, request: Request) -> Response:
         found = self._files.get(request.url.path)
@@ -138,15 +137,14 @@ class Site:
         about = {"version": self._version, "role": scope["role"], "operator": self._access.operator}
         await self._viewers.follow(scope, receive, send, about)
 
-    async def _newer(self, request: Request) -> Response:
-        """Images of the streams `s`, in their order; `n` has the numbers of those that the browser has."""
-        names, numbers = request.query_params.getlist("s"), request.query_params.getlist("n")
-        known = zip(names[:MAX_WATCHED], (*numbers, *names), strict=False)
-        asked = {name: int(number) if number.isdecimal() else 0 for name, number in known}
+    async def _watch(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """New images of the streams `s`, until the browser leaves; see `Images.follow`."""
+        names = QueryParams(scope["query_string"]).getlist("s")[:MAX_WATCHED]
         transport = self._feed.transport
-        if transport is None or not asked or not all(map(self._shown, asked)):
-            return PlainTextResponse("no such stream", 404)
-        return Response(await self._images.newer(asked, transport), media_type="application/octet-stream")
+        if transport is None or not names or not all(map(self._shown, names)):
+            await PlainTextResponse("no such stream", 404)(scope, receive, send)
+            return
+        await self._viewers.watch(scope, receive, send, self._images.follow(list(dict.fromkeys(names)), transport))
 
     def _shown(self, stream: str) -> bool:
         return is_name(stream) and self._deployment.has_stream(stream)
@@ -198,14 +196,14 @@ class Site:
         return JSONResponse({"done": done})
 
 
-class _Plain:
-    """A handler without a Request, for a response that lasts."""
+class _Lasting:
+    """Answers that last, and so have many parts, without the layers that an application puts around each part."""
 
-    def __init__(self, handle: ASGIApp) -> None:
-        self._handle = handle
+    def __init__(self, lasting: Mapping[str, ASGIApp], other: ASGIApp) -> None:
+        self._lasting, self._other = lasting, other
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        await self._handle(scope, receive, send)
+        await self._lasting.get(scope["path"], self._other)(scope, receive, send)
 
 
 def _text(given: dict[str, Any], field: str) -> str:

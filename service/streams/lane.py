@@ -67,6 +67,7 @@ class Lane:
         self._complete_from_us = complete_from_us
         self._answers_from_us: int | None = None
         self._adopted: tuple[int, Carried] | None = None
+        self.adopted_us: int | None = None  # start of the window with which the state of another node began
 
     @property
     def estimator(self) -> Estimator:
@@ -102,12 +103,14 @@ class Lane:
         """Go on with the state of another node from the window that begins here; dropped if there is no such window."""
         self._adopted = start_us, state
 
-    def _adopt_at(self, start_us: int) -> None:
+    def _adopt_at(self, start_us: int, state: StreamState) -> StreamState:
+        """The state before the window that begins here."""
         if self._adopted is not None and start_us >= self._adopted[0]:
             if start_us == self._adopted[0]:
-                self.state = self._adopted[1].into(self.state)
+                state, self.adopted_us = self._adopted[1].into(state), start_us
                 self._complete_from_us = None
             self._adopted = None
+        return state
 
     def follow(self, windows: list[Window], *, checked: bool = False) -> list[TimedEstimate]:
         """Answer windows in order; if an error is raised, the state stays as before the call.
@@ -119,10 +122,9 @@ class Lane:
         Raises:
             NotFinite: a value is not finite.
         """
-        if windows:
-            self._adopt_at(windows[0].start_us)
         state, answers = self.state, []
         for window in windows:
+            state = self._adopt_at(window.start_us, state)
             if not self.has_all_events(window):
                 continue
             began = time.thread_time()  # as in admission: time spent waiting for other work is not the model's

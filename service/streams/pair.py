@@ -19,6 +19,7 @@ from neurove_protocol import TwistEstimate
 from neurove_protocol.control import StandbyStatus
 from neurove_protocol.duty import DutyReply, StateReply
 from neurove_service import logs
+from neurove_service.streams.asking import LONG_PAUSE_NS, Asking, is_long
 from neurove_service.streams.following import Following, Sync
 from neurove_service.streams.stream import Stream
 from neurove_service.streams.tenure import Peers, Tenure
@@ -27,11 +28,6 @@ log = logs.get(__name__)
 
 DOUBT_WINDOWS: Final = 1.25
 """A node that answers asks the others after a pause of so many windows in its work; less than `LATE_WINDOWS`."""
-
-LONG_PAUSE_NS: Final = 1_000_000_000
-"""After a pause as long, a node that gets no reply listens first: packets were lost, and another node may answer."""
-
-_CONFIRM_WINDOWS: Final = 4  # how long to wait for replies
 
 
 class Resigned(NamedTuple):
@@ -61,12 +57,13 @@ class Pair:
         on_close: Callable[["Pair"], None] = lambda _: None,
     ) -> None:
         self._tenure, self._peers, self._wake, self._now_ns, self._on_close = tenure, peers, wake, now_ns, on_close
-        self._stream = tenure.stream
+        self._stream, self._asking = tenure.stream, Asking(tenure, peers, now_ns)
         self._following, self._sync = Following(), Sync(tenure.stream)
         self._calls: deque[Callable[[], None]] = deque()  # from other threads, for the worker
         self._turned_ns = self._answered_ns = now_ns()
         self._pause_ns, self._window_ns = 0, 50_000_000  # longest pause of the worker since the last answer
-        self._last: TwistEstimate | None = None  # published last
+        self._last_us: int | None = None  # start of the window that was published last
+        self._renewed = False  # since an estimate was heard
 
     @property
     def flows(self) -> bool:
@@ -96,7 +93,7 @@ class Pair:
 
         def stop() -> None:
             if self._tenure.answers:
-                resigned.append(Resigned(self._tenure.term, self._last.start_us if self._last else None))
+                resigned.append(Resigned(self._tenure.term, self._last_us))
                 self._tenure.listen("hands over")
             done.set()
 
@@ -114,15 +111,14 @@ class Pair:
             term=tenure.term,
             leader=tenure.leader or None,
             equal=tenure.answers or following.equal,
+            missed_us=following.missed_us,
             draining=tenure.draining,
             digest=following.digest,
         )
 
     def state(self, digest: str, timeout_s: float) -> StateReply | None:
         """The state of the stream for a follower; None if this node has no such state, or is stuck."""
-        found = self._sync.ask(digest, timeout_s, self._wake)
-        about = {"node": self._tenure.node, "stream": self._stream, "digest": digest}
-        return StateReply.model_validate(about | found._asdict()) if found else None
+        return self._sync.ask(self._tenure.node, digest, timeout_s, self._wake)
 
     def status(self) -> StandbyStatus:
         """For the status of the stream."""
@@ -144,13 +140,16 @@ class Pair:
         silent_ns, self._answered_ns, self._pause_ns = self._turned_ns - self._answered_ns, self._turned_ns, 0
         pause_ns = max(pause_ns, silent_ns) if silent_ns > LONG_PAUSE_NS else pause_ns
         self._run_calls()
-        self._following.digest = estimate.digest
+        lacks = self._following.note(estimate)
         if self._tenure.answers and pause_ns > DOUBT_WINDOWS * self._window_ns:
-            self._confirm(pause_ns)
-            self._run_calls()
-        elif not self._tenure.answers and pause_ns > LONG_PAUSE_NS:
-            self._following.renew(self._turned_ns)
+            self._asking.after_pause(pause_ns, self._window_ns)
+            self._asked()
+        elif not self._tenure.answers and is_long(pause_ns, self._window_ns):
+            self._following.renew(self._turned_ns, doubt=True)
             self._tenure.set_patience()
+        if self._tenure.answers and lacks:
+            self._asking.after_loss(estimate.start_us, self._last_us, self._window_ns)
+            self._asked()
         if self._tenure.answers:
             return [self._stamped(estimate)]
         self._following.add(estimate, self._now_ns())
@@ -161,10 +160,7 @@ class Pair:
         self._note_pause()
         self._run_calls()
         self._sync.serve(stream)
-        leader = self._tenure.leader
-        if self._tenure.role == "follows" and self._following.wants_state(self._now_ns()):
-            self._sync.fetch(stream, lambda digest: self._peers.state(self._stream, leader, digest))
-            self._note_pause()
+        self._take_state(stream)
         return [] if self._tenure.answers else self._due()
 
     def wait_s(self, most_s: float) -> float:
@@ -189,6 +185,11 @@ class Pair:
         self._pause_ns, self._turned_ns = max(self._pause_ns, now_ns - self._turned_ns), now_ns
         return self._pause_ns
 
+    def _asked(self) -> None:
+        """Go on after a question to other nodes, which is no pause, with what was heard meanwhile."""
+        self._turned_ns = self._now_ns()
+        self._run_calls()
+
     @property
     def _due_in_s(self) -> float:
         """When this node takes over, unless another estimate is heard; infinite if nothing is kept [s]."""
@@ -197,27 +198,38 @@ class Pair:
         return math.inf if since_ns is None else (since_ns + patience_ns - self._now_ns()) / 1e9
 
     def _due(self) -> list[TwistEstimate]:
-        """All that is kept, if this node takes over now."""
-        tenure = self._tenure
-        if self._due_in_s > 0:
+        """All that is kept, if this node takes over now. If it is late itself, it waits once more."""
+        tenure, late_ns = self._tenure, -1e9 * self._due_in_s
+        if late_ns < 0:
             return []
-        tenure.take_over("no other node answers" if tenure.role == "listens" else f"{tenure.leader} is late")
+        if late_ns > DOUBT_WINDOWS * self._window_ns and not tenure.at_once and not self._renewed:
+            self._renewed = True
+            self._following.renew(self._now_ns(), doubt=is_long(late_ns, self._window_ns))
+            return []
+        tenure.take_over(f"{tenure.leader} is late" if tenure.leader else "no other node answers")
         if self._following.other_model:
             log.warning("another model than before answers", stream=self._stream, before=self._following.other_model)
         return [self._stamped(estimate) for estimate in self._following.release()]
 
     def _stamped(self, estimate: TwistEstimate) -> TwistEstimate:
-        seq = self._following.seq_of(estimate)
-        self._last = estimate.model_copy(update={"seq": seq, "term": self._tenure.term})
-        return self._last
+        self._last_us = estimate.start_us
+        return estimate.model_copy(update={"seq": self._following.seq_of(estimate), "term": self._tenure.term})
+
+    def _take_state(self, stream: Stream) -> None:
+        ask, leader = self._peers.state, self._tenure.leader if self._tenure.role == "follows" else ""
+        if leader and self._following.wants_state(self._now_ns(), used=self._sync.is_used(stream)):
+            self._following.took(self._sync.fetch(stream, lambda digest: ask(self._stream, leader, digest)))
+            self._note_pause()
 
     def _hear(self, estimate: TwistEstimate) -> None:
         if self._tenure.hear(estimate.node or "", estimate.term or 0, self._now_ns()):
+            self._renewed = False
             self._following.hear(estimate)
 
     def _lose(self, node: str) -> None:
         if node == self._tenure.leader:
-            at_once = self.flows and not self._tenure.draining and self._tenure.rank() == 0
+            ready = self._following.equal or not self._peers.names(self._stream)
+            at_once = self.flows and not self._tenure.draining and self._tenure.rank() == 0 and ready
             self._tenure.listen(f"{node} has left", at_once=at_once)
 
     def _take(self, node: str, term: int, start_us: int | None) -> None:
@@ -225,18 +237,3 @@ class Pair:
             self._tenure.term = term
             self._following.leave_out(start_us)
             self._tenure.listen(f"{node} hands over", at_once=True)
-
-    def _confirm(self, pause_ns: int) -> None:
-        """Ask the others after a pause: another node may have taken over. Without an answer, listen first."""
-        tenure, names = self._tenure, set(self._peers.names(self._stream))
-        if not names and pause_ns < LONG_PAUSE_NS:
-            return
-        replies = self._peers.roles(self._stream, _CONFIRM_WINDOWS * self._window_ns / 1e9)
-        self._turned_ns = self._now_ns()
-        others = [(one.term, one.node) for one in replies if one.role == "answers"]
-        if others and max(others) > (tenure.term, tenure.node):
-            log.warning("superseded in a pause", stream=self._stream, pause_ms=pause_ns // 1_000_000)
-            term, leader = max(others)
-            tenure.follow(leader, term)
-        elif not replies or not names <= {one.node for one in replies}:
-            tenure.listen("no reply from another node after a pause")

@@ -33,6 +33,9 @@ class Peers(Protocol):
     def state(self, stream: str, node: str, digest: str, /) -> StateReply | None:
         """The state of the stream on the node that answers it."""
 
+    def take(self, stream: str, node: str, term: int, last_us: int | None, timeout_s: float, /) -> bool:
+        """Ask a node to answer after the window that begins at `last_us`; whether it replies."""
+
 
 class Tenure:
     """The role of one node on one stream; only the worker of the stream changes it.
@@ -54,6 +57,7 @@ class Tenure:
         self.term, self.leader = 0, ""
         self.draining = False
         self._heard_ns = 0
+        self._wary = False  # another node may answer, though it is not known now
         self._patience = 1.0
         self.set_patience()
 
@@ -64,7 +68,7 @@ class Tenure:
 
     def patience_ns(self, window_ns: int, *, equal: bool) -> float:
         """How long the estimates of another node may be missing [ns]; longer unless the state is that of the others."""
-        cold = not equal and bool(self._peers.names(self.stream))
+        cold = self._wary or (not equal and bool(self._peers.names(self.stream)))
         return self._patience * LATE_WINDOWS * window_ns * (_COLD if cold else 1)
 
     def hear(self, sender: str, term: int, now_ns: int) -> bool:
@@ -80,18 +84,19 @@ class Tenure:
     def follow(self, leader: str, term: int) -> None:
         """Another node answers."""
         log.info("follows", stream=self.stream, leader=leader, term=term)
-        self.role, self.leader, self.term = "follows", leader, term
+        self.role, self.leader, self.term, self._wary = "follows", leader, term, False
         self.set_patience()
 
-    def listen(self, why: str, *, at_once: bool = False) -> None:
+    def listen(self, why: str, *, at_once: bool = False, wary: bool = False) -> None:
         """No node is known to answer.
 
         Args:
             why: for the log.
             at_once: whether to take over with the next own estimate, instead of waiting for another node's.
+            wary: whether another node is likely to answer: wait as long as with another state.
         """
         log.info("listens", stream=self.stream, why=why)
-        self.role, self.leader = "listens", ""
+        self.role, self.leader, self._wary = "listens", "", wary
         self.set_patience()
         if at_once:
             self._patience = 0.0
@@ -99,8 +104,13 @@ class Tenure:
     def take_over(self, why: str, *, unix_ms: Callable[[], int] = lambda: time.time_ns() // 1_000_000) -> None:
         """This node answers from now on, in a new term."""
         self.term = max(self.term + 1, 1000 * unix_ms() + zlib.crc32(self.node.encode()) % 1000)
-        self.role, self.leader = "answers", self.node
+        self.role, self.leader, self._wary = "answers", self.node, False
         log.warning("answers the stream", stream=self.stream, term=self.term, why=why)
+
+    @property
+    def at_once(self) -> bool:
+        """Whether this node takes over with its next estimate."""
+        return self._patience == 0.0
 
     def rank(self) -> int:
         """How many other nodes take over first."""

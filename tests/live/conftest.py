@@ -62,11 +62,11 @@ def wait_until(condition, timeout_s=120.0):
 class Process:
     """A command as a child process."""
 
-    def __init__(self, *arguments, module="neurove_service.cli", **environment):
+    def __init__(self, *arguments, module="neurove_service.cli", stderr=subprocess.PIPE, **environment):
         self.child = subprocess.Popen(
             [sys.executable, "-m", module, *arguments],
             stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
+            stderr=stderr,
             text=True,
             env=os.environ | environment,
         )

@@ -146,10 +146,11 @@ class Consumer:
 
 
 class Fellow:
-    """A node that is started, killed, stopped and drained."""
+    """A node that is started, killed, stopped and drained; its logs are appended to a file in `logs`, if given."""
 
-    def __init__(self, name, endpoint, model, *more):
+    def __init__(self, name, endpoint, model, *more, logs=None):
         self.name = name
+        self._log = None if logs is None else Path(logs, f"{name}.log")
         self._arguments = (
             *("serve", "--mode", "client", "--connect", endpoint, "--node", name, "--model", str(model)),
             *("--standby", "lot", "--log-level", "info", "--max-age-s", "60", "--queue-s", "60", *more),
@@ -157,7 +158,11 @@ class Fellow:
         self.process = None
 
     def start(self):
-        self.process = Process(*self._arguments)
+        if self._log is None:
+            self.process = Process(*self._arguments)
+        else:
+            with self._log.open("a") as log:
+                self.process = Process(*self._arguments, stderr=log)
         return self
 
     def kill(self):
@@ -195,9 +200,9 @@ def drain(transport, node, *, resume=False):
 
 
 @contextlib.contextmanager
-def fellows(names, endpoint, model, *more):
+def fellows(names, endpoint, model, *more, logs=None):
     """Nodes that are alive, by name; all are ended."""
-    nodes = {name: Fellow(name, endpoint, model, *more).start() for name in names}
+    nodes = {name: Fellow(name, endpoint, model, *more, logs=logs).start() for name in names}
     try:
         with client(endpoint) as transport:
             wait_until(lambda: len(transport.tokens(KEYS.alive(), 1.0)) == len(names), START_S)

@@ -17,7 +17,7 @@ from neurove_service.guard import Guard
 from neurove_service.ros2 import graph
 from neurove_service.ros2.graph import Entity, Topic
 from neurove_service.ros2.zenoh_link import ZenohLink
-from neurove_service.transport import open_transport
+from neurove_service.transport import TIMESTAMPS, open_transport
 from tests import ros_peer
 from tests.builders import make_events
 from tests.builders_evt import write_evt3
@@ -271,7 +271,7 @@ def test_the_recorded_node_of_rmw_zenoh_is_heard_as_a_peer(place):
     entities = {graph.gid_of(token): Entity.of_token(token) for token in tokens}
     entities = {gid: entity for gid, entity in entities.items() if entity.type in HASHES}
     samples = [sample for sample in recorded["samples"] if graph.type_of(sample["key"]) in HASHES]
-    own = open_transport("client", connect=(place.endpoint,), patience_s=START_S, timestamps=True)
+    own = open_transport("client", connect=(place.endpoint,), patience_s=START_S, more=TIMESTAMPS)
     link, heard = ZenohLink(own, 0, "/neurove", "listener", "kilted", Guard()), []
     with contextlib.closing(link), client(place.endpoint) as peer:
         for entity in entities.values():

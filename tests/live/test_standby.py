@@ -29,9 +29,9 @@ def test_kills_drains_and_a_hanging_node_leave_no_trace_in_the_estimates(router,
             (found,) = both - {name}
             return found
 
-        def some_windows_later():
+        def some_windows_later(windows=20):
             count = len(consumer.taken[STREAM])
-            wait_until(lambda: len(consumer.taken[STREAM]) > count + 20)
+            wait_until(lambda: len(consumer.taken[STREAM]) > count + windows)
 
         def hand_over(by, back):
             """The other node answers after `by`; after `back` there is a follower with equal state again."""
@@ -45,7 +45,13 @@ def test_kills_drains_and_a_hanging_node_leave_no_trace_in_the_estimates(router,
         for _ in range(2):
             hand_over(lambda name: nodes[name].kill(), lambda name: nodes[name].start())
         hand_over(lambda name: drain(transport, name), lambda name: drain(transport, name, resume=True))
-        hand_over(lambda name: nodes[name].hang(), lambda name: nodes[name].wake())
+        for _ in range(2):  # so long that packets are lost; the node that woke answers while the other one hangs
+
+            def hang(name):
+                nodes[name].hang()
+                some_windows_later(100)
+
+            hand_over(hang, lambda name: nodes[name].wake())
         some_windows_later()
         driver.pause()
         wait_until(lambda: driver.is_answered(consumer.newest(STREAM)))

@@ -16,10 +16,11 @@ from tests.builders import make_packets
 from tests.live.conftest import AT_FULL_SPEED, Source, client, free_endpoint, service, wait_until
 
 
-def process_seconds(pid: int) -> float:
-    """Processor time of a process so far [s]."""
+def process_seconds(pid: int, *, children: bool = False) -> float:
+    """Processor time so far of a process, or of its children that ended [s]."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    first = 13 if children else 11
+    return (int(fields[first]) + int(fields[first + 1])) / os.sysconf("SC_CLK_TCK")
 
 
 def run(rate: int, seconds: float, events: int) -> str:

@@ -27,6 +27,7 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--hangs", type=int, default=5)
     parser.add_argument("--streams", type=int, default=2)
+    parser.add_argument("--logs", help="folder for the logs of the nodes")
     args = parser.parse_args()
     streams = [f"cam{number}" for number in range(args.streams)]
     endpoint = free_endpoint()
@@ -34,7 +35,7 @@ def main() -> int:
     try:
         with tempfile.TemporaryDirectory() as folder, client(endpoint) as transport:
             model = small_model(Path(folder), WINDOW_US)
-            with fellows(("a", "b"), endpoint, model) as nodes:
+            with fellows(("a", "b"), endpoint, model, logs=args.logs) as nodes:
                 consumer, driver = Consumer(transport), Driver(transport, streams).start()
                 wait_until(lambda: all(len(consumer.taken.get(one, ())) > 50 for one in streams), START_S)
                 changes = run(transport, nodes, consumer, streams, args)
@@ -68,6 +69,8 @@ def run(transport, nodes, consumer, streams, args):
             wait_until(gathered, START_S)
             first = consumer.leader(streams[0])
             changes.append((time.monotonic_ns(), kind))
+            if args.logs:
+                print(time.strftime("%H:%M:%S"), kind, first, flush=True)
             if kind == "drain":
                 drain(transport, first)
                 drain(transport, first, resume=True)

@@ -244,6 +244,7 @@ EXAMPLES: dict[str, Fields] = {
         "term": 7,
         "leader": "rover-1",
         "equal": True,
+        "missed_us": 60_000,
         "draining": False,
         "digest": "5e" * 32,
     },
@@ -558,6 +559,7 @@ ANY: dict[str, st.SearchStrategy[Fields]] = {
             "term": counts,
             "leader": st.none() | names,
             "equal": st.booleans(),
+            "missed_us": st.none() | int64s,
             "draining": st.booleans(),
             "digest": sentences,
         }

@@ -44,6 +44,7 @@ NULLABLE = {
     ("TwistEstimate", "host"),
     ("TwistEstimate", "term"),
     ("DutyReply", "leader"),
+    ("DutyReply", "missed_us"),
     ("TakeRequest", "start_us"),
     ("CameraInfo", "height_m"),
     *(

@@ -98,9 +98,11 @@ def test_gains_alone_make_a_model_of_the_wrong_scale_better_and_leave_a_right_on
         again.replace(out)
     assert code == 1
     assert "not better: on the held-out pieces" in text
-    assert "nothing is written; --force" in text
+    assert "nothing is written; --accept-worse" in text
     assert not again.exists()
     code, _, _ = adapt("--out", again, *arguments, "--start", out, "--force", updates=0)
+    assert (code, again.exists()) == (1, False)  # --force only replaces
+    code, _, _ = adapt("--out", again, *arguments, "--start", out, "--accept-worse", updates=0)
     assert (code, again.exists()) == (0, True)
     code, _, error = adapt("--out", again, *arguments, updates=0)
     assert code == 2

@@ -9,7 +9,7 @@ import pytest
 import safetensors.torch
 import torch
 
-from neurove_core import self_test
+from neurove_core import models, self_test
 from neurove_core.estimator import Estimator
 from neurove_core.models import bundle, golden
 from neurove_core.models.metadata import BundleLimits, MadeBy, Metadata
@@ -305,3 +305,18 @@ def test_scale_writes_a_bundle_with_longer_windows_and_the_same_weights(run, bun
     assert code == 2
     assert "scales" in err
     assert not (tmp_path / "no.safetensors").exists()
+
+
+def test_a_built_in_model_is_given_by_its_name(run, tmp_path):
+    code, out, _ = run("inspect", "default", "--json")
+    assert code == 0
+    assert json.loads(out)["digest"] == models.find("default").digest
+    assert run("scale", "default", "--scales", 2, "--out", "s.safetensors")[0] == 0
+    assert bundle.load(tmp_path / "s.safetensors").config.scales == (2,)
+    code, _, err = run("inspect", "defualt")
+    assert code == 2
+    assert "defualt" in err
+
+
+def test_every_built_in_model_has_the_name_of_its_file():
+    assert [models.file_of(found.name).stem for found in models.shipped()] == [found.name for found in models.shipped()]

@@ -35,3 +35,19 @@ def test_a_child_that_cannot_start_or_that_is_stopped_leaves_the_work_to_the_nod
     monkeypatch.setattr("sys.executable", "/no/such/program")
     assert not precompile.in_child(SMALL, threading.Event())
     assert "code is compiled by the node itself" in capsys.readouterr().out
+
+
+def test_a_node_with_little_memory_or_another_network_starts_no_children(monkeypatch, capsys):
+    monkeypatch.setattr("sys.executable", "/no/such/program")  # a child would be a warning in the log
+    monkeypatch.setattr(precompile, "is_cold", lambda: True)
+    precompile.at_start(SMALL, precompile.CHILD_BYTES - 1)
+    precompile.at_start(SMALL.model_copy(update={"kind": "ann"}), None)
+    assert "by the node itself" not in capsys.readouterr().out
+
+
+def test_children_of_a_first_start_that_cannot_start_leave_the_work_to_the_node(monkeypatch, capsys):
+    monkeypatch.setattr("sys.executable", "/no/such/program")
+    monkeypatch.setattr(precompile, "is_cold", lambda: True)
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    precompile.at_start(SMALL, None)
+    assert capsys.readouterr().out.count("code is compiled by the node itself") == 3

@@ -2,6 +2,7 @@
 
 import json
 import math
+import time
 
 import pytest
 
@@ -75,7 +76,7 @@ def test_the_uncertainty_of_a_speed_is_that_along_the_motion():
 def test_points_are_news_once_and_history_for_a_new_viewer():
     deployment = Deployment()
     for _ in range(3):
-        deployment.on_estimate(estimate(flags=("gap", "late")))
+        deployment.on_estimate(estimate(flags=("gap", "late")), time.monotonic_ns())
     (stream,) = deployment.news()["streams"]
     assert [len(stream["points"]), stream["points"][0][13]] == [3, "gap late"]
     assert deployment.news()["streams"][0]["points"] == []
@@ -84,7 +85,7 @@ def test_points_are_news_once_and_history_for_a_new_viewer():
 
 def test_the_verdict_and_its_reason_are_those_of_the_node_while_estimates_arrive():
     deployment = Deployment()
-    deployment.on_estimate(estimate())
+    deployment.on_estimate(estimate(), time.monotonic_ns())
     deployment.on_status(status(verdict="lossy", why="3 packets are missing"))
     (stream,) = deployment.news()["streams"]
     assert (stream["level"], stream["verdict"], stream["why"]) == ("warn", "lossy", "3 packets are missing")
@@ -124,7 +125,7 @@ def test_a_node_that_leaves_is_gone_and_comes_back():
 def test_streams_nodes_and_texts_are_bounded():
     deployment = Deployment()
     for number in range(3 * MAX_STREAMS):
-        deployment.on_estimate(estimate(f"s{number}"))
+        deployment.on_estimate(estimate(f"s{number}"), time.monotonic_ns())
         deployment.on_token(f"n{number}", True)
     deployment.on_status(status("s0", "unstable", "x" * 100_000))
     state = deployment.everything()
@@ -134,7 +135,7 @@ def test_streams_nodes_and_texts_are_bounded():
 
 def test_no_text_from_the_network_begins_another_event():
     deployment = Deployment()
-    deployment.on_estimate(estimate(model=HOSTILE, flags=(HOSTILE,)))
+    deployment.on_estimate(estimate(model=HOSTILE, flags=(HOSTILE,)), time.monotonic_ns())
     deployment.on_status(status(verdict="lossy", why=HOSTILE))
     deployment.on_health([health(HOSTILE, change=HOSTILE)])
     sent = message("news", deployment.news()).decode()

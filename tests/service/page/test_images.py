@@ -2,6 +2,7 @@
 
 import asyncio
 import io
+import struct
 
 import numpy as np
 import pytest
@@ -39,14 +40,18 @@ def packet(x, y, p, seq=0, t_us=0):
     return encode_packet(EventPacket("cam0", seq, Sensor(31, 7), t_us, Events.from_columns([t_us], [x], [y], [p])))
 
 
-def parts(answer, number):
-    """Number and PNG of each image of an answer."""
-    found = []
-    for _ in range(number):
-        head, size = HEAD.unpack_from(answer)
-        found.append((head, answer[HEAD.size : HEAD.size + size]))
-        answer = answer[HEAD.size + size :]
-    assert answer == b""
+def outside(payload):
+    """A packet of one event whose x is 40, which is not on the sensor."""
+    return payload[:-4] + struct.pack("<H", 40) + payload[-2:]
+
+
+def parts(data):
+    """The images in what a browser receives: place of the stream -> PNG."""
+    found = {}
+    while data:
+        _, place, size = HEAD.unpack_from(data)
+        found[place] = data[HEAD.size : HEAD.size + size]
+        data = data[HEAD.size + size :]
     return found
 
 
@@ -57,31 +62,85 @@ def test_a_png_shows_every_pixel(shape):
 
 
 def test_an_image_has_the_newest_events_and_is_sent_once():
-    async def follow():
+    async def look():
         link, images = Link(), Images(str, Guard())
-        assert parts(await images.newer({"cam0": 0}, link), 1) == [(0, b"")]  # no packet yet
-        link.waiting["cam0"] += [packet(3, 2, 0), b"garbled", packet(30, 6, 1, 1, 10_000)]
-        ((number, png),) = parts(await images.newer({"cam0": 0}, link), 1)
+        follow = images.follow(["cam1", "cam0"], link)
+        coming = asyncio.create_task(anext(follow))
+        while "cam0" not in link.waiting:  # subscribed for the first round
+            await asyncio.sleep(0)
+        link.waiting["cam0"] += [
+            packet(3, 2, 0),
+            b"garbled",
+            packet(30, 6, 1, 1, 10_000),
+            outside(packet(9, 6, 1, 2, 10_000)),
+        ]
+        ((place, png),) = parts(await coming).items()
         both = pixels(png)
-        assert both.shape == (7, 31, 3)
+        assert (place, both.shape) == (1, (7, 31, 3))
         assert (tuple(both[2, 3]), tuple(both[6, 30])) == COLOURS[1:]
-        assert parts(await images.newer({"cam0": number, "cam1": 0}, link), 2) == [(number, b""), (0, b"")]
-        ((_, again),) = parts(await images.newer({"cam0": 0}, link), 1)
-        assert again == png  # for a browser that has none
-        link.waiting["cam0"].append(packet(1, 1, 1, 2, 30_000))
-        ((newer, png),) = parts(await images.newer({"cam0": number}, link), 1)
-        assert newer > number
-        assert tuple(pixels(png)[6, 30]) == COLOURS[2]  # 20 ms before the newest event
-        assert tuple(pixels(png)[2, 3]) == COLOURS[0]  # 30 ms before it
+        assert (both != COLOURS[0]).any(axis=2).sum() == 2  # the event outside the sensor is nowhere
+        late = images.follow(["cam0"], link)
+        assert parts(await anext(late)) == {0: png}  # a browser that has none gets the newest one
+        assert parts(await anext(follow)) == {0: b""}  # nothing new: a sign of life after some time
+        link.waiting["cam0"].append(packet(1, 1, 1, 3, 30_000))
+        first, second = await asyncio.gather(anext(follow), anext(late))
+        assert parts(first)[1] == parts(second)[0]
+        newer = pixels(parts(first)[1])
+        assert tuple(newer[6, 30]) == COLOURS[2]  # 20 ms before the newest event
+        assert tuple(newer[2, 3]) == COLOURS[0]  # 30 ms before it
 
-    asyncio.run(follow())
+    asyncio.run(look())
+
+
+class Camera(Link):
+    """A transport on which a packet of each stream with a subscriber has waited since it was subscribed, or never."""
+
+    def __init__(self, packets):
+        super().__init__()
+        self.packets, self.begun = packets, 0
+
+    def subscribe_newest(self, key, most):
+        self.begun += 1
+        subscription = super().subscribe_newest(key, most)
+        self.waiting[key] += [packet(self.begun % 31, 0, 1, seq, 10_000 * seq) for seq in range(self.packets)]
+        return subscription
+
+
+STREAMS = [f"cam{number}" for number in range(4)]
+
+
+async def _rounds(link, number):
+    """Look at four streams for some rounds; the streams that are received between two of them."""
+    images = Images(str, Guard())
+    follow = images.follow(STREAMS, link)
+    between = []
+    for _ in range(number):
+        assert set(parts(await anext(follow))) <= {0, 1, 2, 3}
+        between.append(set(link.waiting))
+        for packets in link.waiting.values():  # of the streams that are still received
+            packets.append(packet(5, 5, 0, 100, 10_000_000 * (1 + len(between))))
+    return between
+
+
+def test_between_two_rounds_nothing_is_received_of_a_stream_whose_packets_suffice():
+    link = Camera(packets=6)
+    between = asyncio.run(_rounds(link, 3))
+    assert between == [set()] * 3
+    assert link.begun == 3 * len(STREAMS)
+
+
+def test_a_stream_whose_packets_come_too_seldom_is_received_always():
+    link = Camera(packets=1)
+    between = asyncio.run(_rounds(link, 5))
+    assert between == [set(STREAMS)] * 5
+    assert link.begun == len(STREAMS)
 
 
 def test_streams_with_images_are_bounded():
-    async def ask():
+    async def look():
         link, images = Link(), Images(str, Guard())
-        names = {f"cam{number}": 0 for number in range(MAX_WATCHED + 5)}
-        await images.newer(names, link)
+        follow = images.follow([f"cam{number}" for number in range(MAX_WATCHED + 5)], link)
+        assert parts(await anext(follow)) == {0: b""}
         return len(images.watched), len(link.waiting)
 
-    assert asyncio.run(ask()) == (MAX_WATCHED, MAX_WATCHED)
+    assert asyncio.run(look()) == (MAX_WATCHED, MAX_WATCHED)

@@ -1,0 +1,84 @@
+"""A vehicle that stopped is answered as standing; few events alone, or a stop that no motion led to, change nothing."""
+
+import numpy as np
+import pytest
+
+from neurove_core.refine.standing import KEPT_US, Standing, answered, hold, outweighs
+
+WINDOW_US = 50_000
+NETWORK = np.tile([0.0, 0.1, 2.0, 0.02, 0.0, 0.01], (5, 1))  # it goes on with 2 m/s
+COVARIANCE = np.diag([0.3, 0.3, 1.5, 0.05, 0.05, 0.05]) ** 2
+
+
+def speed(share: float, before: Standing, end_us: int = WINDOW_US, height_m: float = 1.0) -> float:
+    return float(hold(NETWORK, COVARIANCE, end_us, share, height_m, before).twists[0, 2])
+
+
+def slow() -> Standing:
+    """After a slow motion over the ground in the window before."""
+    return answered(Standing(), 0, 0.1)
+
+
+def test_few_events_after_a_slow_motion_are_a_stop():
+    found = hold(NETWORK, COVARIANCE, WINDOW_US, 0.01, 1.0, slow())
+    assert np.linalg.norm(found.twists[:, :3], axis=1).max() < 0.01
+    assert np.abs(found.twists[:, 3:]).max() < 0.001
+    assert np.sqrt(found.covariance[2, 2]) < 0.05
+    assert np.array_equal(found.covariance, found.covariance.T)
+    assert np.linalg.eigvalsh(found.covariance)[0] > 0
+
+
+@pytest.mark.parametrize("before", [Standing(), answered(slow(), 0, 4.0)])
+def test_few_events_without_a_slow_motion_before_are_no_stop(before: Standing):
+    """Dark ground and lost data look alike."""
+    found = hold(NETWORK, COVARIANCE, WINDOW_US, 0.01, 1.0, before)
+    assert found.twists is NETWORK
+    assert found.covariance is COVARIANCE
+    assert not outweighs(found.standing, 10.0)
+
+
+def test_a_slow_motion_long_ago_tells_no_stop():
+    assert speed(0.01, slow(), KEPT_US + 1) == 2.0
+    assert speed(0.01, slow(), KEPT_US) < 0.01
+
+
+def test_a_stop_lasts_while_there_are_few_events():
+    standing = slow()
+    for end_us in range(WINDOW_US, 10 * KEPT_US, WINDOW_US):
+        found = hold(NETWORK, COVARIANCE, end_us, 0.01, 1.0, standing)
+        standing = found.standing
+    assert found.twists[0, 2] < 0.01
+
+
+def test_the_more_events_the_less_a_stop_counts():
+    speeds = [speed(share, slow()) for share in (0.02, 0.1, 0.24)]
+    assert speeds == sorted(speeds)
+    assert speeds[-1] > 5 * speeds[0]
+
+
+def test_a_slow_motion_with_its_events_is_no_stop():
+    assert speed(0.4, slow()) == 2.0
+
+
+def test_a_vehicle_that_starts_gains_speed_no_faster_than_vehicles_do():
+    standing = hold(NETWORK, COVARIANCE, WINDOW_US, 0.24, 1.0, slow()).standing
+    speeds = []
+    for count in range(1, 20):
+        found = hold(NETWORK, COVARIANCE, (1 + count) * WINDOW_US, 5.0, 1.0, standing)
+        standing = found.standing
+        speeds.append(found.twists[0, 2])
+    assert speeds[0] < 0.05
+    assert speeds[:10] == sorted(speeds[:10])
+    assert speeds[-1] == 2.0  # half a second after the stop it says nothing
+
+
+def test_a_motion_over_the_ground_counts_where_it_is_more_certain():
+    standing = hold(NETWORK, COVARIANCE, WINDOW_US, 0.24, 1.0, slow()).standing
+    assert outweighs(standing, 0.5)
+    assert not outweighs(standing, 0.2)
+
+
+def test_a_motion_that_is_found_ends_the_stop():
+    standing = hold(NETWORK, COVARIANCE, WINDOW_US, 0.24, 1.0, slow()).standing
+    moving = hold(NETWORK, COVARIANCE, 2 * WINDOW_US, 2.0, 1.0, standing).standing
+    assert speed(2.0, answered(moving, 2 * WINDOW_US, 0.2), 3 * WINDOW_US) == 2.0

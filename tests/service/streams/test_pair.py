@@ -1,0 +1,219 @@
+"""Two nodes of one stream in one process: who answers, and who is ready to answer, after pauses and lost packets."""
+
+import pytest
+
+from neurove_protocol import Trace, Twist, TwistEstimate
+from neurove_protocol.velocity import HostTime
+from neurove_service.streams.pair import Pair
+from neurove_service.streams.stream import Stream
+from neurove_service.streams.tenure import Tenure
+
+STREAM, WINDOW_US = "cam0", 20_000
+NOT_EQUAL = 9.0
+
+
+def estimate(node, number, value, flags, age_us):
+    """The window with this number; `value` stands for the state of the node."""
+    start_us = number * WINDOW_US
+    end_us = start_us + WINDOW_US
+    return TwistEstimate(
+        stream=STREAM,
+        seq=number,
+        start_us=start_us,
+        end_us=end_us,
+        bin_end_us=(end_us,),
+        twists=(Twist(value, 0.0, 0.0, 0.0, 0.0, 0.0),),
+        model="m",
+        digest="0" * 64,
+        epoch=0,
+        events=5,
+        flags=flags,
+        trace=Trace(received_ns=0, queued_ns=0, computed_ns=0, published_ns=0),
+        node=node,
+        host=HostTime(end_ns=0, uncertainty_ns=0, age_ns=1000 * age_us),
+    )
+
+
+class Other:
+    """The other node, as a node sees it."""
+
+    def __init__(self, nodes, name):
+        self._nodes, self._name = nodes, name
+
+    def names(self, _stream):
+        return (self._name,)
+
+    def roles(self, _stream, timeout_s):
+        nodes = self._nodes
+        nodes.asked += 1
+        if nodes.hangs != self._name:
+            return [nodes.pairs[self._name].reply()]
+        nodes.now_ns += int(1e9 * timeout_s)
+        return []
+
+    def state(self, _stream, _node, _digest):
+        return None
+
+    def take(self, _stream, node, term, last_us, _timeout_s):
+        self._nodes.pairs[node].take("another", term, last_us)
+        return True
+
+
+class Nodes:
+    """Two nodes on one clock that hear each other at once; a node that hangs says and hears nothing."""
+
+    def __init__(self, stream):
+        self.now_ns, self.hangs, self.asked = 0, "", 0
+        self.stream, self.published = stream, []
+        self.pairs = {}
+        for name, other in ("ab", "ba"):
+            peers = Other(self, other)
+            self.pairs[name] = Pair(Tenure(name, STREAM, peers), peers, lambda: None, lambda: self.now_ns)
+
+    @property
+    def leader(self):
+        (leader,) = [name for name in self.pairs if self.role(name) == "answers"]
+        return leader
+
+    @property
+    def follower(self):
+        return "ab".replace(self.leader, "")
+
+    def role(self, name):
+        return self.pairs[name].reply().role
+
+    def ready(self, name):
+        reply = self.pairs[name].reply()
+        return reply.role == "follows" and reply.equal
+
+    def wait(self, windows):
+        self.now_ns += int(windows * WINDOW_US * 1000)
+
+    def turn(self, name):
+        self._publish(name, self.pairs[name].turn(self.stream))
+
+    def compute(self, name, number, value=0.0, flags=(), age_us=0):
+        self.turn(name)
+        self._publish(name, self.pairs[name].answer(estimate(name, number, value, flags, age_us)))
+
+    def both(self, numbers):
+        """Both nodes compute these windows in real time."""
+        for number in numbers:
+            self.wait(1)
+            for name in self.pairs:
+                self.compute(name, number)
+            for name in self.pairs:
+                self.turn(name)
+
+    def _publish(self, name, estimates):
+        self.published += estimates
+        for one in estimates:
+            for other, pair in self.pairs.items():
+                if other not in {name, self.hangs}:
+                    pair.heard(one)
+
+
+@pytest.fixture
+def nodes(slot):
+    """One node has answered 60 windows, the other one follows."""
+    nodes = Nodes(Stream(STREAM, slot))
+    nodes.both(range(60))
+    assert nodes.ready(nodes.follower)
+    return nodes
+
+
+def test_a_follower_that_missed_packets_is_not_ready_until_its_estimates_are_equal_again(nodes):
+    leader, follower = nodes.leader, nodes.follower
+    nodes.wait(1)
+    nodes.compute(follower, 60, NOT_EQUAL, ("gap",))
+    assert not nodes.ready(follower)
+    for number in (60, 61):
+        nodes.compute(leader, number)
+    nodes.compute(follower, 61, NOT_EQUAL)
+    assert not nodes.ready(follower)
+    nodes.both([62])
+    assert nodes.ready(follower)
+
+
+def test_an_equal_window_from_before_the_loss_does_not_make_a_follower_ready(nodes):
+    leader, follower = nodes.leader, nodes.follower
+    nodes.wait(1)
+    nodes.compute(follower, 60)
+    nodes.compute(follower, 61, NOT_EQUAL, ("gap",))
+    nodes.compute(leader, 60)
+    nodes.turn(follower)
+    assert not nodes.ready(follower)
+
+
+def test_a_leader_that_missed_packets_lets_a_node_answer_that_has_them(nodes):
+    leader, follower = nodes.leader, nodes.follower
+    nodes.wait(1)
+    nodes.compute(follower, 60)
+    nodes.compute(leader, 60, NOT_EQUAL, ("gap",))
+    nodes.turn(follower)
+    nodes.compute(leader, 61, NOT_EQUAL)
+    nodes.compute(follower, 61)
+    assert (nodes.leader, nodes.role(leader)) == (follower, "follows")
+    assert [(one.start_us // WINDOW_US, one.twists[0].vx) for one in nodes.published[-2:]] == [(60, 0.0), (61, 0.0)]
+
+
+def test_a_leader_answers_if_the_other_node_missed_the_same_packets(nodes):
+    leader, follower = nodes.leader, nodes.follower
+    nodes.wait(1)
+    nodes.compute(follower, 60, NOT_EQUAL, ("gap",))
+    nodes.compute(leader, 60, NOT_EQUAL, ("gap",))
+    nodes.both([61])
+    assert nodes.leader == leader
+    assert nodes.ready(follower)
+
+
+def test_a_node_that_works_off_what_arrived_while_it_hung_is_not_ready(nodes):
+    leader, follower = nodes.leader, nodes.follower
+    for number in range(60, 110):
+        nodes.wait(1)
+        nodes.compute(leader, number)
+    for number in range(60, 100):
+        nodes.compute(follower, number, age_us=(110 - number) * WINDOW_US)
+    assert not nodes.ready(follower)
+    for number in range(100, 110):
+        nodes.compute(follower, number)
+    nodes.both(range(110, 120))
+    assert nodes.ready(follower)
+
+
+def test_a_follower_that_wakes_does_not_take_over_before_it_has_heard_the_leader(nodes):
+    leader, follower = nodes.leader, nodes.follower
+    nodes.compute(follower, 60)
+    nodes.wait(75)
+    nodes.turn(follower)
+    assert nodes.role(follower) == "follows"
+    nodes.wait(2)
+    nodes.turn(follower)
+    assert nodes.leader == leader
+
+
+def test_a_node_that_hangs_does_not_keep_the_leader_waiting_again_and_again(nodes):
+    leader = nodes.leader
+    nodes.hangs = nodes.follower
+    for number in range(60, 70):
+        nodes.wait(1.4)
+        nodes.compute(leader, number)
+    assert nodes.asked == 1
+    assert [one.start_us // WINDOW_US for one in nodes.published[-10:]] == list(range(60, 70))
+    assert len({one.term for one in nodes.published[-11:]}) == 1
+
+
+def test_after_a_long_pause_without_a_reply_the_leader_listens_first(nodes):
+    leader = nodes.leader
+    nodes.hangs = nodes.follower
+    before = len(nodes.published)
+    nodes.wait(75)
+    nodes.compute(leader, 60)
+    nodes.wait(20)
+    nodes.turn(leader)
+    assert (nodes.role(leader), len(nodes.published)) == ("listens", before)
+    for _ in range(60):
+        nodes.wait(1)
+        nodes.turn(leader)
+    assert nodes.role(leader) == "answers"
+    assert [one.start_us // WINDOW_US for one in nodes.published[before:]] == [60]
