@@ -223,16 +223,14 @@ class Estimator:
         if window.sample is None or state.view is None or estimate.covariance is None:
             return estimate, state
         known_m = state.camera.height_m if state.camera else None
-        height_m = known_m or 1.0
         about = window.start_us, self.config.window.duration_us, window.sample, state.view, estimate.twists.mean(axis=0)
-        given = Given(*about, estimate.covariance, estimate.low_activity, None, height_m, known_m is not None)
+        given = Given(*about, estimate.covariance, estimate.low_activity, None, known_m or 1.0, known_m is not None)
         found = refining.refine(given, state.stages)
         state = state._replace(stages=found.state, ground=state.ground if found.level else GroundState())
         estimate = _turned(estimate, found.turn, found.velocity)
-        about_turn = window, estimate, state, found.turn.sigma_rad_s
-        answer, state = _over_ground(*about_turn) if found.level else (estimate, state)
+        answer, state = _over_ground(window, estimate, state, found)
         if answer is estimate and found.velocity is None:
-            answer = _with_errors(estimate, found.turn, height_m)
+            answer = _with_errors(estimate, found.turn, given.height_m)
         return answer._replace(uncertain=self.is_uncertain(answer.twists, answer.covariance)), state
 
     def is_uncertain(self, twists: NDArray[np.float64], covariance: NDArray[np.float64] | None) -> bool:
@@ -388,7 +386,7 @@ def _over_ground(
     window: Window,
     estimate: WindowEstimate,
     state: StreamState,
-    sigma_rad_s: NDArray[np.float64] | None,
+    found: refining.Stages,
 ) -> Refined:
     """The estimate with the motion over level ground, where it is accepted; see `refine.ground`.
 
@@ -396,15 +394,18 @@ def _over_ground(
         window: with the sample of its events.
         estimate: so far; it stays the same object if the answer is not accepted.
         state: of the stream.
-        sigma_rad_s: (3,) of its angular part; None for that of its covariance.
+        found: the stages before; a camera that is on no vehicle has no ground.
     """
+    if not found.level:
+        return estimate, state
     if window.sample is None or state.view is None or state.camera is None or estimate.covariance is None:
         return estimate, state
     height_m = state.camera.height_m
     if height_m is None:
         return estimate, state  # nothing says that the camera looks at level ground
     events = ground.events_of(state.view, window.sample, window.start_us)
-    sigma = np.sqrt(np.diagonal(estimate.covariance)[3:]) if sigma_rad_s is None else sigma_rad_s
+    sigma = found.turn.sigma_rad_s
+    sigma = np.sqrt(np.diagonal(estimate.covariance)[3:]) if sigma is None else sigma
     known = estimate.twists.mean(axis=0), sigma, state.ground
     turned = estimate.source == "refined" and not estimate.low_activity
     measured = estimate.covariance[3:, 3:] if turned else None
