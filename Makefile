@@ -28,9 +28,10 @@ ros2: .venv-ros2/ready  # for the tests with real nodes of ROS 2; without it the
 .venv-ros2/ready: tests/ros2/install.sh tests/ros2/make_messages.py tests/ros2/requirements.txt
 	@sh tests/ros2/install.sh $(PYTHON) .venv-ros2
 
-picture: $(VENV)/installed  # the pictures in README, of a simulated street; the page needs Chromium
+picture: $(VENV)/installed  # the pictures in README and in the guides, of simulated streets; the page needs Chromium
 	@$(BIN)/neurove demo "sim://street?seed=7&seconds=8" --force --screenshot service/pictures/demo.svg
 	@$(BIN)/python -m tests.long.page_picture
+	@$(BIN)/python -m tests.long.docs_pictures
 
 docs: $(VENV)/installed  # the documentation site in build/docs/site; a broken link is an error
 	@$(BIN)/python deploy/docs/build.py build/docs

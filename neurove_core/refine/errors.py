@@ -56,6 +56,12 @@ UNKNOWN_PITCH: Final = math.radians(4)
 YAW: Final = np.array([0.0, 0.0, 0.0, 0.004, 0.0, 0.012])
 """Error of the rates of pitch and roll, as a share of the yaw rate."""
 
+ASIDE_SPEED: Final = 0.03
+"""Error of the sideways speed by the sideways acceleration [s]: it changes within the span."""
+
+ASIDE_YAW: Final = 0.01
+"""Error of the yaw rate by the sideways acceleration over the height of the camera [s]."""
+
 SLOW_SHARE: Final = 0.6
 """Share of sigma of a camera that hardly moves: the search sees it well, and its prior hides that."""
 
@@ -112,5 +118,7 @@ def of_ground(twist: Array, covariance: Array, tilt: float, pitch_sigma: float, 
     shares = np.array([share, 1.0, share, share, share, share])
     tilting = math.sqrt(max(0.0, tilt - TILT_FLOOR_RAD_S**2)) * min(1.0, pitch_sigma / UNKNOWN_PITCH)
     metres = np.array([height_m] * 3 + [1.0] * 3)
-    terms = [TILT * metres * tilting, YAW * abs(float(twist[4]))]
+    aside_m_s2 = float(np.linalg.norm(twist[:3])) * abs(float(twist[4]))
+    aside = np.array([ASIDE_SPEED * aside_m_s2, 0.0, 0.0, 0.0, ASIDE_YAW * aside_m_s2 / height_m, 0.0])
+    terms = [TILT * metres * tilting, YAW * abs(float(twist[4])), aside]
     return covariance * np.outer(shares, shares) + np.diag(np.square(terms).sum(axis=0))

@@ -27,6 +27,7 @@ from neurove_core.refine import ground_kernels as kernels
 from neurove_core.refine.ground_kernels import Image, Rays
 from neurove_core.refine.ground_search import UNKNOWNS, Prior, climb, motion_of, objective
 from neurove_core.refine.ground_sway import Sway, swayed
+from neurove_core.refine.late import ANSWERS, Answers, change
 from neurove_core.refine.standing import Standing, answered, outweighs
 from neurove_core.refine.view import View
 from neurove_protocol import CameraInfo
@@ -131,6 +132,7 @@ class GroundState(NamedTuple):
     sway: Sway = Sway()
     tilt: float = 0.0  # mean square rate of pitch and roll before the search [rad^2/s^2]
     standing: Standing = Standing()
+    answers: Answers = ()  # accepted in a row, see `late`
 
 
 class GroundMotion(NamedTuple):
@@ -236,6 +238,7 @@ def refine(
         return Answer("turning", found._replace(twist=twist), state._replace(last=None, sway=sway))
     pitch, pitch_sigma = _learned(state, found.pitch, pitch_sigma, 1 / len(used))
     twist, sway = swayed(found.twist, found.pitch, state.sway)
+    found, answers = _on_time(found._replace(twist=twist), state.answers, begin_us, end_us, window_us)
     standing = answered(state.standing, end_us, float(np.linalg.norm(unknowns[:3])))
     walls = np.clip(np.array(state.walls) + unknowns[7:] / height_m, *_WALL_SPAN)
     state = state._replace(
@@ -245,8 +248,25 @@ def refine(
         walls=(float(walls[0]), float(walls[1])),
         sway=sway,
         standing=standing,
+        answers=answers,
     )
-    return Answer("accepted", found._replace(twist=twist), state)
+    return Answer("accepted", found, state)
+
+
+def _on_time(
+    found: GroundMotion, answers: Answers, begin_us: int, end_us: int, window_us: int
+) -> tuple[GroundMotion, Answers]:
+    """The motion in the middle of the newest window, not that of the span, and the answers after it; see `late`."""
+    middle_s, newest_s = (begin_us + end_us) / 2e6, (2 * end_us - window_us) / 2e6
+    if answers and middle_s - answers[-1][0] > 4 * window_us / 1e6:  # spans differ in length
+        answers = ()
+    ahead = np.array([0.0, -math.sin(found.pitch), math.cos(found.pitch)])
+    answers = (*answers, (middle_s, float(ahead @ found.twist[:3])))[-ANSWERS:]
+    more = change(answers, newest_s - middle_s)
+    twist, covariance = found.twist.copy(), found.covariance.copy()
+    twist[:3] += more.speed_m_s * ahead
+    covariance[:3, :3] += more.sigma_m_s**2 * np.outer(ahead, ahead)
+    return found._replace(twist=twist, covariance=covariance), answers
 
 
 def _distance(found: GroundMotion, twist: Array, measured: Array | None) -> float:

@@ -211,7 +211,7 @@ def age_text(age_s: float) -> str:
     ('8.3 s ago', '75 s ago', '99+ h ago')
     """
     if age_s < 9.95:
-        return f"{age_s:.1f} s ago"
+        return f"{max(age_s, 0.0):.1f} s ago"
     if age_s < 99.5:
         return f"{age_s:.0f} s ago"
     minutes = age_s / 60
@@ -386,7 +386,8 @@ def _footer(received: Received, status: StreamStatus | None, now: float) -> Text
     if received.silent_s(now) is not None:
         text.append(f"{received.count:,} estimates before")
     elif numbers is not None:
-        text.append(f"{received.rate_hz:.1f} estimates/s, latency p50 {numbers.p50:.1f} ms p99 {numbers.p99:.1f} ms")
+        rate = f"{received.rate_hz:.1f} estimates/s, " if len(received.arrivals) > 1 else ""  # one has no rate
+        text.append(f"{rate}latency p50 {numbers.p50:.1f} ms p99 {numbers.p99:.1f} ms")
     if received.late_s is not None:
         text.append(f", {received.late_s:.1f} s old on arrival", style="yellow")
     if status is not None:

@@ -6,6 +6,7 @@ tests/test_readme.py checks commands, links and language of its pages, as of eve
 import contextlib
 import functools
 import http.server
+import io
 import re
 import shutil
 import subprocess
@@ -15,6 +16,9 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+from PIL import Image
+
+from tests.long.docs_pictures import FOLDER, PICTURES
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "deploy" / "docs"
@@ -93,6 +97,29 @@ def test_the_page_of_symptoms_has_a_section_for(symptom):
     assert any(symptom.lower() in heading.lower() for heading in headings)
 
 
+def test_every_picture_of_the_guides_is_made_by_the_script_and_shown_with_a_description():
+    shown = {}
+    for page in DOCS.glob("*.md"):
+        shown |= {name: about for about, name in re.findall(r"!\[([^\]]*)\]\(pictures/([\w.-]+)\)", page.read_text())}
+    assert set(shown) == set(PICTURES) == {path.name for path in (DOCS / "pictures").iterdir()}
+    assert min(map(len, shown.values())) > 30
+    assert (ROOT / FOLDER).resolve() == DOCS / "pictures"
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_a_picture_is_small_and_loads_nothing(name):
+    data = (DOCS / "pictures" / name).read_bytes()
+    assert len(data) < 120_000
+    if name.endswith(".svg"):
+        addresses = set(re.findall(r"https?://[\w.-]+", data.decode()))
+        assert addresses <= {"http://www.w3.org", "https://www.textualize.io"}  # a namespace and a comment
+        assert len(re.sub(r"<[^>]*>", "", data.decode().rpartition("</style>")[2]).strip()) > 200  # text is in it
+    else:
+        with Image.open(io.BytesIO(data)) as picture:
+            assert picture.width in (390, 968, 1000, 1280)
+            assert len(picture.getcolors(1 << 20)) > 20  # not an empty page
+
+
 def test_no_page_loads_anything_from_another_host(site):
     chromium = shutil.which("chromium")
     if chromium is None:
@@ -106,7 +133,13 @@ def test_no_page_loads_anything_from_another_host(site):
         page = browser.new_page()
         page.set_default_timeout(120_000)
         page.on("request", lambda request: asked.append(request.url))
-        for name in ("protocol/index.html", "index.html", "deploy/SCALE.html", "reference/spiking.html"):
+        for name in (
+            "protocol/index.html",
+            "index.html",
+            "deploy/docs/start.html",
+            "deploy/docs/troubleshooting.html",
+            "reference/spiking.html",
+        ):
             page.goto(f"{address}/{name}", wait_until="networkidle")
             assert page.evaluate("[...document.images].every(one => one.complete && one.naturalWidth > 0)"), name
         browser.close()

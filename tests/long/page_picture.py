@@ -51,9 +51,9 @@ def main() -> int:
                 context = browser.new_context(viewport={"width": width, "height": height}, color_scheme=scheme)
                 page = context.new_page()
                 page.goto(found[0])
-                _settled(page)
+                settled(page)
                 target = args.all / f"page-{width}-{scheme}.png" if args.all else FILE
-                _write(page.screenshot(full_page=True), target)
+                write_png(page.screenshot(full_page=True), target)
                 context.close()
             browser.close()
     finally:
@@ -62,7 +62,7 @@ def main() -> int:
     return 0
 
 
-def _settled(page: Page) -> None:
+def settled(page: Page) -> None:
     """Wait until the plots are full and an image is there."""
     deadline = time.monotonic() + LONGEST_S
     since = None
@@ -76,7 +76,7 @@ def _settled(page: Page) -> None:
     raise TimeoutError(f"no full plots within {LONGEST_S:.0f} s")
 
 
-def _write(png: bytes, file: Path) -> None:
+def write_png(png: bytes, file: Path) -> None:
     """Write a picture with a palette."""
     picture = Image.open(io.BytesIO(png)).convert("RGB")
     for colours in (256, 128, 64, 32):

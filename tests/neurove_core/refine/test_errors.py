@@ -74,3 +74,15 @@ def test_a_slow_camera_is_more_certain_and_a_turning_one_less_of_pitch_and_roll(
     assert (of_ground(0.0, 0.01, slow) <= of_ground(0.0, 0.01)).all()
     turning = slow + np.eye(6)[4]
     assert (of_ground(0.0, 0.01, turning)[[3, 5]] > of_ground(0.0, 0.01, slow)[[3, 5]]).all()
+
+
+def test_a_bend_makes_yaw_and_sideways_speed_less_certain_most_of_all_near_the_ground():
+    bend = VEHICLE + np.array([0.0, 0.0, 0.0, 0.0, 0.3, 0.0])
+    straight, high, low = (
+        sigma(errors.of_ground(twist, GROUND, 0.0, 0.01, height))
+        for twist, height in ((VEHICLE, 2.0), (bend, 2.0), (bend, 0.3))
+    )
+    assert (high >= straight).all()
+    assert high[0] > straight[0]
+    assert low[4] > high[4] > straight[4]
+    assert low[3] == high[3]
