@@ -13,8 +13,10 @@ MAX_STATE_BYTES = 33 << 20
 QUIET_NS = 10_000_000_000
 """After this time without an estimate a consumer accepts any term: the nodes may have restarted with another clock."""
 
-AGAIN_US = 5_000_000
-"""At the begin of a term, windows up to this much before the newest one are not taken again."""
+AGAIN_US = 20_000_000
+"""At the begin of a term, windows up to this much before the newest one are not taken again.
+
+After an interruption of a link, an estimate that arrives can be as old as the lease of the link (10 s)."""
 
 Role = Literal["answers", "follows", "listens", "absent"]
 """A node publishes the estimates of a stream; it keeps its own and hears those of another node; it knows no node that

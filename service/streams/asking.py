@@ -47,7 +47,7 @@ class Asking:
         """This node has paused: another node may have taken over.
 
         After a short pause a node that does not reply costs nothing more: if it had taken over, it would be heard by
-        now. After a long pause this node listens before it goes on.
+        now. After a long pause this node follows any node that answers, or else listens before it goes on.
         """
         tenure, long = self._tenure, is_long(pause_ns, window_ns)
         names = set(self._peers.names(tenure.stream))
@@ -56,7 +56,7 @@ class Asking:
             if not names:
                 return
         replies = self._ask(names, (_LONG_REPLY_WINDOWS if long else _REPLY_WINDOWS) * window_ns)
-        if self._is_superseded(replies):
+        if self._is_superseded(replies, by_any=long):
             log.warning("superseded in a pause", stream=tenure.stream, pause_ms=pause_ns // 1_000_000)
         elif long and not (replies and names <= {one.node for one in replies}):
             tenure.listen("no reply from another node after a pause", wary=True)
@@ -101,11 +101,11 @@ class Asking:
         now_ns = self._now_ns()
         return {name for name, until_ns in self._silent.items() if now_ns < until_ns}
 
-    def _is_superseded(self, replies: list[DutyReply]) -> bool:
-        """Whether another node answers in a later term; then this node follows it."""
+    def _is_superseded(self, replies: list[DutyReply], *, by_any: bool = False) -> bool:
+        """Whether another node answers in a later term, or `by_any` in any term; then this node follows it."""
         tenure = self._tenure
         term, leader = max(((one.term, one.node) for one in replies if one.role == "answers"), default=(-1, ""))
-        if (term, leader) <= (tenure.term, tenure.node):
+        if not leader or (not by_any and (term, leader) <= (tenure.term, tenure.node)):
             return False
         tenure.follow(leader, term)
         return True

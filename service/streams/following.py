@@ -21,7 +21,7 @@ BEHIND: Final = 8
 """A node that is so many windows behind the other one, or that catches up so many, is not ready to answer."""
 
 _INCOMPLETE: Final = frozenset({Flag.GAP.value, Flag.OVERLOAD.value})
-_PASSED_US: Final = 5_000_000  # a clock that goes back further has begun anew
+_ANEW_US: Final = 5_000_000  # a clock that goes back further has begun anew
 _RETRY_NS, _MAX_RETRY_NS = 200_000_000, 60_000_000_000  # between requests for the state
 
 
@@ -66,6 +66,8 @@ class Following:
             self._own.clear()
             self._heard.clear()
             self.missed_us = self._taken_us = None
+            if self._newest is not None and self._newest.start_us - own.start_us > _ANEW_US:
+                self._newest = None
         self._own_us = own.start_us
         self._own[own.start_us] = own
         while len(self._own) > KEPT:
@@ -95,6 +97,8 @@ class Following:
 
     def hear(self, heard: TwistEstimate) -> None:
         """The other node has published an estimate: what this node has kept up to it is answered."""
+        if self._newest is not None and self._newest.start_us - heard.start_us > _ANEW_US:
+            self._kept = deque((one for one in self._kept if one[0].start_us <= heard.start_us), maxlen=KEPT)
         self._newest, self._left_out_us = heard, None
         own = self._own.get(heard.start_us)
         if own is not None:
@@ -159,7 +163,7 @@ class Following:
 
     def _is_passed(self, own: TwistEstimate) -> bool:
         """Whether the other node has answered this window, or left it out."""
-        return self._newest is not None and 0 <= self._newest.start_us - own.start_us < _PASSED_US
+        return self._newest is not None and own.start_us <= self._newest.start_us
 
     def _compare(self, own: TwistEstimate, heard: TwistEstimate) -> None:
         self._seq_offset = heard.seq - own.seq

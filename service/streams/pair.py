@@ -206,7 +206,7 @@ class Pair:
             self._renewed = True
             self._following.renew(self._now_ns(), doubt=is_long(late_ns, self._window_ns))
             return []
-        tenure.take_over(f"{tenure.leader} is late" if tenure.leader else "no other node answers")
+        tenure.take_over(f"{tenure.leader} is late" if tenure.leader else "no other node answers", self._now_ns())
         if self._following.other_model:
             log.warning("another model than before answers", stream=self._stream, before=self._following.other_model)
         return [self._stamped(estimate) for estimate in self._following.release()]

@@ -17,6 +17,10 @@ LATE_WINDOWS: Final = 1.5
 DRAINING: Final = 4.0
 """A node that is drained waits so many times longer before it takes over again."""
 
+HASTY_WINDOWS: Final = 10
+"""If the node before is heard again within so many windows, this node took over in haste: it waits longer then."""
+
+_MAX_SLACK, _SLACK_NS = 8, 60_000_000_000  # times the patience at most; until half of it is taken back
 _COLD: Final = 20  # times the patience of a node whose state is not that of the others
 _RELUCTANT: Final = 2  # ranks behind the other nodes
 
@@ -59,6 +63,8 @@ class Tenure:
         self._heard_ns = 0
         self._wary = False  # another node may answer, though it is not known now
         self._patience = 1.0
+        self._slack, self._slack_ns = 1, 0  # times the patience, because of slow links, and since when
+        self._window_ns, self._took_ns = 50_000_000, 0
         self.set_patience()
 
     @property
@@ -69,13 +75,19 @@ class Tenure:
     def patience_ns(self, window_ns: int, *, equal: bool) -> float:
         """How long the estimates of another node may be missing [ns]; longer unless the state is that of the others."""
         cold = self._wary or (not equal and bool(self._peers.names(self.stream)))
-        return self._patience * LATE_WINDOWS * window_ns * (_COLD if cold else 1)
+        self._window_ns = window_ns
+        return self._patience * LATE_WINDOWS * window_ns * (_COLD if cold else self._slack)
 
     def hear(self, sender: str, term: int, now_ns: int) -> bool:
         """Another node has published; False if it does not know yet that it was superseded."""
         known, quiet = (self.term, self.leader), now_ns - self._heard_ns > QUIET_NS
         if (term, sender) < known and (self.answers or (self.leader and not quiet)):
+            if self.answers and 0 <= now_ns - self._took_ns < HASTY_WINDOWS * self._window_ns:
+                self._took_ns -= HASTY_WINDOWS * self._window_ns  # once
+                self._slack, self._slack_ns = min(_MAX_SLACK, 2 * self._slack), now_ns
             return False
+        if self._slack > 1 and now_ns - self._slack_ns > _SLACK_NS:
+            self._slack, self._slack_ns = self._slack // 2, now_ns
         if (term, sender) != known or self.role != "follows":
             self.follow(sender, term)
         self._heard_ns = now_ns
@@ -101,8 +113,11 @@ class Tenure:
         if at_once:
             self._patience = 0.0
 
-    def take_over(self, why: str, *, unix_ms: Callable[[], int] = lambda: time.time_ns() // 1_000_000) -> None:
+    def take_over(
+        self, why: str, now_ns: int = 0, *, unix_ms: Callable[[], int] = lambda: time.time_ns() // 1_000_000
+    ) -> None:
         """This node answers from now on, in a new term."""
+        self._took_ns = now_ns
         self.term = max(self.term + 1, 1000 * unix_ms() + zlib.crc32(self.node.encode()) % 1000)
         self.role, self.leader, self._wary = "answers", self.node, False
         log.warning("answers the stream", stream=self.stream, term=self.term, why=why)

@@ -138,6 +138,12 @@ class Consumer:
         taken = rule.takes(estimate.term, estimate.start_us, received_ns)
         (self.taken if taken else self.dropped).setdefault(name, []).append(Got(received_ns, estimate))
 
+    def forget(self):
+        """Keep only what arrives from now on."""
+        for name in list(self.taken):
+            del self.taken[name][:-1]  # in place: the session's thread appends meanwhile
+        self.dropped.clear()
+
     def newest(self, stream):
         return self.taken[stream][-1].estimate
 
@@ -200,9 +206,10 @@ def drain(transport, node, *, resume=False):
 
 
 @contextlib.contextmanager
-def fellows(names, endpoint, model, *more, logs=None):
-    """Nodes that are alive, by name; all are ended."""
-    nodes = {name: Fellow(name, endpoint, model, *more, logs=logs).start() for name in names}
+def fellows(names, endpoint, model, *more, logs=None, links=None):
+    """Nodes that are alive, by name; all are ended. With `links` each node has a link of its own to the router."""
+    ends = {name: links[name].endpoint if links else endpoint for name in names}
+    nodes = {name: Fellow(name, end, model, *more, logs=logs).start() for name, end in ends.items()}
     try:
         with client(endpoint) as transport:
             wait_until(lambda: len(transport.tokens(KEYS.alive(), 1.0)) == len(names), START_S)

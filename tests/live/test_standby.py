@@ -7,6 +7,7 @@ from neurove_service.clients import ask
 from neurove_service.config import ClientConfig
 from tests.live.conftest import client, neurove, wait_until
 from tests.live.fellows import Consumer, Driver, check, drain, duty, fellows, follows, small_model
+from tests.live.relay import Link
 
 STREAM = "cam0"
 
@@ -85,3 +86,27 @@ def test_kills_drains_and_a_hanging_node_leave_no_trace_in_the_estimates(router,
         some_windows_later()
         driver.stop()
         assert duty(transport, last, STREAM).role == "answers"
+
+
+def test_after_a_partition_no_window_is_answered_twice_and_the_node_follows_again(router, models):
+    model, _ = models
+    links = {name: Link(int(router.rpartition(":")[2])) for name in ("a", "b")}
+    try:
+        with client(router) as transport, fellows(links, router, model, links=links):
+            consumer, driver = Consumer(transport), Driver(transport, [STREAM]).start()
+            wait_until(lambda: any(follows(transport, name, STREAM) for name in links))
+            wait_until(lambda: consumer.taken.get(STREAM))
+            first = consumer.leader(STREAM)
+            links[first].part()
+            wait_until(lambda: consumer.leader(STREAM) != first)
+            newest = len(consumer.taken[STREAM])
+            wait_until(lambda: len(consumer.taken[STREAM]) > newest + 100)
+            links[first].heal()
+            wait_until(lambda: follows(transport, first, STREAM))
+            driver.pause()
+            wait_until(lambda: driver.is_answered(consumer.newest(STREAM)))
+            check(consumer, driver, STREAM, model)
+            driver.stop()
+    finally:
+        for link in links.values():
+            link.close()

@@ -33,3 +33,24 @@ def test_a_term_rises_though_the_clock_goes_back():
     before = node.term
     node.take_over("a test", unix_ms=lambda: 1_763_000_000_000)
     assert node.term == before + 1
+
+
+def test_a_node_that_took_over_in_haste_waits_longer_from_then_on_and_not_for_ever():
+    node, window_ns = Tenure("a", "cam0", NoPeers()), 20_000_000
+    usual_ns = node.patience_ns(window_ns, equal=True)
+    node.hear("b", 7, 0)
+    node.take_over("b is late", 10 * window_ns)
+    for late in (1, 2):
+        assert not node.hear("b", 7, (10 + late) * window_ns)
+    assert node.patience_ns(window_ns, equal=True) == 2 * usual_ns
+    node.hear("b", node.term + 1, 61_000_000_000)
+    assert node.patience_ns(window_ns, equal=True) == usual_ns
+
+
+def test_a_node_that_is_heard_long_after_it_was_replaced_does_not_make_the_other_one_slow():
+    node, window_ns = Tenure("a", "cam0", NoPeers()), 20_000_000
+    usual_ns = node.patience_ns(window_ns, equal=True)
+    node.hear("b", 7, 0)
+    node.take_over("b is late", 10 * window_ns)
+    assert not node.hear("b", 7, 80 * window_ns)
+    assert node.patience_ns(window_ns, equal=True) == usual_ns

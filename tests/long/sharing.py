@@ -1,0 +1,170 @@
+"""Many cameras on three nodes: `python -m tests.long.sharing [--streams 32] [--copies 2]`; a minute or two.
+
+The streams have 20 windows a second each. A node joins, one is killed (-9), and it comes back. For each change the
+command reports, in windows: how late the latest window of any stream was (a stream that nobody answers), and for how
+long two nodes answered one stream. At the end it compares all estimates that a consumer took with a run without
+changes. With `--copies 1` the streams of the killed node begin anew, so these are reported and not counted.
+"""
+
+import argparse
+import itertools
+import os
+import statistics
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from neurove_service.node.sharing import drawn
+from tests.live.conftest import client, free_endpoint, start_router, wait_until
+from tests.live.fellows import KEYS, Consumer, Driver, Fellow, duty, gaps, small_model
+from tests.long.standby import twists_of
+
+WINDOW_US = 50_000
+START_S = 300
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--streams", type=int, default=32)
+    parser.add_argument("--copies", type=int, default=2)
+    parser.add_argument("--events", type=int, default=50, help="in each packet; a window has two packets")
+    parser.add_argument("--logs", help="folder for the logs of the nodes")
+    args = parser.parse_args()
+    streams = [f"cam{number}" for number in range(args.streams)]
+    endpoint = free_endpoint()
+    router = start_router(endpoint)
+    try:
+        with tempfile.TemporaryDirectory() as folder, client(endpoint) as transport:
+            model = small_model(Path(folder), WINDOW_US)
+            share = ("--copies", str(args.copies), "--max-streams", str(args.streams))
+            nodes = {name: Fellow(name, endpoint, model, *share, logs=args.logs) for name in ("n1", "n2", "n3")}
+            consumer, driver = Consumer(transport), Driver(transport, streams, args.events, 100, WINDOW_US // 2)
+            try:
+                changes = run(transport, nodes, consumer, driver, streams, args.copies)
+            finally:
+                for node in nodes.values():
+                    if node.process is not None and node.process.child.poll() is None:
+                        node.end()
+            return report(consumer, driver, streams, model, changes, args.copies)
+    finally:
+        router.kill()
+        router.wait()
+
+
+def run(transport, nodes, consumer, driver, streams, copies):
+    """Let nodes join, die and come back; the time, the kind and the streams of each change."""
+    changes = []
+
+    def join(*names):
+        for name in names:
+            nodes[name].start()
+        wait_until(lambda: all(transport.tokens(KEYS.alive(name), 1.0) for name in names), START_S)
+
+    def settle(*alive):
+        """Wait until the streams are where they belong, and each of their other nodes follows with equal state."""
+        owners = {one: drawn(one, dict.fromkeys(alive, 1))[:copies] for one in streams}
+        began = time.monotonic()
+        wait_until(lambda: all(consumer.taken.get(one) for one in streams), START_S)
+        wait_until(lambda: all(consumer.leader(one) in owners[one] for one in streams), START_S)
+        waiting = [(one, node) for one in streams for node in owners[one]]
+
+        def is_there(one, node):
+            reply = duty(transport, node, one)
+            return reply is not None and reply.equal
+
+        def all_there():
+            waiting[:] = [(one, node) for one, node in waiting if not is_there(one, node)]
+            return not waiting
+
+        wait_until(all_there, START_S)
+        counts = {node: sum(consumer.leader(one) == node for one in streams) for node in alive}
+        load = os.getloadavg()[0]
+        print(f"settled after {time.monotonic() - began:.1f} s; answers: {counts}; load {load:.1f}", flush=True)
+
+    def change(kind, of, act, *alive):
+        changes.append(
+            (time.monotonic_ns(), kind, {one for one in streams if of is None or consumer.leader(one) == of})
+        )
+        print(kind, flush=True)
+        act()
+        settle(*alive)
+
+    join("n1", "n2")
+    driver.start()
+    settle("n1", "n2")
+    time.sleep(2)
+    consumer.forget()
+    change("n3 joins", None, lambda: join("n3"), "n1", "n2", "n3")
+    change("n2 is killed", "n2", nodes["n2"].kill, "n1", "n3")
+    change("n2 joins again", None, lambda: join("n2"), "n1", "n2", "n3")
+    time.sleep(1)
+    driver.stop()
+    return changes
+
+
+def overlaps(got):
+    """How long two nodes answered a stream at each change of the term [windows]."""
+    by_term = {}
+    for one in got:
+        by_term.setdefault(one.estimate.term, []).append(one.at_ns)
+    terms = sorted(by_term)
+    return [
+        (by_term[after][0], max(0.0, (by_term[before][-1] - by_term[after][0]) / 1e3 / WINDOW_US))
+        for before, after in itertools.pairwise(terms)
+    ]
+
+
+def report(consumer, driver, streams, model, changes, copies):
+    """Print the figures; return 0 if no window is doubled, missing, out of order or wrong."""
+    bad, anew = 0, 0
+    late, twice, usual = {}, {}, []
+    killed = next(of for _, kind, of in changes if kind.endswith("killed")) if copies == 1 else set()
+
+    def kind_at(at_ns):
+        return next((kind for began_ns, kind, _ in reversed(changes) if at_ns >= began_ns), "before")
+
+    for stream in streams:
+        got = consumer.taken[stream]
+        starts = [one.estimate.start_us for one in got]
+        wanted = driver.reference(stream, model)
+        doubled, broken = len(starts) - len(set(starts)), gaps(starts, WINDOW_US)
+        wrong = sum(one.estimate.twists != twists_of(wanted[one.estimate.start_us]) for one in got)
+        if stream in killed:
+            anew += len(broken) + wrong
+            bad += doubled
+        else:
+            bad += doubled + len(broken) + wrong
+            if doubled or broken or wrong:
+                print(f"{stream}: {doubled} doubled, {len(broken)} gaps, {wrong} not equal")
+        for one in got:
+            delay = (one.at_ns - driver.sent_ns[one.estimate.end_us // driver.step_us]) / 1e3 / WINDOW_US
+            usual.append(delay)
+            if stream not in killed:
+                late.setdefault(kind_at(one.at_ns), []).append(delay)
+        everything = sorted(got + consumer.dropped.get(stream, []), key=lambda one: one.at_ns)
+        for at_ns, length in overlaps(everything):
+            twice.setdefault(kind_at(at_ns), []).append(length)
+    total = sum(len(consumer.taken[one]) for one in streams)
+    dropped = sum(len(one) for one in consumer.dropped.values())
+    print(
+        f"{total} windows of {len(streams)} streams, {dropped} dropped by the rule of terms; "
+        f"{bad} doubled, missing or wrong"
+    )
+    if copies == 1:
+        print(f"{len(killed)} streams of the killed node began anew: {anew} gaps and windows of another state")
+    usual.sort()
+    high = usual[int(0.99 * len(usual))]
+    print(f"all windows: median {statistics.median(usual):.2f} windows late, 99 %: {high:.2f}, worst {usual[-1]:.2f}")
+    for kind, values in late.items():
+        over = sum(value > 2 for value in values)
+        lengths = twice.get(kind, [0.0])
+        print(
+            f"{kind}: latest window {max(values):.2f}, {over} of {len(values)} above 2 windows; "
+            f"{len(twice.get(kind, []))} changes, two nodes answered for at most {max(lengths):.2f} windows"
+        )
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
