@@ -16,6 +16,8 @@ from neurove_core.networks.arrays import ArrayState
 from neurove_core.refine.ground import GroundEvents, GroundState
 from neurove_core.refine.ground_sway import Sway
 from neurove_core.refine.rotation import Filter
+from neurove_core.refine.scene import Scene
+from neurove_core.refine.stages import State as Stages
 from neurove_core.refine.standing import Standing
 from neurove_core.timescales import Longer
 from neurove_protocol.errors import InvalidField, NeuroVEError
@@ -24,10 +26,11 @@ MAX_BYTES: Final = 32 << 20
 """Cap of the bytes of one stream's state."""
 
 _KINDS: Final[dict[str, Any]] = {
-    kind.__name__: kind for kind in (ArrayState, Filter, GroundEvents, GroundState, Longer, Standing, Sway)
+    kind.__name__: kind
+    for kind in (ArrayState, Filter, GroundEvents, GroundState, Longer, Scene, Stages, Standing, Sway)
 }
 _DTYPES: Final = ("|u1", "|i1", "|b1", "<u2", "<i2", "<u4", "<i4", "<i8", "<u8", "<f4", "<f8")
-_PARTS: Final = ("network", "age", "end_us", "filter", "ground", "recent", "longer")
+_PARTS: Final = ("network", "age", "end_us", "stages", "ground", "recent", "longer")
 _WHAT: Final = "stream state"
 
 
@@ -37,7 +40,7 @@ class Carried(NamedTuple):
     network: Any
     age: int
     end_us: int
-    filter: Filter | None
+    stages: Stages
     ground: GroundState
     recent: tuple[NDArray[np.uint8], ...]
     longer: Longer
@@ -76,7 +79,7 @@ def decode(data: bytes, own: StreamState) -> Carried:
         raise InvalidField(_WHAT, "network", type(carried.network).__name__, "the shapes of this node's model")
     if not (_is_count(carried.age) and isinstance(carried.end_us, int) and carried.network.finite()):
         raise InvalidField(_WHAT, "network", carried.age, "finite numbers, an age and the end of a window")
-    kinds = (Filter | None, GroundState, tuple, Longer)
+    kinds = (Stages, GroundState, tuple, Longer)
     for name, value, kind in zip(_PARTS[3:], carried[3:], kinds, strict=True):
         if not isinstance(value, kind):
             raise InvalidField(_WHAT, name, type(value).__name__, str(kind))

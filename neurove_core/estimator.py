@@ -21,8 +21,9 @@ from neurove_core.models.bounds import UNSET, Bounds
 from neurove_core.models.bundle import PER_HEIGHT, Bundle, LinearUnit
 from neurove_core.networks.arrays import Runner, State
 from neurove_core.refine import errors, ground, standing
+from neurove_core.refine import stages as refining
 from neurove_core.refine.ground import GroundState
-from neurove_core.refine.rotation import Filter, Given, Rate, refine
+from neurove_core.refine.rotation import Given, Rate
 from neurove_core.refine.rotation import Refined as RotationFound
 from neurove_core.refine.view import View
 from neurove_core.running import form_of, runner_of
@@ -48,14 +49,14 @@ class StreamState(NamedTuple):
     end_us: int | None = None  # end of the newest window that the network has processed
     low_activity_below: float = 0.0  # a window with fewer visible events is flagged low_activity
     view: View | None = None  # for the refinement; None where estimates are not refined
-    filter: Filter | None = None  # of the refinement
+    stages: refining.State = refining.State()  # of the refinement
     ground: GroundState = GroundState()  # of the refinement of the linear part
     recent: Recent = ()  # counts of earlier windows, for models with a history
     longer: Longer = Longer()  # for models with longer windows
 
     def without_refinement(self) -> "StreamState":
         """The state in which the refinement begins again."""
-        return self._replace(filter=None, ground=GroundState())
+        return self._replace(stages=refining.State(), ground=GroundState())
 
 
 class WindowEstimate(NamedTuple):
@@ -221,14 +222,15 @@ class Estimator:
         estimate, state = _held(window, estimate, state)
         if window.sample is None or state.view is None or estimate.covariance is None:
             return estimate, state
-        height_m = (state.camera.height_m if state.camera else None) or 1.0
+        known_m = state.camera.height_m if state.camera else None
         about = window.start_us, self.config.window.duration_us, window.sample, state.view, estimate.twists.mean(axis=0)
-        found = refine(Given(*about, estimate.covariance, estimate.low_activity, state.filter, height_m))
-        if found.outcome == "accepted":
-            estimate = _turned(estimate, found)
-        answer, state = _over_ground(window, estimate, state._replace(filter=found.filter), found.sigma_rad_s)
-        if answer is estimate:
-            answer = _with_errors(estimate, found, height_m)
+        given = Given(*about, estimate.covariance, estimate.low_activity, None, known_m or 1.0, known_m is not None)
+        found = refining.refine(given, state.stages)
+        state = state._replace(stages=found.state, ground=state.ground if found.level else GroundState())
+        estimate = _turned(estimate, found.turn, found.velocity)
+        answer, state = _over_ground(window, estimate, state, found)
+        if answer is estimate and found.velocity is None:
+            answer = _with_errors(estimate, found.turn, given.height_m)
         return answer._replace(uncertain=self.is_uncertain(answer.twists, answer.covariance)), state
 
     def is_uncertain(self, twists: NDArray[np.float64], covariance: NDArray[np.float64] | None) -> bool:
@@ -359,11 +361,13 @@ def _held(window: Window, estimate: WindowEstimate, state: StreamState) -> Refin
     return estimate._replace(twists=found.twists, covariance=found.covariance, source="refined"), state
 
 
-def _turned(estimate: WindowEstimate, found: RotationFound) -> WindowEstimate:
-    """The estimate with the angular part of the refinement by rotation."""
-    if estimate.covariance is None:
+def _turned(estimate: WindowEstimate, found: RotationFound, velocity: refining.Velocity | None) -> WindowEstimate:
+    """The estimate with the angular part of the refinement, and the linear one if it has one, where it is accepted."""
+    if estimate.covariance is None or found.outcome != "accepted":
         return estimate
     twists, covariance = _with_rate(estimate.twists, estimate.covariance, found.rate, found.change_rad_s)
+    if velocity is not None:
+        twists[:, :3], covariance[:3, :3] = velocity
     return estimate._replace(twists=twists, covariance=covariance, source="refined")
 
 
@@ -382,7 +386,7 @@ def _over_ground(
     window: Window,
     estimate: WindowEstimate,
     state: StreamState,
-    sigma_rad_s: NDArray[np.float64] | None,
+    found: refining.Stages,
 ) -> Refined:
     """The estimate with the motion over level ground, where it is accepted; see `refine.ground`.
 
@@ -390,20 +394,23 @@ def _over_ground(
         window: with the sample of its events.
         estimate: so far; it stays the same object if the answer is not accepted.
         state: of the stream.
-        sigma_rad_s: (3,) of its angular part; None for that of its covariance.
+        found: the stages before; a camera that is on no vehicle has no ground.
     """
+    if not found.level:
+        return estimate, state
     if window.sample is None or state.view is None or state.camera is None or estimate.covariance is None:
         return estimate, state
     height_m = state.camera.height_m
     if height_m is None:
         return estimate, state  # nothing says that the camera looks at level ground
     events = ground.events_of(state.view, window.sample, window.start_us)
-    sigma = np.sqrt(np.diagonal(estimate.covariance)[3:]) if sigma_rad_s is None else sigma_rad_s
+    sigma = found.turn.sigma_rad_s
+    sigma = np.sqrt(np.diagonal(estimate.covariance)[3:]) if sigma is None else sigma
     known = estimate.twists.mean(axis=0), sigma, state.ground
     turned = estimate.source == "refined" and not estimate.low_activity
     measured = estimate.covariance[3:, 3:] if turned else None
     answer = ground.refine(events, estimate.start_us, estimate.end_us, state.camera, *known, measured)
-    state = state._replace(ground=answer.state)
+    state = state._replace(ground=answer.state, stages=state.stages.after_ground(answer.outcome))
     if answer.outcome not in ("accepted", "turning") or answer.motion is None:
         return estimate, state
     twist, after = answer.motion.twist, answer.state

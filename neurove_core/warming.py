@@ -18,7 +18,7 @@ from neurove_core.ingest.wire import read_packet
 from neurove_core.models.bundle import Bundle
 from neurove_core.models.golden import Golden
 from neurove_core.networks.arrays import Weights, shapes
-from neurove_core.refine import ground, search
+from neurove_core.refine import ground, stages
 from neurove_core.refine.view import View
 from neurove_core.running import runner_of
 from neurove_protocol import CameraInfo, Events, Sensor
@@ -72,7 +72,7 @@ def warm_camera(sensor: Sensor) -> CameraInfo:
 
 def compile_refinement(view: View, camera: CameraInfo) -> None:
     """Compile the kernels of both refinements."""
-    search.compile_kernels(view.grid)
+    stages.compile_kernels(view.grid)
     ground.compile_kernels(camera)
 
 

@@ -38,11 +38,12 @@ _TAPS: Final = (_BELL / _BELL.sum()).astype(np.float32)
 
 
 class Rays(NamedTuple):
-    """The events of a window as rays (N,): x/z, y/z, and the time from the middle in units of the window's length."""
+    """The events of a window as rays (N,)."""
 
-    x: Floats
-    y: Floats
-    time: Floats
+    x: Floats  # x/z
+    y: Floats  # y/z
+    time: Floats  # from the middle of the window, in units of its length
+    near: Floats  # the depth that translation is over, over the depth at the event; 1 for a scene of one depth
 
 
 class Grid(NamedTuple):
@@ -76,7 +77,7 @@ def image(rays: Rays, motion: Array, grid: Grid) -> Floats:
         grid: size and place of the image.
     """
     drawn = np.zeros((grid.height, grid.width), np.float32)
-    _draw(rays.x, rays.y, rays.time, motion.astype(np.float32), grid, drawn)
+    _draw(*rays, motion.astype(np.float32), grid, drawn)
     return _smoothed(drawn, _TAPS)
 
 
@@ -108,7 +109,7 @@ def tiles(rays: Rays, motion: Array, grid: Grid, smooth: Floats) -> Tiles:
         grid: of the image.
         smooth: the image of these events at this motion.
     """
-    found = _sums(rays.x, rays.y, rays.time, motion.astype(np.float32), grid, smooth)
+    found = _sums(*rays, motion.astype(np.float32), grid, smooth)
     return _as_tiles(found)
 
 
@@ -144,7 +145,7 @@ def _moved_reference(rays: Rays, motion: Array) -> Array:
     phi = time * motion[:3]
     ray = np.stack([rays.x, rays.y, np.ones_like(rays.x)], 1).astype(np.float64)
     once = np.cross(phi, ray)
-    moved = ray + once + np.cross(phi, once) / 2 + time * motion[3:]
+    moved = ray + once + np.cross(phi, once) / 2 + time * rays.near[:, None] * motion[3:]
     return np.asarray(moved[:, :2] / moved[:, 2:])
 
 
@@ -158,28 +159,28 @@ def _compiled_fast(function: Callable[P, R]) -> Callable[P, R]:
 
 @compiled
 def _moved(
-    x: np.float32, y: np.float32, t: np.float32, motion: Floats
+    x: np.float32, y: np.float32, t: np.float32, near: np.float32, motion: Floats
 ) -> tuple[np.float32, np.float32]:  # pragma: no cover (machine code)
     """The ray (x, y, 1), turned to the second order, and shifted."""
     a, b, c = motion[0] * t, motion[1] * t, motion[2] * t
     px, py, pz = b - c * y, c * x - a, a * y - b * x
-    half = np.float32(0.5)
-    z = np.float32(1) / (np.float32(1) + pz + half * (a * py - b * px) + motion[5] * t)
+    half, shift = np.float32(0.5), t * near
+    z = np.float32(1) / (np.float32(1) + pz + half * (a * py - b * px) + motion[5] * shift)
     return (
-        (x + px + half * (b * pz - c * py) + motion[3] * t) * z,
-        (y + py + half * (c * px - a * pz) + motion[4] * t) * z,
+        (x + px + half * (b * pz - c * py) + motion[3] * shift) * z,
+        (y + py + half * (c * px - a * pz) + motion[4] * shift) * z,
     )
 
 
 @_compiled_fast
 def _draw(
-    xs: Floats, ys: Floats, times: Floats, motion: Floats, grid: Grid, drawn: Floats
+    xs: Floats, ys: Floats, times: Floats, nears: Floats, motion: Floats, grid: Grid, drawn: Floats
 ) -> None:  # pragma: no cover (machine code)
     focal, left, top = np.float32(grid.focal), np.float32(grid.left), np.float32(grid.top)
     most_u, most_v = np.float32(grid.width - 1), np.float32(grid.height - 1)
     one, zero = np.float32(1), np.float32(0)
     for i in range(xs.size):
-        x, y = _moved(xs[i], ys[i], times[i], motion)
+        x, y = _moved(xs[i], ys[i], times[i], nears[i], motion)
         u, v = focal * (x - left), focal * (y - top)
         if not (zero <= u < most_u and zero <= v < most_v):
             continue
@@ -211,7 +212,7 @@ def _smoothed(drawn: Floats, taps: Floats) -> Floats:  # pragma: no cover (machi
 
 @_compiled_fast
 def _sums(
-    xs: Floats, ys: Floats, times: Floats, motion: Floats, grid: Grid, smooth: Floats
+    xs: Floats, ys: Floats, times: Floats, nears: Floats, motion: Floats, grid: Grid, smooth: Floats
 ) -> Array:  # pragma: no cover (machine code)
     """(K, 12): events, x, y, value, gradient u v, Hessian uu uv vv, square of the gradient uu uv vv."""
     found = np.zeros((ROWS * COLUMNS, 12))
@@ -222,7 +223,7 @@ def _sums(
     own, own_curvature = np.float32(_SELF), np.float32(_SELF_CURVATURE)
     for i in range(xs.size):
         t = times[i]
-        x, y = _moved(xs[i], ys[i], t, motion)
+        x, y = _moved(xs[i], ys[i], t, nears[i], motion)
         u, v = focal * (x - left), focal * (y - top)
         if not (one <= u < most_u and one <= v < most_v):
             continue

@@ -135,7 +135,8 @@ def _part(rays: Rays, middle: float, share: float) -> Rays:
     """The events around a time of the window, with times from there in units of the part's length."""
     first, stop = np.searchsorted(rays.time, [middle - share / 2, middle + share / 2])
     time = ((rays.time[first:stop] - np.float32(middle)) / np.float32(share)).astype(np.float32)
-    return Rays(np.ascontiguousarray(rays.x[first:stop]), np.ascontiguousarray(rays.y[first:stop]), time)
+    x, y, near = (np.ascontiguousarray(column[first:stop]) for column in (rays.x, rays.y, rays.near))
+    return Rays(x, y, time, near)
 
 
 def _prior(length_s: float) -> Gaussian:

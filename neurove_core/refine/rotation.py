@@ -141,6 +141,7 @@ class Given(NamedTuple):
     low_activity: bool
     before: Filter | None
     height_m: float = 1.0  # of the camera, or what the linear part assumes
+    knows_height: bool = True  # whether it is that of the camera
 
 
 class Refined(NamedTuple):
@@ -155,11 +156,12 @@ class Refined(NamedTuple):
     )
     errors: Array | None = None  # (3, 3) covariance of the rate with the terms of `errors`; None where they are unknown
     shift: float = 0.0  # translation over depth [1/s]
+    motion: Array | None = None  # (6,) what the search found, also where it is not accepted: see Filter.motion
 
 
 def refine(given: Given) -> Refined:
     """Refine the angular velocity of a window; if it is not accepted, it is the network's."""
-    known = Rate(given.twist[3:], _with_floor(given.covariance[3:, 3:]))
+    known = Rate(given.twist[3:], floored(given.covariance[3:, 3:]))
     before = _predicted(given.before, given.start_us, given.window_us)
     not_accepted = Rate(known.w_rad_s, given.covariance[3:, 3:])
     rays = given.view.rays_of(given.sample, given.window_us)
@@ -173,9 +175,14 @@ def refine(given: Given) -> Refined:
         return Refined(not_accepted, "few events", None)
 
 
-def _slow_or_fast(given: Given, known: Rate, before: Filter | None, not_accepted: Rate, rays: Rays) -> Refined:
+def drives(given: Given) -> bool:
+    """Whether the network is certain that the camera moves fast."""
     speed, sigma = np.linalg.norm(given.twist[:3]), np.sqrt(np.trace(given.covariance[:3, :3]))
-    moving = bool(speed > MAX_SPEED * given.height_m and speed > _CERTAIN * sigma)
+    return bool(speed > MAX_SPEED * given.height_m and speed > _CERTAIN * sigma)
+
+
+def _slow_or_fast(given: Given, known: Rate, before: Filter | None, not_accepted: Rate, rays: Rays) -> Refined:
+    moving = drives(given)
     fast = before is not None and float(np.linalg.norm(before.motion[:3])) >= SURELY_FAST_RAD_S
     found = _turned_fast(given, known, before, rays) if fast else None
     if found is not None:
@@ -205,7 +212,7 @@ def _turned_fast(given: Given, known: Rate, before: Filter | None, rays: Rays) -
     covariance[:3, :3] = turn.covariance
     filtered = Filter(motion, covariance, given.start_us + given.window_us)
     sigma = np.sqrt(np.diagonal(turn.covariance))
-    return Refined(Rate(turn.w_rad_s, turn.covariance), "accepted", filtered, turn.change_rad_s, sigma)
+    return Refined(Rate(turn.w_rad_s, turn.covariance), "accepted", filtered, turn.change_rad_s, sigma, motion=motion)
 
 
 def _searched(given: Given, known: Rate, before: Filter | None, not_accepted: Rate, rays: Rays) -> Refined:
@@ -214,18 +221,18 @@ def _searched(given: Given, known: Rate, before: Filter | None, not_accepted: Ra
     found = search(rays, given.view.grid, prior, _guesses(known, before, seconds))
     posterior = found.information / _DISPERSION + prior.information
     if not np.linalg.eigvalsh(posterior)[0] > 0:
-        return Refined(not_accepted, "no maximum", before)
+        return Refined(not_accepted, "no maximum", before, motion=found.motion / seconds)
     covariance = np.asarray(np.linalg.inv(posterior) / seconds**2, np.float64)
     steady = before is not None and _goes_on(found.motion / seconds, covariance, before)
     outcome = _outcome(found, rays, known, covariance, seconds, steady=steady)
     if outcome != "accepted":
-        return Refined(not_accepted, outcome, before)
+        return Refined(not_accepted, outcome, before, motion=found.motion / seconds)
     motion, end_us = found.motion / seconds, given.start_us + given.window_us
     change = np.zeros(3) if before is None else _CHANGE_GAIN * (motion[:3] - before.motion[:3])
     rate = Rate(motion[:3], _honest(motion, covariance, before))
     sigma, shift = np.sqrt(np.diagonal(covariance)[:3]), float(np.linalg.norm(motion[3:]))
     wider = errors.of_rotation(motion, covariance, motion if before is None else before.motion, known.w_rad_s)
-    return Refined(rate, outcome, Filter(motion, covariance, end_us), change, sigma, wider, shift)
+    return Refined(rate, outcome, Filter(motion, covariance, end_us), change, sigma, wider, shift, motion)
 
 
 def _honest(motion: Array, covariance: Array, before: Filter | None) -> Array:
@@ -252,7 +259,8 @@ def spread(rays: Rays, grid: Grid) -> float:
     return float(counts.sum() ** 2 / (256 * (counts**2).sum()))
 
 
-def _with_floor(covariance: Array) -> Array:
+def floored(covariance: Array) -> Array:
+    """Covariance of the network's angular velocity, with the heavier tails of its errors."""
     return covariance * _NETWORK_SCALE**2 + np.eye(3) * _NETWORK_FLOOR**2
 
 

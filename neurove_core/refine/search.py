@@ -61,7 +61,7 @@ def search(rays: Rays, grid: Grid, prior: Gaussian, guesses: Sequence[Array], le
     for level in levels:
         some = Rays(*(np.ascontiguousarray(column[::level]) for column in rays)) if level > 1 else rays
         view = coarser(grid, level)
-        scale = _scale(measure(some, view, motions[0]))
+        scale = scale_of(measure(some, view, motions[0]))
         found = [_ascend(some, view, prior, motion, scale) for motion in motions]
         found.sort(key=lambda one: -one.score)
         motions = [found[0].motion]
@@ -85,7 +85,7 @@ def measure(rays: Rays, grid: Grid, motion: Array) -> Tiles:
 def compile_kernels(grid: Grid) -> None:
     """Compile the kernels of the search, so that the first window does not wait for it."""
     some = np.linspace(-0.5, 0.5, 16).astype(np.float32)
-    search(Rays(some, some, some), grid, Gaussian(np.zeros(6), np.eye(6)), [np.zeros(6)])
+    search(Rays(some, some, some, np.ones_like(some)), grid, Gaussian(np.zeros(6), np.eye(6)), [np.zeros(6)])
 
 
 def jacobian(x: Array, y: Array) -> Array:
@@ -96,7 +96,7 @@ def jacobian(x: Array, y: Array) -> Array:
     return np.stack([across, along], -2)
 
 
-def _scale(found: Tiles) -> float:
+def scale_of(found: Tiles) -> float:
     """The factor that makes the alignment a quasi-likelihood: the variance of its gradient is then its curvature."""
     curvature = -np.trace(found.hessian.sum(0))
     return float(max(curvature, 0.0) / max(np.trace(found.square.sum(0)), 1e-9))

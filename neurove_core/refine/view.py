@@ -54,4 +54,4 @@ class View(NamedTuple):
         x, y = self.rays[:, sample.y, sample.x]
         seen = (np.abs(x) <= _MAX_RAY) & (np.abs(y) <= _MAX_RAY)  # nan is not seen
         time = ((sample.t_us + np.float32(0.5)) / np.float32(window_us) - np.float32(0.5)).astype(np.float32)
-        return Rays(x[seen], y[seen], time[seen])
+        return Rays(x[seen], y[seen], time[seen], np.ones(np.count_nonzero(seen), np.float32))

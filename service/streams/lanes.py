@@ -175,7 +175,7 @@ class Lanes:
         new = self._lane(roles.serving, packet)
         self.serving_lane = new
         if new.estimator.has_same_windows(old.estimator):
-            new.state = new.state._replace(windows=old.state.windows, filter=old.state.filter, ground=old.state.ground)
+            new.state = new.state._replace(windows=old.state.windows, stages=old.state.stages, ground=old.state.ground)
             return 0
         open_us = old.state.windows.start_us
         new.answer_from(old.state.end_us)

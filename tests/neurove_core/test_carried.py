@@ -9,6 +9,9 @@ from neurove_core.config import ModelConfig
 from neurove_core.estimator import Estimator
 from neurove_core.ingest.windows import Window
 from neurove_core.models import bundle
+from neurove_core.refine import scene
+from neurove_core.refine.rotation import Filter
+from neurove_core.refine.stages import State as Stages
 from neurove_protocol import Sensor
 from neurove_protocol.errors import NeuroVEError
 from tests.bundles import CONFIG, make_bundle
@@ -40,6 +43,22 @@ def test_another_process_goes_on_bit_for_bit(kind):
         assert one.settled == two.settled
         assert one.first == two.first
     assert wanted[0].twists.tobytes() != cold[0].twists.tobytes()
+
+
+def test_the_state_of_the_refinement_goes_along():
+    estimator = Estimator(make_bundle())
+    _, state = estimator.follow(windows(CONFIG, 3), estimator.initial_state(SENSOR))
+    size = 6 + scene.COLUMNS * scene.ROWS
+    moving = scene.Scene(np.arange(float(size)), np.eye(size), 2_000_000, seen=True, moves=7)
+    turning = Filter(np.arange(6.0), np.eye(6), 2_000_000, 1)
+    state = state._replace(stages=Stages(turning, moving, aside=12, idle=2, again=True, odds=-2.5))
+    got = carried.decode(carried.encode(state), state).stages
+    assert (got.aside, got.idle, got.again, got.odds, got.scene.seen, got.scene.moves) == (12, 2, True, -2.5, True, 7)
+    assert (got.filter.end_us, got.filter.against, got.scene.end_us) == (2_000_000, 1, 2_000_000)
+    for one, two in zip(
+        (got.filter.motion, got.scene.mean, got.scene.covariance), (turning.motion, *moving), strict=False
+    ):
+        assert one.tobytes() == two.tobytes()
 
 
 def test_every_truncation_and_the_state_of_another_model_are_refused():

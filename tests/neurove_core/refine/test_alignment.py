@@ -17,7 +17,7 @@ def edges(motion, seed=0, n=4000):
     at = at + rng.normal(0, 0.7, at.shape) / GRID.focal
     flow = np.einsum("kia,a->ki", jacobian(*at.T), motion)
     x, y = (at - time[:, None] * flow).astype(np.float32).T
-    return Rays(x, y, time.astype(np.float32))
+    return Rays(x, y, time.astype(np.float32), np.ones(n, np.float32))
 
 
 @pytest.mark.parametrize(
@@ -25,6 +25,7 @@ def edges(motion, seed=0, n=4000):
 )
 def test_the_kernels_equal_their_reference(motion):
     rays, motion = edges(np.zeros(6)), np.array(motion, float)
+    rays = rays._replace(near=np.linspace(0.5, 2.0, rays.x.size, dtype=np.float32))
     smooth = image(rays, motion, GRID)
     np.testing.assert_allclose(smooth, image_reference(rays, motion, GRID), atol=1e-4)
     for name, ours, plain in zip(
