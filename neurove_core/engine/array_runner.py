@@ -35,6 +35,15 @@ class _Compiled(NamedTuple):
     project: Callable[[SpikeList], Array]
 
 
+class Part(NamedTuple):
+    """One step of a window, to be timed alone."""
+
+    name: str
+    run: Callable[[], object]
+    sums: int  # multiplications with their additions, or additions of a weight, that it does
+    weights: int  # size of the weights that it reads [bytes], each once
+
+
 class ArrayRunner:
     """Runs windows of a network, several streams in one batch; see `Runner`.
 
@@ -87,6 +96,38 @@ class ArrayRunner:
             some = windows[:_TIMED]
             self.choice = fastest({name: partial(self._features, form, some) for name, form in forms.items()})
         self._compiled = forms[self.choice.form]
+
+    def parts(self, counts: Counts) -> list[Part]:
+        """The steps of a window after the zero state, in the form that serves; empty where no form is compiled.
+
+        Args:
+            counts: (C, H, W) network input.
+        """
+        if self._compiled is None:
+            return []
+        form, given, found = self._compiled, np.ascontiguousarray(counts)[None], []
+        state, constants = self.initial_state(), (self._decay, self._v_th)
+        layer, membrane = self._layers[0], state.membranes[0]
+        found.append(
+            Part(
+                "first convolution",
+                partial(form.first, given, membrane, *constants),
+                membrane.size * layer.weight.size // layer.outputs,
+                layer.weight.nbytes,
+            )
+        )
+        spikes, _ = form.first(given, membrane, *constants)
+        for number, (run, layer) in enumerate(zip(form.later, self._layers[1:], strict=True), 2):
+            membrane = state.membranes[number - 1]
+            sums = spikes.total * layer.outputs * 9 // 4  # a cell lies under 9 / 4 kernels of stride 2
+            step = partial(run, spikes, membrane, *constants)
+            found.append(Part(f"convolution {number}", step, sums, layer.weight.nbytes))
+            spikes, _ = step()
+        rows = form.project(spikes)
+        sums, size = spikes.total * rows.size, self._projection.weight.itemsize
+        found.append(Part("projection", partial(form.project, spikes), sums, sums * size))
+        answer = partial(self._answer, rows[:, : self._config.network.features], state)
+        return [*found, Part("cells and readout", answer, self._flat.size, self._flat.nbytes)]
 
     def _features(self, form: "_Compiled", windows: Counts) -> Array:
         """Currents of the projection and potentials of all blocks over consecutive windows, from the zero state."""

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 ALL = (
     "ingest",
     "window",
+    "served",
     "refinement",
     "end-to-end",
     "train",
@@ -74,7 +75,7 @@ def bench(args: argparse.Namespace) -> int:
 
 
 def _rows(name: str, args: argparse.Namespace, missing: list[str]) -> Iterator["Row"]:
-    from neurove_core.bench import ingest, processes, refinement, simulate, sine, window
+    from neurove_core.bench import ingest, processes, refinement, served, simulate, sine, window
     from neurove_service.cli import bench_metrics
     from neurove_service.clients import bench_wire
 
@@ -82,6 +83,7 @@ def _rows(name: str, args: argparse.Namespace, missing: list[str]) -> Iterator["
     run: dict[str, Callable[[], list[Row]]] = {
         "ingest": lambda: ingest.ingest(_rounds(args, 21), missing, **options),
         "window": lambda: window.window(_rounds(args, 15), missing, **options),
+        "served": lambda: served.served(_rounds(args, 31), missing, **options),
         "refinement": lambda: refinement.refinement(_rounds(args, 15), quick=args.quick),
         "end-to-end": lambda: ingest.end_to_end(_rounds(args, 15), missing, **options),
         "train": lambda: window.train(_rounds(args, 3), missing, **options),

@@ -89,6 +89,7 @@ def run(transport, nodes, consumer, driver, streams, copies):
         print(kind, flush=True)
         act()
         settle(*alive)
+        time.sleep(3)
 
     join("n1", "n2")
     driver.start()

@@ -19,14 +19,14 @@ def test_without_measurements_every_figure_says_so():
 
 
 def test_a_ratio_is_judged_by_must_and_goal():
-    name = "window shipped, T=1"
+    name = "window shipped, as served"
     for ratio, reached in ((4.99, "no"), (5.0, "must"), (7.9, "must"), (8.0, "goal")):
         found = lines(row_of(name, "PyTorch, plain", 2.0), row_of(name, "spikingjelly", ratio))
         assert found[1][1:] == ["spikingjelly", f"{ratio:.3g}", "5", "8", reached]
 
 
 def test_the_plain_form_stands_in_for_a_peer_that_is_not_installed():
-    assert lines(row_of("window shipped, T=1", "PyTorch, plain", 6.0))[1][1:3] == ["PyTorch, plain", "6"]
+    assert lines(row_of("window shipped, as served", "PyTorch, plain", 6.0))[1][1:3] == ["PyTorch, plain", "6"]
 
 
 def test_a_share_of_the_limit_is_judged_whatever_the_ratio_to_the_peer_is():

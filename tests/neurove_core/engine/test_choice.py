@@ -123,3 +123,21 @@ def test_an_unknown_form_is_an_error_that_names_the_known_ones(monkeypatch):
     monkeypatch.setenv(VARIABLE, "quick")
     with pytest.raises(InvalidField, match="NEUROVE_FORM.*quick.*sparse"):
         Estimator(bundle.untrained(3, CONFIGS["float32"]))
+
+
+@compiled_only
+@pytest.mark.parametrize("precision", CONFIGS)
+def test_the_parts_of_a_window_together_give_its_answer(precision):
+    runner, given = runner_of(precision), windows(CONFIGS[precision])[1]
+    parts = runner.parts(given)
+    assert [part.name for part in parts] == [
+        "first convolution",
+        "convolution 2",
+        "convolution 3",
+        "projection",
+        "cells and readout",
+    ]
+    assert all(part.sums > 0 and part.weights > 0 for part in parts)
+    ((twists, _),) = runner.run([given], [runner.initial_state()])
+    for _ in range(2):  # a part that is repeated starts from the same state
+        np.testing.assert_array_equal(parts[-1].run()[0], twists)

@@ -68,7 +68,9 @@ def test_an_unknown_benchmark_is_refused(capsys):
 def test_the_table_of_figures_follows_the_rows_of_its_benchmarks(capsys):
     assert main(["bench", "figures", "--quick"]) == 0
     rows, _, table = capsys.readouterr().out.partition("\n\n")
-    assert all(name in rows for name in ("ingest", "window", "events to estimate", "training step", "wire", "streams"))
+    assert all(
+        name in rows for name in ("ingest", "as served", "events to estimate", "training step", "wire", "streams")
+    )
     found = [line for line in table.splitlines() if line.startswith("| 8 streams per core")]
     assert len(found) == 1
     assert "not measured" not in found[0]
