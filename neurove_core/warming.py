@@ -31,8 +31,12 @@ _FIRING: Final = 0.2  # share of the cells with events in made-up windows
 
 
 def is_cold() -> bool:
-    """Whether this process finds no compiled code in the cache; it compiles or loads one small kernel."""
-    return vectors_work() and work().loaded == 0
+    """Whether the cache has no compiled code; a process that has compiled or loaded code already gets False.
+
+    It compiles or loads one small kernel, which is the first one that all others need.
+    """
+    before = work()
+    return before.compiled + before.loaded == 0 and vectors_work() and work().compiled > 0
 
 
 def compile_part(part: str, config: ModelConfig) -> None:

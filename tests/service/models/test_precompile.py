@@ -1,6 +1,7 @@
 import threading
 
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
+from neurove_core.warming import compile_part, is_cold
 from neurove_service.models import precompile
 
 SMALL = ModelConfig(canonical=CanonicalConfig(width=24, height=16), network=NetworkConfig(channels=(4,), hidden=4))
@@ -51,3 +52,8 @@ def test_children_of_a_first_start_that_cannot_start_leave_the_work_to_the_node(
     monkeypatch.setattr("os.cpu_count", lambda: 2)
     precompile.at_start(SMALL, None)
     assert capsys.readouterr().out.count("code is compiled by the node itself") == 3
+
+
+def test_a_process_that_has_run_compiled_code_is_not_cold():
+    compile_part("events", SMALL)
+    assert not is_cold()
