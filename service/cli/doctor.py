@@ -3,6 +3,7 @@
 import argparse
 import json
 import threading
+from collections.abc import Sequence
 from typing import Any, Final
 
 from neurove_protocol import Flag, TwistEstimate
@@ -69,12 +70,49 @@ def _check_network(config: ClientConfig) -> list[Check]:
         except ask.NoService:
             advice = f"start `neurove serve` with prefix {config.prefix}, and check the access list of the router"
             return [Check("connection", f"a router answers at {where}, but no service", "bad", advice)]
-        statuses = {status.stream: status for reply in replies for status in reply.streams}
+        statuses = answering(replies)
         estimates = _newest_estimates(transport, config, set(statuses))
     found = [_check_node(reply, where) for reply in replies]
     for name, status in sorted(statuses.items()):
         found += check_stream(status, estimates.get(name))
+        found += check_standby(name, replies)
     return found or [Check("connection", f"no node at {where}", "bad", "start `neurove serve`")]
+
+
+def answering(replies: Sequence[HealthReply]) -> dict[str, StreamStatus]:
+    """The status of each stream, of the node that answers it where several nodes serve it."""
+    every = [status for reply in replies for status in reply.streams]
+    every.sort(key=lambda status: status.standby is None or status.standby.role == "answers")
+    return {status.stream: status for status in every}
+
+
+def check_standby(stream: str, replies: Sequence[HealthReply]) -> list[Check]:
+    """Which node answers a stream, which nodes follow, and whether one is ready; none where no node stands by.
+
+    Args:
+        stream: its name.
+        replies: of all nodes.
+    """
+    found = [(reply.node, status) for reply in replies for status in reply.streams if status.stream == stream]
+    standing = [(node, status.standby) for node, status in found if status.standby is not None]
+    if not standing:
+        return []
+    what = f"stream {stream}: standby"
+    always = sorted(node for node, status in found if status.standby is None)
+    if always:
+        advice = "set standby on every node that serves the stream"
+        return [Check(what, f"{', '.join(always)} publishes without standby", "bad", advice)]
+    leaders = sorted(node for node, standby in standing if standby.role == "answers")
+    follows = [
+        f"{node} follows, {'ready' if standby.equal else 'not ready: its state is not equal yet'}"
+        for node, standby in sorted(standing)
+        if standby.role != "answers"
+    ]
+    state = "; ".join([f"{' and '.join(leaders) or 'no node'} answers", *(follows or ["no other node serves it"])])
+    if len(leaders) == 1 and any(standby.role == "follows" and standby.equal for _, standby in standing):
+        return [Check(what, state, "ok")]
+    advice = "run it again in a second; see deploy/docs/standby.md"
+    return [Check(what, state, "bad", advice)]
 
 
 def _newest_estimates(transport: Any, config: ClientConfig, streams: set[str]) -> dict[str, TwistEstimate]:

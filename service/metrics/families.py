@@ -148,6 +148,16 @@ def _of_nodes(nodes: Sequence[HealthReply], silent: Sequence[str]) -> Iterator[M
         [((one.node, _clipped(one.version)), 1.0) for one in nodes],
     )
     yield _gauge(
+        "neurove_node_label",
+        "A label of the configuration of the node.",
+        ("node", "label", "value"),
+        [
+            ((one.node, _clipped(label), _clipped(value)), 1.0)
+            for one in nodes
+            for label, value in sorted(one.labels.items())
+        ],
+    )
+    yield _gauge(
         "neurove_model_info",
         "The active model.",
         ("node", "model", "digest", "trained", "signature"),
@@ -169,6 +179,15 @@ def _places(errors: dict[str, int]) -> dict[str, int]:
 
 def _of_streams(streams: Sequence[tuple[str, StreamStatus]]) -> Iterator[Metric]:
     keyed = [((node, status.stream), status) for node, status in streams]
+    standing = [(key, one.standby) for key, one in keyed if one.standby is not None]
+    answers = [(key, float(one.role == "answers")) for key, one in standing]
+    yield _gauge(
+        "neurove_stream_answers", "1 if the node answers a stream that others can answer too.", _STREAM, answers
+    )
+    ready = [(key, float(one.role == "follows" and one.equal)) for key, one in standing]
+    yield _gauge(
+        "neurove_stream_follows", "1 if the node follows such a stream and is ready to answer.", _STREAM, ready
+    )
     for name, about in _STREAM_COUNTERS.items():
         yield _counter(f"neurove_{name}", about, _STREAM, [(key, getattr(one, name)) for key, one in keyed])
     for what, about in _LOSSES.items():

@@ -164,7 +164,7 @@ class Camera:
             if kind == "velocity":
                 self._publish(TwistEstimate.decode(payload))
             else:
-                self._status, self._status_ns = StreamStatus.decode(payload), time.monotonic_ns()
+                self._hear_status(StreamStatus.decode(payload))
         except NeuroVEError as error:
             self._feed.refusal = f"a message of the service: {error}"
 
@@ -178,7 +178,13 @@ class Camera:
             self._transport.answer(self._camera_key, lambda _: self._lens or b"")
         self._transport.put(self._camera_key, packet.payload, CAMERA_SCHEMA)
 
+    def _hear_status(self, status: StreamStatus) -> None:
+        if status.standby is None or status.standby.role == "answers":  # not of a node that follows
+            self._status, self._status_ns = status, time.monotonic_ns()
+
     def _publish(self, estimate: TwistEstimate) -> None:
+        if not self._velocity.takes(estimate, time.monotonic_ns()):
+            return
         stamp_ns = self._feed.clock.ros_ns(estimate.end_us)
         message = self._velocity.message(estimate, stamp_ns, self._feed.frame_id)
         if message is not None:

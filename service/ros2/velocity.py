@@ -8,6 +8,7 @@ import numpy as np
 from neurove_core.geometry.mounting import Mounting
 from neurove_core.io.formats.ros.types import AXES, Header, TwistMessage
 from neurove_protocol import Flag, TwistEstimate
+from neurove_protocol.duty import Newest
 
 DOUBTFUL_VARIANCE: Final = 1e6
 """Default variance of each axis of a doubtful part [m2/s2, rad2/s2]: a filter that weighs by covariance ignores it."""
@@ -78,8 +79,18 @@ class Velocity:
     ) -> None:
         self._stream, self._frame, self._doubtful, self._variance = stream, frame, doubtful, variance
         self.sent = self.withheld = self.unstamped = 0
+        self._rule = Newest()
         self.doubted: Counter[str] = Counter()  # estimates by doubt about the linear part
         self.newest = Doubts((), ())
+
+    def takes(self, estimate: TwistEstimate, now_ns: int) -> bool:
+        """Whether an estimate is to be sent: where several nodes can answer the stream, each window is sent once.
+
+        Args:
+            estimate: of this stream.
+            now_ns: when it arrived, monotonic [ns].
+        """
+        return self._rule.takes(estimate.term, estimate.start_us, now_ns)
 
     def message(self, estimate: TwistEstimate, stamp_ns: int | None, frame_id: str) -> TwistMessage | None:
         """The message of an estimate; None if it must not be sent, which is counted.

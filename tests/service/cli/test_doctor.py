@@ -5,7 +5,7 @@ import json
 import pytest
 
 from neurove_protocol import Flag, TwistEstimate
-from neurove_protocol.control import StreamStatus
+from neurove_protocol.control import HealthReply, StreamStatus
 from neurove_service.cli import doctor, extras, installation
 from tests.protocol.messages import EXAMPLES, STATUS
 
@@ -166,3 +166,39 @@ def test_the_inertial_unit_of_a_stream_is_checked_if_it_has_one(changes, level, 
     assert (check.what, check.level) == ("stream cam0: inertial unit", level)
     assert check.state.startswith(state)
     assert bool(check.advice) == (level == "bad")
+
+
+def replies_of(**roles):
+    """Health replies of nodes that serve one stream; a node without a role does not stand by."""
+    made = EXAMPLES["HealthReply"]
+    return [
+        HealthReply(
+            **(made | {"node": node, "streams": [STATUS | {"stream": "cam0", "standby": role and duty(**role)}]})
+        )
+        for node, role in roles.items()
+    ]
+
+
+def duty(role, *, equal=False):
+    return {"role": role, "leader": "a", "term": 7, "equal": equal}
+
+
+@pytest.mark.parametrize(
+    ("roles", "level", "state"),
+    [
+        ({"a": {"role": "answers"}, "b": {"role": "follows", "equal": True}}, "ok", "a answers; b follows, ready"),
+        ({"a": {"role": "answers"}, "b": {"role": "follows"}}, "bad", "a answers; b follows, not ready"),
+        ({"a": {"role": "answers"}}, "bad", "a answers; no other node serves it"),
+        ({"a": {"role": "answers"}, "b": None}, "bad", "b publishes without standby"),
+    ],
+)
+def test_standby_says_who_answers_and_whether_another_node_is_ready(roles, level, state):
+    (check,) = doctor.check_standby("cam0", replies_of(**roles))
+    assert (check.level, check.state.startswith(state)) == (level, True), check
+
+
+def test_a_stream_without_standby_has_no_such_check_and_its_status_is_that_of_the_node_that_answers():
+    assert doctor.check_standby("cam0", replies_of(a=None)) == []
+    replies = replies_of(a={"role": "answers"}, b={"role": "follows"})
+    assert doctor.answering(replies)["cam0"].standby.role == "answers"
+    assert doctor.answering(replies[::-1])["cam0"].standby.role == "answers"

@@ -138,3 +138,13 @@ def test_promtool_finds_nothing_to_improve():
         ["promtool", "check", "metrics"], input=exposition(fleet), capture_output=True, check=False, timeout=120
     )
     assert (checked.returncode, checked.stdout, checked.stderr) == (0, b"", b"")
+
+
+def test_labels_of_a_node_and_its_part_in_a_stream_of_several_nodes():
+    duty = {"leader": "n1", "term": 7, "equal": True}
+    streams = [(status(standby=duty | {"role": role}),) for role in ("answers", "follows")]
+    fleet = Fleet([reply("n1", streams[0], labels={"site": "hall-2"}), reply("n2", streams[1])])
+    assert value(fleet, "neurove_node_label", node="n1", label="site", value="hall-2") == 1
+    for name, of_n1, of_n2 in (("neurove_stream_answers", 1, 0), ("neurove_stream_follows", 0, 1)):
+        assert value(fleet, name, node="n1", stream="cam0") == of_n1
+        assert value(fleet, name, node="n2", stream="cam0") == of_n2

@@ -144,3 +144,21 @@ def test_diagnostics_say_in_words_what_is_wrong():
     assert told.said() == (diagnostics.STALE, "no events on /cam/events for 3 s")
     values = {one.key: one.value for one in told.status_now().values}
     assert (values["lost_messages"], values["doubtful_unscaled"], values["velocity_sent"]) == ("3", "1", "1")
+
+
+def test_of_two_nodes_that_answer_one_stream_each_window_is_sent_once():
+    velocity, made = Velocity("cam0"), estimate()
+    window_us = made.end_us - made.start_us
+
+    def takes(term, number):
+        start_us = number * window_us
+        one = made.model_copy(update={"term": term, "start_us": start_us, "end_us": start_us + window_us})
+        return velocity.takes(one, number)
+
+    assert [takes(*one) for one in ((7, 0), (7, 1), (9, 1), (9, 2), (7, 2), (9, 3))] == [
+        *(True, True),
+        False,
+        True,
+        False,
+        True,
+    ]
