@@ -419,7 +419,21 @@ def _over_ground(
     if answer.outcome == "turning":
         rate = Rate(twist[3:], covariance[3:, 3:])
         twists, covariance = _with_rate(estimate.twists, estimate.covariance, rate, np.zeros(3))
+    if state.stages.is_free:
+        before = estimate if found.velocity is not None else _with_errors(estimate, found.turn, height_m)
+        twists, covariance = _without_rate(twists, covariance, before)
     return estimate._replace(twists=twists, covariance=covariance, source="refined"), state
+
+
+def _without_rate(
+    twists: NDArray[np.float64], covariance: NDArray[np.float64], before: WindowEstimate
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The linear part of a motion over the ground, with the angular part of the estimate before it."""
+    joint = covariance.copy()
+    joint[:3, 3:], joint[3:, :3] = 0.0, 0.0
+    if before.covariance is not None:
+        joint[3:, 3:] = before.covariance[3:, 3:]
+    return np.hstack([twists[:, :3], before.twists[:, 3:]]), joint
 
 
 def _to_metres(camera: CameraInfo | None, unit: LinearUnit) -> NDArray[np.float64]:

@@ -54,6 +54,7 @@ class StateRequest(Request):
 
     stream: Name
     digest: Digest  # of the model of the asking node
+    after_us: Int64 | None = None  # reply once the state is that after a window with this end, or a later one
 
 
 class StateReply(Message):

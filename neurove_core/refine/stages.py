@@ -4,8 +4,9 @@
 scene shows a camera that translates, in two windows in a row where the rotation is accepted; then its motion is the
 answer, and the rotation is searched only where it is not accepted. A camera that the network certainly sees move fast
 is a vehicle, which is left to the ground. So is a camera that is on a vehicle by the outcomes over the ground, see
-`vehicle`: there no scene is searched for. No scene begins where the rotation finds nothing that moves. Without a known
-height, a scene is searched for only where the parts of the image disagree about the rotation.
+`vehicle`: there no scene is searched for. Elsewhere a motion over the ground gives no angular velocity, because what
+such a camera sees is seldom level. No scene begins where the rotation finds nothing that moves. Without a known height,
+a scene is searched for only where the parts of the image disagree about the rotation.
 """
 
 from typing import Final, NamedTuple
@@ -60,6 +61,11 @@ class State(NamedTuple):
     again: bool = False  # whether to look at the scene once more before it outweighs a rotation
     odds: float = vehicle.START  # that the camera is on a vehicle, see `vehicle`
 
+    @property
+    def is_free(self) -> bool:
+        """Whether the outcomes over the ground show no vehicle; its motion over the ground then has no angular part."""
+        return self.odds < 0
+
     def after_ground(self, outcome: Outcome) -> "State":
         """The state after the outcome over the ground of the same window."""
         return self._replace(odds=vehicle.judged(self.odds, outcome))
@@ -77,7 +83,7 @@ class Stages(NamedTuple):
 def refine(given: Given, state: State) -> Stages:
     """Refine the motion of a window by its events; `given.before` is not used."""
     given = given._replace(before=state.filter)
-    if given.knows_height and state.odds >= 0:
+    if given.knows_height and not state.is_free:
         alone = rotation.refine(given)
         return Stages(alone, None, True, State(alone.filter, odds=state.odds))
     before, turn = state.scene, None

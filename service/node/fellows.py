@@ -27,6 +27,7 @@ from neurove_service.transport import Transport
 log = logs.get(__name__)
 
 _STATE_S = 0.5  # for a state, on both sides
+_STATES_AT_ONCE = 16  # requests for a state; each waits until its stream has reached the window
 _TAKE_S = 1.0
 _POLL_S = 0.005
 
@@ -54,7 +55,7 @@ class Fellows:
         transport.watch_tokens(keys.serves(), self._on_token)
         transport.subscribe_timed(keys.velocity(), self._on_estimate, remote=True)
         transport.answer(keys.duty(node), self._reply)
-        transport.answer(keys.state(node), self._state)
+        transport.answer_streaming(keys.state(node), lambda request, _: self._state(request), _STATES_AT_ONCE)
         transport.answer(keys.take(node), self._take)
         transport.answer_streaming(keys.drain(node), lambda request, _: self._drain(request))
 
@@ -76,9 +77,9 @@ class Fellows:
         replies = self._ask(self._keys.duty(), DutyRequest(stream=stream), DutyReply, timeout_s)
         return [one for one in replies if one.node != self._node]
 
-    def state(self, stream: str, node: str, digest: str) -> StateReply | None:
-        """The state of a stream on another node."""
-        request = StateRequest(stream=stream, digest=digest)
+    def state(self, stream: str, node: str, digest: str, after_us: int | None = None) -> StateReply | None:
+        """The state of a stream on another node, after a window with this end or a later one."""
+        request = StateRequest(stream=stream, digest=digest, after_us=after_us)
         replies = self._ask(self._keys.state(node), request, StateReply, _STATE_S)
         return replies[0] if replies else None
 
@@ -192,7 +193,7 @@ class Fellows:
 
     def _state(self, request: bytes) -> bytes:
         wanted = StateRequest.decode(request)
-        reply = self._pair(wanted.what, wanted.stream).state(wanted.digest, _STATE_S)
+        reply = self._pair(wanted.what, wanted.stream).state(wanted.digest, wanted.after_us, _STATE_S)
         if reply is None:
             raise InvalidField(
                 wanted.what, "digest", wanted.digest, "a model that has answered a window of this stream"

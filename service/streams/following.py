@@ -189,6 +189,7 @@ class Found(NamedTuple):
 
 class _Asked(NamedTuple):
     digest: str
+    after_us: int | None
     found: list[Found]
     done: threading.Event
 
@@ -205,23 +206,30 @@ class Sync:
         self._asked: deque[_Asked] = deque()
         self._end_us: int | None = None  # of the state that was fetched last
 
-    def ask(self, node: str, digest: str, timeout_s: float, wake: Callable[[], None]) -> StateReply | None:
-        """The state of this node for the model with this digest; called on another thread."""
-        asked = _Asked(digest, [], threading.Event())
+    def ask(
+        self, node: str, digest: str, after_us: int | None, timeout_s: float, wake: Callable[[], None]
+    ) -> StateReply | None:
+        """The state of this node for the model with this digest, from `after_us` on; called on another thread."""
+        asked = _Asked(digest, after_us, [], threading.Event())
         self._asked.append(asked)
         wake()
         asked.done.wait(timeout_s)
+        asked.done.set()
         if not asked.found:
             return None
         end_us, data = asked.found[0]
         return StateReply(node=node, stream=self._stream, digest=digest, end_us=end_us, data=data)
 
     def serve(self, stream: Stream) -> None:
-        """Answer the other threads."""
-        while self._asked:
-            asked = self._asked.popleft()
+        """Answer the other threads, each once the stream has reached the window that it wants."""
+        for asked in [self._asked.popleft() for _ in range(len(self._asked))]:
+            if asked.done.is_set():
+                continue  # it has waited long enough
             lane = stream.lanes.serving_lane
             if lane is not None and lane.state.end_us is not None and lane.estimator.bundle.digest == asked.digest:
+                if asked.after_us is not None and lane.state.end_us < asked.after_us:
+                    self._asked.append(asked)
+                    continue
                 asked.found.append(Found(lane.state.end_us, carried.encode(lane.state)))
             asked.done.set()
 
@@ -230,8 +238,10 @@ class Sync:
         lane = stream.lanes.serving_lane
         return lane is not None and self._end_us is not None and lane.adopted_us == self._end_us
 
-    def fetch(self, stream: Stream, ask: Callable[[str], StateReply | None]) -> int | None:
+    def fetch(self, stream: Stream, ask: Callable[[str, int | None], StateReply | None]) -> int | None:
         """Ask the other node for its state, to go on with it where its next window begins, which is returned.
+
+        If this node is ahead, the other one replies when it has reached the window that is open here.
 
         Returns:
             the end of the window after which the state is [us]; None if none came.
@@ -239,7 +249,7 @@ class Sync:
         lane = stream.lanes.serving_lane
         if lane is None:
             return None
-        reply = ask(lane.estimator.bundle.digest)
+        reply = ask(lane.estimator.bundle.digest, lane.next_us)
         if reply is None or reply.digest != lane.estimator.bundle.digest:
             return None
         try:

@@ -116,9 +116,9 @@ class Pair:
             digest=following.digest,
         )
 
-    def state(self, digest: str, timeout_s: float) -> StateReply | None:
-        """The state of the stream for a follower; None if this node has no such state, or is stuck."""
-        return self._sync.ask(self._tenure.node, digest, timeout_s, self._wake)
+    def state(self, digest: str, after_us: int | None, timeout_s: float) -> StateReply | None:
+        """The state of the stream for a follower; None if this node has no such state in time."""
+        return self._sync.ask(self._tenure.node, digest, after_us, timeout_s, self._wake)
 
     def status(self) -> StandbyStatus:
         """For the status of the stream."""
@@ -218,7 +218,7 @@ class Pair:
     def _take_state(self, stream: Stream) -> None:
         ask, leader = self._peers.state, self._tenure.leader if self._tenure.role == "follows" else ""
         if leader and self._following.wants_state(self._now_ns(), used=self._sync.is_used(stream)):
-            self._following.took(self._sync.fetch(stream, lambda digest: ask(self._stream, leader, digest)))
+            self._following.took(self._sync.fetch(stream, lambda *wanted: ask(self._stream, leader, *wanted)))
             self._note_pause()
 
     def _hear(self, estimate: TwistEstimate) -> None:

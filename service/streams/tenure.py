@@ -34,8 +34,8 @@ class Peers(Protocol):
     def roles(self, stream: str, timeout_s: float, /) -> list[DutyReply]:
         """What they do on the stream, as far as they reply in time."""
 
-    def state(self, stream: str, node: str, digest: str, /) -> StateReply | None:
-        """The state of the stream on the node that answers it."""
+    def state(self, stream: str, node: str, digest: str, after_us: int | None, /) -> StateReply | None:
+        """The state of the stream on the node that answers it, after a window with this end or a later one."""
 
     def take(self, stream: str, node: str, term: int, last_us: int | None, timeout_s: float, /) -> bool:
         """Ask a node to answer after the window that begins at `last_us`; whether it replies."""

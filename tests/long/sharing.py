@@ -138,6 +138,15 @@ def report(consumer, driver, streams, model, changes, copies):
             bad += doubled + len(broken) + wrong
             if doubled or broken or wrong:
                 print(f"{stream}: {doubled} doubled, {len(broken)} gaps, {wrong} not equal")
+            for before, after in broken:
+                (last,) = [one for one in got if one.estimate.start_us == before][:1]
+                (first,) = [one for one in got if one.estimate.start_us == after][:1]
+                lost = first.estimate.seq - last.estimate.seq - 1
+                missing = (after - before) // WINDOW_US - 1
+                print(
+                    f"  {missing} windows missing from {before + WINDOW_US} us, {lost} of them published; "
+                    f"{kind_at(first.at_ns)}, {last.estimate.node} before and {first.estimate.node} after"
+                )
         for one in got:
             delay = (one.at_ns - driver.sent_ns[one.estimate.end_us // driver.step_us]) / 1e3 / WINDOW_US
             usual.append(delay)

@@ -248,7 +248,7 @@ EXAMPLES: dict[str, Fields] = {
         "draining": False,
         "digest": "5e" * 32,
     },
-    "StateRequest": {"v": 1, "stream": "cam0", "digest": "5e" * 32},
+    "StateRequest": {"v": 1, "stream": "cam0", "digest": "5e" * 32, "after_us": 60_000},
     "StateReply": {
         "v": 1,
         "node": "rover-1",
@@ -564,7 +564,7 @@ ANY: dict[str, st.SearchStrategy[Fields]] = {
             "digest": sentences,
         }
     ),
-    "StateRequest": st.fixed_dictionaries({"stream": names, "digest": digests}),
+    "StateRequest": st.fixed_dictionaries({"stream": names, "digest": digests, "after_us": st.none() | int64s}),
     "StateReply": st.fixed_dictionaries(
         {"node": names, "stream": names, "digest": digests, "end_us": int64s, "data": st.binary(max_size=40)}
     ),

@@ -45,6 +45,7 @@ NULLABLE = {
     ("TwistEstimate", "term"),
     ("DutyReply", "leader"),
     ("DutyReply", "missed_us"),
+    ("StateRequest", "after_us"),
     ("TakeRequest", "start_us"),
     ("CameraInfo", "height_m"),
     *(

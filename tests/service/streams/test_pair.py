@@ -51,7 +51,7 @@ class Other:
         nodes.now_ns += int(1e9 * timeout_s)
         return []
 
-    def state(self, _stream, _node, _digest):
+    def state(self, _stream, _node, _digest, _after_us):
         return None
 
     def take(self, _stream, node, term, last_us, _timeout_s):

@@ -13,7 +13,7 @@ class NoPeers:
     def roles(self, _stream, _timeout_s):
         return []
 
-    def state(self, _stream, _node, _digest):
+    def state(self, _stream, _node, _digest, _after_us):
         return None
 
 
