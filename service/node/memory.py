@@ -64,7 +64,7 @@ class CompilerPages:
 
 
 def _clean(lines: Iterable[str]) -> list[tuple[int, int, int]]:
-    """Start, end and resident size [KiB] of each part of the compiler's library that nobody has written to."""
+    """Start, end and resident size [KiB] of each part of the library of the compiler that was never written to."""
     found, begun, kib = [], None, 0
     for line in lines:
         name, *rest = line.split()

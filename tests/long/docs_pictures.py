@@ -132,6 +132,7 @@ def idle(scene: Scene) -> None:
 def gone(scene: Scene) -> None:
     """The service was killed: the last picture, because nothing serves afterwards."""
     with scene.tab(1000, 560) as tab:
+        until(tab, "document.querySelector('#stream-front .picture').dataset.images > 2")
         scene.serving.child.kill()
         until(tab, verdict("front") + " === 'no service'")
         tab.wait_for_timeout(2000)
@@ -141,10 +142,10 @@ def gone(scene: Scene) -> None:
 PICTURES: dict[str, Callable[[Scene], None]] = {
     "page-live.png": live,
     "page-phone.png": phone,
-    "page-models.png": models,
     "watch.svg": watch,
     "health.svg": health,
     "page-idle.png": idle,
+    "page-models.png": models,
     "page-gone.png": gone,
 }
 

@@ -4,7 +4,7 @@ import { NodeCard } from "./node.js";
 import { askToken, change, redeemFragment } from "./session.js";
 import { StreamCard } from "./stream.js";
 
-const LOST_MS = 1500; // without a message for so long, the page has lost its connection
+const LOST_MS = 1300; // without a message for so long, the page has lost its connection
 const AGAIN_MS = 6000;
 
 const byId = (id) => document.getElementById(id);
