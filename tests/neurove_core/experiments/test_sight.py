@@ -83,7 +83,7 @@ def test_the_default_model_sees_the_order_of_events_within_a_window(run, tmp_pat
     assert (tmp_path / "sight.png").stat().st_size > 10_000
     drive = results["cases"][0]
     assert drive["as recorded"]["share"] == pytest.approx(1, abs=0.2)
-    assert abs(drive["shuffled"]["share"]) < 0.25
+    assert abs(drive["shuffled"]["share"]) < 0.5  # longer windows keep the order of the windows in them
     assert drive["reversed"]["share"] < -0.4
     assert results["sentence"] in out
 
