@@ -10,6 +10,8 @@ from typing import Any, NamedTuple, ParamSpec, TypeVar, cast
 
 import numba
 
+from neurove_core.dependencies import dependencies
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -37,6 +39,7 @@ def compile_with(function: Callable[P, R], **how: Any) -> Callable[P, R]:
         dispatcher = numba.njit(nogil=True, **how)(function)
     else:
         _tolerate_io_errors(dispatcher)
+        _compare_dependencies(dispatcher)
     _dispatchers.append(dispatcher)
     return cast("Callable[P, R]", dispatcher)
 
@@ -63,6 +66,17 @@ def work() -> Work:
 
 
 _dispatchers: list[Any] = []
+
+
+def _compare_dependencies(dispatcher: Any) -> None:
+    """Let a function be compiled again after a change of what it takes from other modules.
+
+    numba compares only the file that the function is in. Without the attributes that are named here, which are private,
+    it does so still.
+    """
+    with contextlib.suppress(AttributeError):
+        file = dispatcher._cache._cache_file
+        file._source_stamp = (file._source_stamp, dependencies(dispatcher))
 
 
 def _tolerate_io_errors(dispatcher: Any) -> None:
