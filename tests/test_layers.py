@@ -21,8 +21,7 @@ MAX_LINES, MAX_CLASS_LINES = 450, 200
 MAY_IMPORT = {
     # neurove_core, from below
     "neurove_core.config": "",
-    "neurove_core.dependencies": "",
-    "neurove_core.compiled": "dependencies",
+    "neurove_core.compiled": "",
     "neurove_core.files": "",
     "neurove_core.extras": "",
     "neurove_core.tasks": "",
