@@ -11,6 +11,7 @@ from types import CodeType, ModuleType
 from typing import Any, Final, NamedTuple, ParamSpec, TypeVar, cast
 
 import numba
+import numpy as np
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -116,7 +117,7 @@ def _collect(function: Callable[..., Any], found: dict[str, str], seen: set[int]
 def _add(name: str, value: Any, found: dict[str, str], seen: set[int]) -> None:
     if isinstance(value, bool | int | float | complex | str | bytes | tuple):
         found[name] = repr(value)
-    elif hasattr(value, "tobytes"):  # an array, or a number of numpy
+    elif isinstance(value, np.ndarray | np.generic):
         found[name] = f"{value.dtype} {value.shape} {value.tobytes().hex()}"
     elif callable(value):
         module = getattr(value, "__module__", None) or ""
