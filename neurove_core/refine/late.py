@@ -1,4 +1,4 @@
-"""Late: an answer over the ground is of the middle of its span, the estimate of the newest window.
+"""An answer over the ground belongs to the middle of its span; this module brings it to the newest window.
 
 A vehicle that brakes or starts is therefore answered late, by its acceleration times half the span. The acceleration is
 the slope of a line through the newest answers, drawn towards zero by how uncertain it is: spans overlap, so the

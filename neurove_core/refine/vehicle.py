@@ -24,7 +24,7 @@ EVIDENCE: Final[dict[Outcome, float]] = {
     "standing": 0.0,
 }
 """Logarithm of the likelihood ratio of each outcome, vehicle over free camera, by the length of the runs in which it
-comes. A window without events that move says nothing. Measured on own seeds, see decision 131."""
+comes. A window without events that move says nothing. Measured on own seeds, see decision 132."""
 
 START: Final = 3.0
 """Odds of a camera with a known height before anything is seen: its height is a promise of level ground."""
