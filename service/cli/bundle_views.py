@@ -35,6 +35,7 @@ def fields(found: "Bundle", data: bytes) -> dict[str, Any]:
 def lines(about: dict[str, Any]) -> Iterator[str]:
     """The lines that people read, from what `fields` returns and its `signature`."""
     window, grid, net = (about["config"][part] for part in ("window", "canonical", "network"))
+    longer = about["config"].get("scales", ())
     rows = {
         "name": about["name"],
         "release": about["release"],
@@ -48,7 +49,8 @@ def lines(about: dict[str, Any]) -> Iterator[str]:
         "figures": _pairs(about["figures"]),
         "answers": f"{about['linear_unit']} and rad/s",
         "windows": f"{window['duration_us'] / 1e3:g} ms in {window['bins']} bins, settled after "
-        f"{about['config']['settle_windows']}, primed with {about['prime_windows']}",
+        f"{about['config']['settle_windows']}, primed with {about['prime_windows']}"
+        + (f"; for slow motion also {', '.join(map(str, longer))} windows at once" if longer else ""),
         "camera": f"{grid['width']}x{grid['height']}, {grid['hfov_deg']:g} degrees wide"
         + (f", each cell in {grid['subcells'] ** 2} parts" if "subcells" in grid else ""),
         "network": _pairs(net),

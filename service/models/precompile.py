@@ -14,7 +14,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from neurove_core.config import ModelConfig
@@ -63,18 +63,19 @@ def in_child(config: ModelConfig, stop: threading.Event, timeout_s: float = TIME
     return _finish([_start(config, ())], stop, timeout_s)
 
 
-def at_start(config: ModelConfig, free_bytes: int | None) -> None:
+def at_start(config: ModelConfig, free_bytes: Callable[[], int | None]) -> None:
     """Compile all code for the first model of a node in children, where the cache is empty.
 
     What they do not compile, the node compiles by itself.
 
     Args:
         config: of the model.
-        free_bytes: free memory [bytes]; it limits the number of children.
+        free_bytes: says the free memory [bytes], if it is known; it limits the number of children.
     """
     if config.kind != "neurove" or not is_cold():
         return
-    most = len(_GROUPS) if free_bytes is None else free_bytes // CHILD_BYTES
+    free = free_bytes()
+    most = len(_GROUPS) if free is None else free // CHILD_BYTES
     if most and (os.cpu_count() or 1) > 1:
         groups = _GROUPS[min(most, len(_GROUPS)) - 1]
         _finish([_start(config, parts) for parts in groups], threading.Event(), _START_S)

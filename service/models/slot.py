@@ -64,7 +64,7 @@ class ModelSlot:
         first = restart.first(library, model, active, trained_only)
         takes = "up to 30 s at the first start on a machine"
         log.info("compiling the kernels of the model; `ready` follows", model=first.name, takes=takes)
-        precompile.at_start(first.config, free_bytes())
+        precompile.at_start(first.config, free_bytes)
         estimator = Estimator(first, bounds=rules.bounds, refine=rules.refine)
         estimator.warm_up()
         self._shared = SharedPlan(Serving(estimator, 0), previous)

@@ -22,7 +22,7 @@ from neurove_core.config import ModelConfig
 from neurove_core.warming import PARTS, compile_part, is_cold
 from neurove_service.models import precompile
 config = ModelConfig.model_validate_json(sys.argv[1])
-precompile.at_start(config, None)
+precompile.at_start(config, lambda: None)
 before = work().compiled
 for part in PARTS:
     compile_part(part, config)

@@ -313,6 +313,7 @@ def test_a_built_in_model_is_given_by_its_name(run, tmp_path):
     assert json.loads(out)["digest"] == models.find("default").digest
     assert run("scale", "default", "--scales", 2, "--out", "s.safetensors")[0] == 0
     assert bundle.load(tmp_path / "s.safetensors").config.scales == (2,)
+    assert "for slow motion also 2 windows at once" in run("inspect", "s.safetensors")[1]
     code, _, err = run("inspect", "defualt")
     assert code == 2
     assert "defualt" in err

@@ -57,7 +57,9 @@ def still_serves(stream, model):
 
 
 def test_a_bug_before_the_switch_refuses_the_change(node):
-    slot, handlers, guard, stream = node(free_bytes=raises)
+    memory = [lambda: None]  # the newest one answers
+    slot, handlers, guard, stream = node(free_bytes=lambda: memory[-1]())
+    memory.append(raises)
     steps = []
     with pytest.raises(InternalError):
         handlers.activate(ACTIVATE, steps.append)

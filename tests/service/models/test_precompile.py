@@ -41,8 +41,8 @@ def test_a_child_that_cannot_start_or_that_is_stopped_leaves_the_work_to_the_nod
 def test_a_node_with_little_memory_or_another_network_starts_no_children(monkeypatch, capsys):
     monkeypatch.setattr("sys.executable", "/no/such/program")  # a child would be a warning in the log
     monkeypatch.setattr(precompile, "is_cold", lambda: True)
-    precompile.at_start(SMALL, precompile.CHILD_BYTES - 1)
-    precompile.at_start(SMALL.model_copy(update={"kind": "ann"}), None)
+    precompile.at_start(SMALL, lambda: precompile.CHILD_BYTES - 1)
+    precompile.at_start(SMALL.model_copy(update={"kind": "ann"}), lambda: None)
     assert "by the node itself" not in capsys.readouterr().out
 
 
@@ -50,7 +50,7 @@ def test_children_of_a_first_start_that_cannot_start_leave_the_work_to_the_node(
     monkeypatch.setattr("sys.executable", "/no/such/program")
     monkeypatch.setattr(precompile, "is_cold", lambda: True)
     monkeypatch.setattr("os.cpu_count", lambda: 2)
-    precompile.at_start(SMALL, None)
+    precompile.at_start(SMALL, lambda: None)
     assert capsys.readouterr().out.count("code is compiled by the node itself") == 3
 
 
