@@ -9,6 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from neurove_core.inertial import smooth
 from neurove_protocol.imu import Imu
 
 EXTRAPOLATED_US: Final = 10_000
@@ -67,6 +68,24 @@ def rates(samples: Imu, edges_us: NDArray[np.int64], noise_rad_s: float) -> Rate
     mean_square = (means**2).mean(0)
     variance += SCALE**2 * mean_square + MOUNTING_RAD**2 * (mean_square.sum() - mean_square)
     return Rates(means, variance, inside, extrapolated_us)
+
+
+def smooth_rates(samples: Imu, edges_us: NDArray[np.int64], found: Rates) -> Array:
+    """The rates (n, 3) with less noise, where the samples of an equal time before the bins are at hand; see `smooth`.
+
+    Args:
+        samples: see `rates`.
+        edges_us: (n + 1,) the bins [us].
+        found: the rates of these bins.
+    """
+    bins, start_us = edges_us.size - 1, int(edges_us[0])
+    earlier_us = start_us - (edges_us[:0:-1] - start_us)
+    longer = rates(samples, np.concatenate([earlier_us, edges_us]), 0.0)
+    if longer is None or samples.t[0] > earlier_us[0] or not longer.samples:
+        return found.gyro_rad_s
+    first, stop = (int(samples.t.searchsorted(t_us)) for t_us in (earlier_us[0], edges_us[-1]))
+    variance = smooth.noise_of(samples.span(first, stop)) ** 2 / max(1.0, longer.samples / (2 * bins))
+    return smooth.smoothed(longer.gyro_rad_s, variance)[bins:]
 
 
 def turned(samples: Imu, at_us: NDArray[np.int64]) -> Array:

@@ -21,10 +21,10 @@ from neurove_core.inertial.bias import DRIFT_RAD_S, Bias
 CORRELATED: Final = 10.0
 """Windows in a row whose errors are alike."""
 
-EVENTS_RAD_S: Final = 0.05
+EVENTS_RAD_S: Final = 0.03
 """Standard deviation of the angular velocity by the events, in addition to the one that they claim."""
 
-EVENTS_SHARE: Final = 0.3
+EVENTS_SHARE: Final = 0.6
 """The same, as a share of the angular velocity."""
 
 FORCE_M_S2: Final = 1.0

@@ -104,7 +104,7 @@ def aid(state: InertialState, window: Window) -> tuple[Aided, InertialState]:
         return Aided(window.twists, window.covariance, used=False, resting=False), state
     state = _learned_in_motion(state, window, known, found)
     twists = window.twists.copy()
-    twists[:, 3:] = found.gyro_rad_s - state.bias.mean_rad_s
+    twists[:, 3:] = gyro.smooth_rates(known, edges_us, found) - state.bias.mean_rad_s
     covariance = window.covariance
     if covariance is not None:
         covariance = covariance.copy()
