@@ -25,7 +25,7 @@ FEW: Final = 0.25
 
 SPEED: Final = 1.0
 """Sigma of the speed over the height of the camera, where the events are just as many as low activity asks [1/s].
-Streets make so many at 0.3 (own seeds, see decision 135)."""
+Streets make so many at 0.3 (own seeds, see decision 134)."""
 
 RATE: Final = 0.1
 """The same of the angular velocity [rad/s]."""
