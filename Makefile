@@ -10,7 +10,7 @@ JOBS ?= 2
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 
-.PHONY: run test ros2 format picture docs image clean
+.PHONY: run test coverage ros2 format picture docs image clean
 
 run: $(VENV)/warm
 	@echo "with a live page for browsers: $(BIN)/neurove demo --page"
@@ -21,6 +21,9 @@ test: $(VENV)/warm $(VENV)/packages
 	$(BIN)/ruff check .
 	MYPYPATH=$(VENV)/packages $(BIN)/mypy
 	$(BIN)/python tests/wheel.py
+	$(BIN)/pytest --numprocesses $(JOBS) --dist loadgroup --no-loadscope-reorder
+
+coverage: $(VENV)/warm  # the tests with the share of lines and branches that they run; it takes a third more time
 	$(BIN)/pytest --numprocesses $(JOBS) --dist loadgroup --no-loadscope-reorder --cov --cov-report=term
 
 ros2: .venv-ros2/ready  # for the tests with real nodes of ROS 2; without it they are skipped
