@@ -239,7 +239,8 @@ def refine(
     pitch, pitch_sigma = _learned(state, found.pitch, pitch_sigma, 1 / len(used))
     twist, sway = swayed(found.twist, found.pitch, state.sway)
     found, answers = _on_time(found._replace(twist=twist), state.answers, begin_us, end_us, window_us)
-    standing = answered(state.standing, end_us, float(np.linalg.norm(unknowns[:3])))
+    ahead = math.sqrt(found.covariance[2, 2]) / height_m
+    standing = answered(state.standing, end_us, float(np.linalg.norm(unknowns[:3])), ahead)
     walls = np.clip(np.array(state.walls) + unknowns[7:] / height_m, *_WALL_SPAN)
     state = state._replace(
         last=unknowns[:6],

@@ -42,6 +42,9 @@ ACCELERATION_M_S2: Final = 1.5
 TURN_RAD_S2: Final = 0.5
 """The same for its angular velocity."""
 
+SIGMAS: Final = 2.0
+"""A motion that is faster than SLOW by so many sigmas is not slow."""
+
 KEPT_US: Final = 500_000
 """Time after which an answer or a stop says nothing of the present."""
 
@@ -96,8 +99,18 @@ def outweighs(standing: Standing, sigma_m_s: float) -> bool:
     return standing.sigma_m_s is not None and standing.sigma_m_s < sigma_m_s
 
 
-def answered(standing: Standing, end_us: int, speed: float) -> Standing:
-    """What is known of a stop after a motion over the ground was accepted, with this speed over the height [1/s]."""
-    if speed > SLOW:
+def answered(standing: Standing, end_us: int, speed: float, sigma: float) -> Standing:
+    """What is known of a stop after a motion over the ground was accepted.
+
+    Args:
+        standing: what was known before.
+        end_us: end of the window.
+        speed: of the motion over the height [1/s].
+        sigma: of the speed. An answer that may be slow as well does not end what is known: the few events of a vehicle
+            that comes to a stop leave the answer to the network.
+    """
+    if speed - SIGMAS * sigma > SLOW:
         return Standing(few=standing.few)
+    if speed > SLOW:
+        return standing
     return standing._replace(slow_us=end_us, stood_us=standing.stood_us if standing.few else None)

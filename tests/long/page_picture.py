@@ -18,7 +18,7 @@ from playwright.sync_api import Page, sync_playwright
 
 FILE = Path("service/pictures/page.png")
 MOST_BYTES = 250_000
-FULL_S, LONGEST_S = 26.0, 600.0
+FULL_S, LONGEST_S = 23.0, 600.0
 ARGUMENTS = (
     "--no-sandbox",
     "--disable-gpu",

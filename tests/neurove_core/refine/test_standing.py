@@ -16,7 +16,7 @@ def speed(share: float, before: Standing, end_us: int = WINDOW_US, height_m: flo
 
 def slow() -> Standing:
     """After a slow motion over the ground in the window before."""
-    return answered(Standing(), 0, 0.1)
+    return answered(Standing(), 0, 0.1, 0.1)
 
 
 def test_few_events_after_a_slow_motion_are_a_stop():
@@ -28,7 +28,7 @@ def test_few_events_after_a_slow_motion_are_a_stop():
     assert np.linalg.eigvalsh(found.covariance)[0] > 0
 
 
-@pytest.mark.parametrize("before", [Standing(), answered(slow(), 0, 4.0)])
+@pytest.mark.parametrize("before", [Standing(), answered(slow(), 0, 4.0, 0.5)])
 def test_few_events_without_a_slow_motion_before_are_no_stop(before: Standing):
     """Dark ground and lost data look alike."""
     found = hold(NETWORK, COVARIANCE, WINDOW_US, 0.01, 1.0, before)
@@ -81,4 +81,10 @@ def test_a_motion_over_the_ground_counts_where_it_is_more_certain():
 def test_a_motion_that_is_found_ends_the_stop():
     standing = hold(NETWORK, COVARIANCE, WINDOW_US, 0.24, 1.0, slow()).standing
     moving = hold(NETWORK, COVARIANCE, 2 * WINDOW_US, 2.0, 1.0, standing).standing
-    assert speed(2.0, answered(moving, 2 * WINDOW_US, 0.2), 3 * WINDOW_US) == 2.0
+    assert speed(2.0, answered(moving, 2 * WINDOW_US, 0.2, 0.1), 3 * WINDOW_US) == 2.0
+
+
+def test_an_answer_that_may_be_slow_as_well_does_not_end_what_is_known():
+    """The last events of a vehicle that stops leave the motion over the ground to the network."""
+    assert speed(0.01, answered(slow(), 0, 0.9, 0.5)) < 0.01
+    assert speed(0.01, answered(slow(), 0, 0.9, 0.1)) == 2.0
