@@ -23,7 +23,7 @@ test: $(VENV)/warm $(VENV)/packages
 	$(BIN)/python tests/wheel.py
 	$(BIN)/pytest --numprocesses $(JOBS) --dist loadgroup --no-loadscope-reorder
 
-coverage: $(VENV)/warm  # the tests with the share of lines and branches that they run; it takes a third more time
+coverage: $(VENV)/warm  # the tests with the share of lines and branches that they run; it takes half as long again
 	$(BIN)/pytest --numprocesses $(JOBS) --dist loadgroup --no-loadscope-reorder --cov --cov-report=term
 
 ros2: .venv-ros2/ready  # for the tests with real nodes of ROS 2; without it they are skipped
