@@ -27,7 +27,7 @@ EVIDENCE: Final[dict[Outcome, float]] = {
 comes. A window without events that move says nothing. Measured on own seeds, see decision 132."""
 
 START: Final = 3.0
-"""Odds of a camera with a known height before anything is seen: its height is a promise of level ground."""
+"""Odds of a camera with a known height before anything is seen: who gives a height says that the ground is level."""
 
 MOST: Final = 8.0
 """Bound of the odds on both sides."""

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
 from neurove_core.estimator import Estimator
 from neurove_core.models import bundle
-from neurove_protocol import EventPacket, TwistEstimate
+from neurove_protocol import EventPacket, Twist, TwistEstimate
 from neurove_protocol.duty import DrainReply, DrainRequest, DutyReply, DutyRequest, Newest
 from neurove_protocol.events import encode_packet
 from neurove_protocol.keys import Keys
@@ -228,9 +228,42 @@ def check(consumer, driver, stream, model):
     step = taken[0].end_us - taken[0].start_us
     assert starts == list(range(starts[0], starts[0] + step * len(starts), step)), gaps(starts, step)
     assert [one.seq for one in taken] == list(range(taken[0].seq, taken[0].seq + len(taken)))
-    wanted = driver.reference(stream, model)
-    wrong = [one for one in taken if [tuple(row) for row in wanted[one.start_us].twists.tolist()] != list(one.twists)]
+    wrong = compared(consumer, driver, stream, model, step).unequal
     assert not wrong, (len(wrong), wrong[0].seq, wrong[0].node, wrong[0].flags)
+
+
+class Compared(NamedTuple):
+    """What a consumer took of a stream, against a node that never stopped."""
+
+    taken: list  # in the order of arrival
+    doubled: int
+    broken: list  # pairs of starts between which windows are missing, doubled or out of order
+    unequal: list  # estimates with other numbers
+
+    def __str__(self):
+        counts = f"{self.doubled} doubled, {len(self.broken)} gaps, {len(self.unequal)} not equal"
+        return f"{len(self.taken)} windows, {counts}"
+
+    @property
+    def bad(self):
+        return self.doubled + len(self.broken) + len(self.unequal)
+
+
+def compared(consumer, driver, stream, model, window_us):
+    """The windows of a stream, compared bit for bit with those of a node that never stopped."""
+    taken = consumer.taken[stream]
+    starts, wanted = [one.estimate.start_us for one in taken], driver.reference(stream, model)
+    unequal = [one.estimate for one in taken if one.estimate.twists != _twists(wanted[one.estimate.start_us])]
+    return Compared(taken, len(starts) - len(set(starts)), gaps(starts, window_us), unequal)
+
+
+def windows_late(one, driver, window_us):
+    """How long after its last packet an estimate arrived, in windows."""
+    return (one.at_ns - driver.sent_ns[one.estimate.end_us // driver.step_us]) / 1e3 / window_us
+
+
+def _twists(estimate):
+    return tuple(Twist(*row) for row in estimate.twists.tolist())
 
 
 def gaps(starts, step):

@@ -14,9 +14,9 @@ import time
 from pathlib import Path
 
 from tests.live.conftest import client, free_endpoint, start_router, wait_until
-from tests.live.fellows import Consumer, Driver, drain, fellows, follows, gaps, small_model
+from tests.live.fellows import Consumer, Driver, compared, drain, fellows, follows, small_model, windows_late
 from tests.live.relay import Link
-from tests.long.standby import STEP_US, WINDOW_US, twists_of
+from tests.long.standby import WINDOW_US
 
 START_S = 300
 
@@ -94,27 +94,17 @@ def report(consumer, driver, streams, model, after, args):
     """Print the figures; return 0 if no window is doubled, missing or wrong, or published by two nodes."""
     bad = 0
     for stream in streams:
-        got = consumer.taken[stream]
-        starts = [one.estimate.start_us for one in got]
-        wanted = driver.reference(stream, model)
-        doubled, broken = len(starts) - len(set(starts)), gaps(starts, WINDOW_US)
-        wrong = sum(one.estimate.twists != twists_of(wanted[one.estimate.start_us]) for one in got)
+        found = compared(consumer, driver, stream, model, WINDOW_US)
         by_window = collections.defaultdict(set)
-        for one in got + consumer.dropped.get(stream, []):
+        for one in found.taken + consumer.dropped.get(stream, []):
             if any(begin <= one.at_ns <= end for begin, end in after):
                 by_window[one.estimate.start_us].add(one.estimate.node)
         twice = sum(len(names) > 1 for names in by_window.values())
-        if doubled and args.logs:
-            seen = collections.Counter(starts)
-            for one in got:
-                if seen[one.estimate.start_us] > 1:
-                    print(one.at_ns // 1000000, one.estimate.start_us, one.estimate.node, one.estimate.term)
-        print(f"{stream}: {len(got)} windows, {doubled} doubled, {len(broken)} gaps, {wrong} not equal; ", end="")
-        print(f"{twice} published by two nodes after the link was back")
-        parted = [one for one in got if one.at_ns >= after[0][0] - 1e9 * max(args.seconds)]
-        late = max((one.at_ns - driver.sent_ns[one.estimate.end_us // STEP_US]) / 1e3 / WINDOW_US for one in parted)
+        print(f"{stream}: {found}; {twice} published by two nodes after the link was back")
+        parted = [one for one in found.taken if one.at_ns >= after[0][0] - 1e9 * max(args.seconds)]
+        late = max(windows_late(one, driver, WINDOW_US) for one in parted)
         print(f"{stream}: the latest window was {late:.2f} windows late")
-        bad += doubled + len(broken) + wrong + twice
+        bad += found.bad + twice
     return 1 if bad else 0
 
 

@@ -17,8 +17,7 @@ from pathlib import Path
 
 from neurove_service.node.sharing import drawn
 from tests.live.conftest import client, free_endpoint, start_router, wait_until
-from tests.live.fellows import KEYS, Consumer, Driver, Fellow, duty, gaps, small_model
-from tests.long.standby import twists_of
+from tests.live.fellows import KEYS, Consumer, Driver, Fellow, compared, duty, small_model, windows_late
 
 WINDOW_US = 50_000
 START_S = 300
@@ -126,33 +125,29 @@ def report(consumer, driver, streams, model, changes, copies):
         return next((kind for began_ns, kind, _ in reversed(changes) if at_ns >= began_ns), "before")
 
     for stream in streams:
-        got = consumer.taken[stream]
-        starts = [one.estimate.start_us for one in got]
-        wanted = driver.reference(stream, model)
-        doubled, broken = len(starts) - len(set(starts)), gaps(starts, WINDOW_US)
-        wrong = sum(one.estimate.twists != twists_of(wanted[one.estimate.start_us]) for one in got)
+        found = compared(consumer, driver, stream, model, WINDOW_US)
         if stream in killed:
-            anew += len(broken) + wrong
-            bad += doubled
+            anew += len(found.broken) + len(found.unequal)
+            bad += found.doubled
         else:
-            bad += doubled + len(broken) + wrong
-            if doubled or broken or wrong:
-                print(f"{stream}: {doubled} doubled, {len(broken)} gaps, {wrong} not equal")
-            for before, after in broken:
-                (last,) = [one for one in got if one.estimate.start_us == before][:1]
-                (first,) = [one for one in got if one.estimate.start_us == after][:1]
+            bad += found.bad
+            if found.bad:
+                print(f"{stream}: {found}")
+            for before, after in found.broken:
+                last = next(one for one in found.taken if one.estimate.start_us == before)
+                first = next(one for one in found.taken if one.estimate.start_us == after)
                 lost = first.estimate.seq - last.estimate.seq - 1
                 missing = (after - before) // WINDOW_US - 1
                 print(
                     f"  {missing} windows missing from {before + WINDOW_US} us, {lost} of them published; "
                     f"{kind_at(first.at_ns)}, {last.estimate.node} before and {first.estimate.node} after"
                 )
-        for one in got:
-            delay = (one.at_ns - driver.sent_ns[one.estimate.end_us // driver.step_us]) / 1e3 / WINDOW_US
+        for one in found.taken:
+            delay = windows_late(one, driver, WINDOW_US)
             usual.append(delay)
             if stream not in killed:
                 late.setdefault(kind_at(one.at_ns), []).append(delay)
-        everything = sorted(got + consumer.dropped.get(stream, []), key=lambda one: one.at_ns)
+        everything = sorted(found.taken + consumer.dropped.get(stream, []), key=lambda one: one.at_ns)
         for at_ns, length in overlaps(everything):
             twice.setdefault(kind_at(at_ns), []).append(length)
     total = sum(len(consumer.taken[one]) for one in streams)

@@ -1,8 +1,9 @@
-"""Drains and kills of two nodes under load: `python -m tests.long.standby [--drains 50] [--kills 50] [--streams 2]`.
+"""Changes of two nodes under load: `python -m tests.long.standby [--drains 50] [--kills 50] [--hangs 5] [--streams 2]`.
 
-Two nodes serve streams of 50 windows a second each. The node that answers is drained, then killed (-9), again and
-again; it comes back and follows. At the end the estimates that a consumer took are compared with a run without kills.
-It reports doubled and missing windows, wrong numbers, and how late the latest window of each change was, in windows.
+Two nodes serve streams of 50 windows a second each. The node that answers is drained, killed (-9) or stopped (SIGSTOP),
+again and again; it comes back and follows. At the end the estimates that a consumer took are compared with a run
+without changes. The command reports doubled and missing windows, wrong numbers, and how late the latest window of each
+change was, in windows.
 """
 
 import argparse
@@ -12,9 +13,8 @@ import tempfile
 import time
 from pathlib import Path
 
-from neurove_protocol import Twist
 from tests.live.conftest import START_S, client, free_endpoint, start_router, wait_until
-from tests.live.fellows import STEP_US, Consumer, Driver, drain, fellows, follows, gaps, small_model
+from tests.live.fellows import Consumer, Driver, compared, drain, fellows, follows, small_model, windows_late
 
 WINDOW_US = 20_000
 AROUND_NS = 1_000_000_000
@@ -88,28 +88,18 @@ def run(transport, nodes, consumer, streams, args):
     return changes
 
 
-def twists_of(estimate):
-    return tuple(Twist(*row) for row in estimate.twists.tolist())
-
-
 def report(consumer, driver, streams, model, changes):
     """Print the figures; return 0 if no window is doubled, missing, out of order or wrong."""
     bad, late, usual = 0, {}, []
     for stream in streams:
-        got = consumer.taken[stream]
-        starts = [one.estimate.start_us for one in got]
-        doubled, broken = len(starts) - len(set(starts)), gaps(starts, WINDOW_US)
-        wanted = driver.reference(stream, model)
-        unequal = [one.estimate for one in got if one.estimate.twists != twists_of(wanted[one.estimate.start_us])]
-        wrong = len(unequal)
-        for one in unequal[:1]:
+        found = compared(consumer, driver, stream, model, WINDOW_US)
+        for one in found.unequal[:1]:
             print(f"{stream}: the first that is not equal begins at {one.start_us} us, from {one.node}: {one.flags}")
         again = consumer.dropped.get(stream, [])
-        print(f"{stream}: {len(got)} windows, {doubled} doubled, {len(broken)} gaps, {wrong} not equal; ", end="")
-        print(f"{len(again)} of an earlier term or published twice, dropped by the rule")
-        bad += doubled + len(broken) + wrong
-        for one in got:
-            delay = (one.at_ns - driver.sent_ns[one.estimate.end_us // STEP_US]) / 1e3 / WINDOW_US
+        print(f"{stream}: {found}; {len(again)} of an earlier term or published twice, dropped by the rule")
+        bad += found.bad
+        for one in found.taken:
+            delay = windows_late(one, driver, WINDOW_US)
             usual.append(delay)
             for index, (at_ns, kind) in enumerate(changes):
                 if 0 <= one.at_ns - at_ns < AROUND_NS:
