@@ -42,9 +42,9 @@ def interleaved(
     warm_up: int = 2,
     clock: Callable[[], float] = time.thread_time,
 ) -> dict[str, float]:
-    """Median time [ms] of each function, by default the CPU time of this thread. Every round runs all in turn, so that a busy machine slows all alike.
+    """Median time [ms] of each function, by default the CPU time of this thread.
 
-    Each round has another order, the same in every run, because a function that fills the caches slows the next one.
+    Every round runs all in turn, so that a busy machine slows all alike. Each round has another order, the same in every run, because a function that fills the caches slows the next one.
 
     Args:
         runs: the functions to time, by name.
