@@ -238,7 +238,7 @@ class Sync:
                 if asked.after_us is not None and lane.state.end_us < asked.after_us:
                     self._asked.append(asked)
                     continue
-                asked.found.append(Found(lane.state.end_us, carried.encode(lane.state)))
+                asked.found.append(Found(lane.state.end_us, carried.encode(lane.state, stream.inertial.learned)))
             asked.done.set()
 
     def is_used(self, stream: Stream) -> bool:
@@ -274,10 +274,12 @@ class Sync:
         if reply is None or reply.digest != lane.estimator.bundle.digest:
             return None
         try:
-            lane.adopt(reply.end_us, carried.decode(reply.data, lane.state))
+            found = carried.decode(reply.data, lane.state)
         except NeuroVEError as error:
             log.warning("state refused", stream=self._stream, leader=reply.node, why=error.message)
             return None
+        lane.adopt(reply.end_us, found)
+        stream.inertial.adopt(reply.end_us, found.inertial)
         log.info("state taken", stream=self._stream, leader=reply.node)
         self._end_us = reply.end_us
         return reply.end_us
