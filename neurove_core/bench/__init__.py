@@ -44,7 +44,8 @@ def interleaved(
 ) -> dict[str, float]:
     """Median time [ms] of each function, by default the CPU time of this thread.
 
-    Every round runs all in turn, so that a busy machine slows all alike. Each round has another order, the same in every run, because a function that fills the caches slows the next one.
+    Every round runs all in turn, so that a busy machine slows all alike. Each round has another order, the
+    same in every run, because a function that fills the caches slows the next one.
 
     Args:
         runs: the functions to time, by name.
