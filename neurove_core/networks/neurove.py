@@ -13,7 +13,7 @@ from neurove_core.networks.state import is_finite
 from neurove_core.spiking.alif import diffuse
 from neurove_core.spiking.aslstm import ASLSTM, ASLSTMState
 from neurove_core.spiking.lif import LIFParams, LIFState, lif_scan
-from neurove_core.spiking.readout import readout_step
+from neurove_core.spiking.readout import readout_scan
 
 
 class NetworkState(NamedTuple):
@@ -168,10 +168,6 @@ class NeuroVE(nn.Module):
             scanned, last = layer(x, cell)
             x = diffuse(scanned.s, scanned.v, self.d_space[index])
             cells.append(last)
-        y, kappa, answers = state.readout, torch.sigmoid(self.kappa_logit), []
-        weight, bias = self.outputs()
-        for z in x:
-            y = readout_step(z, y, weight, bias, kappa)
-            answers.append(y)
-        twists = torch.stack(answers)[..., : 6 * self.bins].reshape(steps, batch, self.bins, 6)
+        answers, y = readout_scan(x, state.readout, *self.outputs(), torch.sigmoid(self.kappa_logit))
+        twists = answers[..., : 6 * self.bins].reshape(steps, batch, self.bins, 6)
         return twists, NetworkState(tuple(membranes), tuple(cells), y)

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
+from neurove_core.spiking.fused import aslstm as fused
 from neurove_core.spiking.layers import (
     drawn_weights,
     require,
@@ -23,6 +24,7 @@ from neurove_core.spiking.layers import (
     require_threshold,
     scan_of,
 )
+from neurove_core.spiking.plain import is_plain
 from neurove_core.spiking.surrogate import Surrogate, spike
 
 
@@ -125,9 +127,16 @@ class ASLSTM(nn.Module):
     def forward(self, x: Tensor, state: ASLSTMState) -> tuple[ASLSTMState, ASLSTMState]:
         """Scan a sequence: x (T, B, I) to the states of all steps, each field (T, B, N), and the last one.
 
+        Where gradients are recorded on a CPU, this is one compiled pass (fused/aslstm.py).
+
         Raises:
             InvalidField: x is not a sequence of this width, or the state has another batch size.
         """
         params = self.params()
         require_sequence("ASLSTM", x, params.w_x.shape[1], state, self.hidden)
-        return scan_of(aslstm_step, x, state, params)
+        weights = params.w_x, params.w_v, params.b, params.d_time
+        if is_plain() or not fused.fits(x, *state, *weights):
+            return scan_of(aslstm_step, x, state, params)
+        alpha, *spike = self._constants
+        steps = ASLSTMState(*fused.scan(x, state, weights, alpha, tuple(spike)))
+        return steps, ASLSTMState(*(field[-1] for field in steps))

@@ -11,7 +11,9 @@ import math
 import torch
 from torch import Tensor, nn
 
+from neurove_core.spiking.fused import aslstm as fused
 from neurove_core.spiking.layers import require, require_sequence, require_shape_of_layer
+from neurove_core.spiking.plain import is_plain
 
 
 def readout_step(z: Tensor, y: Tensor, weight: Tensor, bias: Tensor, kappa: Tensor | float) -> Tensor:
@@ -31,6 +33,22 @@ def readout_step(z: Tensor, y: Tensor, weight: Tensor, bias: Tensor, kappa: Tens
         potential of this step (B, K).
     """
     return kappa * y + torch.nn.functional.linear(z, weight, bias)
+
+
+def readout_scan(z: Tensor, y: Tensor, weight: Tensor, bias: Tensor, kappa: Tensor) -> tuple[Tensor, Tensor]:
+    """The output neurons over a sequence z (T, B, N): potentials of all steps (T, B, K), and the last one.
+
+    Where gradients are recorded on a CPU, this is one compiled pass (fused/aslstm.py); otherwise, or inside `plain()`,
+    it is one `readout_step` after the other. Potentials are equal bit for bit.
+    """
+    if not is_plain() and fused.fits(z, y, weight, bias, kappa):
+        answers = fused.leaky_sums(fused.applied(z, weight, bias), y, kappa)
+        return answers, answers[-1]
+    steps = []
+    for z_t in z:
+        y = readout_step(z_t, y, weight, bias, kappa)
+        steps.append(y)
+    return torch.stack(steps), y
 
 
 class Readout(nn.Module):
@@ -70,8 +88,4 @@ class Readout(nn.Module):
             InvalidField: z is not a sequence of this width, or y has another batch size.
         """
         require_sequence("Readout", z, self.f.in_features, (y,), self.f.out_features)
-        kappa, answers = self.kappa, []
-        for z_t in z:
-            y = readout_step(z_t, y, self.f.weight, self.f.bias, kappa)
-            answers.append(y)
-        return torch.stack(answers), y
+        return readout_scan(z, y, self.f.weight, self.f.bias, self.kappa)

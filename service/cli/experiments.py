@@ -133,6 +133,10 @@ def reproduce_motion(args: argparse.Namespace) -> int:
     from neurove_core.experiments.motion import run, sets
 
     groups = args.sets.split(",") if args.sets else (*sets.GROUPS, sets.REAL)
+    if args.model in (*sets.GROUPS, sets.REAL) and not Path(args.model).exists():
+        meant = ",".join([*filter(None, groups if args.sets else ()), args.model])
+        bound = f"{args.model} is the name of a set, not a model; sets are separated by commas: --sets {meant}"
+        raise InvalidField("reproduce motion", "--sets", " ".join(filter(None, (args.sets, args.model))), bound)
     if args.recordings and not args.recordings.is_dir():
         raise InvalidField("reproduce", "--recordings", str(args.recordings), "it is not a folder")
     for folder in (args.out, args.data):

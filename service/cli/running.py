@@ -82,7 +82,8 @@ def drive(args: argparse.Namespace) -> int:
     config = client_config(args)
     recording = with_axes(open_source(args.source, args.sensor, args.topic, args.time_unit), args.imu_axes)
     lens = lens_of(recording, args.calibration, args.height)
-    with _connected(args, config, stop, lambda to, keys: _player(args, recording, lens, to, keys)) as player:
+    replayed = _replayed(args, recording)
+    with _connected(args, config, stop, lambda to, keys: _player(args, recording, replayed, lens, to, keys)) as player:
         duration_s = math.inf if args.seconds is None else args.seconds
         how = {"speed": args.speed, "loop": args.loop, "duration_s": duration_s}
         sent = player.play(stop, **how, **({} if args.json else {"on_behind": _tell_behind}))
@@ -188,24 +189,40 @@ def _listened_to(player: Any, wait: Wait, stop: threading.Event) -> bool:
     return player.wait_for_listener(wait.left_s, stop) or stop.is_set()
 
 
-def _player(args: argparse.Namespace, recording: Any, lens: Any, transport: Any, keys: Any) -> Any:
-    """A replay for a packet log, a driver for any other recording; both have the same methods."""
+def _replayed(args: argparse.Namespace, recording: Any) -> bool:
+    """Whether the packets of a packet log are sent as they were published; its other flags must fit.
+
+    Raises:
+        InvalidField: a flag cannot be used with a replay.
+    """
     from neurove_core.io.formats.packet_log.reader import McapRecording
-    from neurove_service.clients.driver import Driver
-    from neurove_service.clients.replay import Replay
 
     if (
         not isinstance(recording, McapRecording) or args.stream
     ):  # the name is in every packet, so another name means new packets
-        return Driver(recording, args.stream or _STREAM, transport, keys, lens)
+        return False
     if args.loop:
         why = "a replay would repeat sequence numbers and times; give --stream NAME to encode the events again"
         raise InvalidField("drive", "--loop", True, why)
-    given = args.calibration is not None or args.height is not None
-    if given and not args.topic and len(recording.all_streams) > 1:
+    if _gives_lens(args) and not args.topic and len(recording.all_streams) > 1:
         why = f"this packet log has the streams {', '.join(recording.all_streams)}: choose one with --topic"
         raise InvalidField("drive", "--calibration, --height", args.calibration or args.height, why)
-    return Replay(recording, recording.stream if args.topic else None, transport, keys, lens if given else None)
+    return True
+
+
+def _gives_lens(args: argparse.Namespace) -> bool:
+    return args.calibration is not None or args.height is not None
+
+
+def _player(args: argparse.Namespace, recording: Any, replayed: bool, lens: Any, transport: Any, keys: Any) -> Any:
+    """A replay for a packet log, a driver for any other recording; both have the same methods."""
+    from neurove_service.clients.driver import Driver
+    from neurove_service.clients.replay import Replay
+
+    if not replayed:
+        return Driver(recording, args.stream or _STREAM, transport, keys, lens)
+    stream = recording.stream if args.topic else None
+    return Replay(recording, stream, transport, keys, lens if _gives_lens(args) else None)
 
 
 def demo(args: argparse.Namespace) -> int:

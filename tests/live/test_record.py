@@ -13,7 +13,7 @@ from neurove_protocol.imu import decode_imu
 from neurove_protocol.keys import Keys
 from neurove_service.clients.recorder import Recorder
 from tests.builders import make_packets
-from tests.live.conftest import client, running, wait_until
+from tests.live.conftest import client, free_endpoint, running, wait_until
 
 pytestmark = pytest.mark.live
 
@@ -100,9 +100,17 @@ def test_a_replay_keeps_all_streams_or_the_selected_one_and_encodes_again_under_
         wait_until(lambda: len(heard.payloads) > 24)
         assert {stream for stream, _ in heard.payloads} == {"front"}
         assert sum(decode_packet(payload).events.n for _, payload in heard.payloads) == 25 * 60
-    looped = run("drive", file, "--loop", "--connect", router)
+
+
+def test_a_replay_that_cannot_be_repeated_is_refused_without_a_service(tmp_path, run):
+    two_streams(tmp_path / "two.mcap")
+    nowhere = ("--connect", free_endpoint(), "--wait", "0.1")
+    looped = run("drive", tmp_path / "two.mcap", "--loop", *nowhere)
     assert looped.code == 2
     assert "give --stream NAME" in looped.err
+    ambiguous = run("drive", tmp_path / "two.mcap", "--height", "1", *nowhere)
+    assert ambiguous.code == 2
+    assert "choose one with --topic" in ambiguous.err
 
 
 def test_a_recorder_counts_missing_packets_and_keeps_unreadable_ones(router, tmp_path):

@@ -107,3 +107,18 @@ def test_an_unknown_set_is_refused_before_anything_is_simulated(run, tmp_path):
     assert code == EXIT_WRONG_USAGE
     assert "--sets='swimming': known are forward" in err
     assert not list((tmp_path / "data").glob("*.npy"))
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        (("--sets", "slow", "forward"), "--sets slow,forward"),
+        (("--sets", "slow,", "forward"), "--sets slow,forward"),
+        (("forward",), "--sets forward"),
+    ],
+)
+def test_the_name_of_a_set_is_not_taken_for_a_model(run, tmp_path, words, meant):
+    code, _, err = run("reproduce", "motion", *words, "--data", tmp_path / "data")
+    assert code == EXIT_WRONG_USAGE
+    assert "forward is the name of a set, not a model" in err
+    assert err.strip().endswith(meant)
