@@ -13,8 +13,7 @@ from typing import Any, Final
 import numba
 import numpy as np
 
-from neurove_core import ahead
-from neurove_core.compiled import folder_of, work
+from neurove_core.compiled import ahead, folder_of, work
 from neurove_core.config import ModelConfig
 from neurove_core.engine.fallback import vectors_work
 from neurove_core.geometry.tables import TABLES

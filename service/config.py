@@ -92,7 +92,7 @@ _OF_KUBERNETES = re.compile(
 )
 """What follows NEUROVE_ in the variables that Kubernetes sets in every pod for a service whose name begins so."""
 _OF_ENGINE = ("form", "ahead")
-"""The same of variables that neurove_core reads: engine/choice.py and ahead.py."""
+"""The same of variables that neurove_core reads: engine/choice.py and compiled/ahead.py."""
 
 
 class _Settings(BaseSettings):

@@ -21,8 +21,7 @@ MAX_LINES, MAX_CLASS_LINES = 450, 200
 MAY_IMPORT = {
     # neurove_core, from below
     "neurove_core.config": "",
-    "neurove_core.ahead": "",
-    "neurove_core.compiled": "ahead",
+    "neurove_core.compiled": "",
     "neurove_core.files": "",
     "neurove_core.extras": "",
     "neurove_core.tasks": "",
@@ -38,7 +37,7 @@ MAY_IMPORT = {
     "neurove_core.refine": "compiled geometry ingest",
     "neurove_core.inertial": "",
     "neurove_core.running": "extras ingest networks engine models",
-    "neurove_core.warming": "ahead compiled config geometry ingest networks engine models refine running",
+    "neurove_core.warming": "compiled config geometry ingest networks engine models refine running",
     "neurove_core.estimator": "geometry ingest networks models io refine running timescales warming",
     "neurove_core.self_test": "config models estimator",
     "neurove_core.aided": "estimator inertial",

@@ -48,7 +48,8 @@ def _brings_code() -> bool:
     """Whether the installation has compiled code for this processor, of the present sources."""
     if absent("serve"):
         return False
-    from neurove_core import ahead, models
+    from neurove_core import models
+    from neurove_core.compiled import ahead
     from neurove_core.warming import complete_for
 
     return ahead.complete_for() == complete_for(models.find(models.DEFAULT).config)

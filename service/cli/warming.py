@@ -102,7 +102,7 @@ def _ahead(args: argparse.Namespace) -> int:
 
     The second process loads only what Python code calls, not the functions that these call.
     """
-    from neurove_core.ahead import FOLDER, SWITCH
+    from neurove_core.compiled.ahead import FOLDER, SWITCH
 
     if args.out is not None:
         raise InvalidField("warm-up", "--out", str(args.out), "absent with --ahead, which writes into the package")

@@ -11,7 +11,7 @@ from neurove_service.cli.processors import PROCESSORS, missing
 CALLER = """
 import sys
 from pathlib import Path
-from neurove_core import ahead
+from neurove_core.compiled import ahead
 ahead.FOLDER = Path(sys.argv[1])
 from neurove_core.compiled import compiled, work, write_ahead
 from called import STEP, twice

@@ -1,6 +1,6 @@
 """Compiled code that an installation brings: a second place where a function looks before it is compiled.
 
-`neurove warm-up --ahead` writes the folder `ahead` of this package: for a wheel, an image, or all users of a machine.
+`neurove warm-up --ahead` writes the folder `neurove_core/ahead`: for a wheel, an image, or all users of a machine.
 A file of code is found by the digest of all that it was made of, so code of other sources or of other versions of
 Python, numba or llvmlite is never found. It needs no path, time or owner to be the same.
 
@@ -27,7 +27,7 @@ import numpy as np
 
 log = logging.getLogger(__name__)
 
-FOLDER: Final = Path(__file__).parent / "ahead"
+FOLDER: Final = Path(__file__).parents[1] / "ahead"
 """Where the code lies: one folder for each processor, with the file `processor.json`."""
 
 SWITCH: Final = "NEUROVE_AHEAD"

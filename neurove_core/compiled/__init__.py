@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple, ParamSpec, TypeVar, cast
 import numba
 import numpy as np
 
-from neurove_core import ahead
+from neurove_core.compiled import ahead
 
 P = ParamSpec("P")
 R = TypeVar("R")
