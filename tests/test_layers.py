@@ -41,7 +41,7 @@ MAY_IMPORT = {
     "neurove_core.estimator": "geometry ingest networks models io refine running timescales warming",
     "neurove_core.self_test": "config models estimator",
     "neurove_core.aided": "estimator inertial",
-    "neurove_core.carried": "spiking networks refine estimator timescales",
+    "neurove_core.carried": "spiking networks refine inertial estimator timescales",
     "neurove_core.io": "files extras figures geometry",
     "neurove_core.io.formats": "compiled files extras geometry io",
     "neurove_core.sim": "compiled config figures geometry io io.formats",

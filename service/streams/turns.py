@@ -1,8 +1,9 @@
-"""Turns: how many workers of a node work at once, each in the order in which it asked."""
+"""Turns: how many workers of a node work at once, each in the order in which it asked; workers that answer go first."""
 
+import contextlib
 import threading
 from collections import deque
-from types import TracebackType
+from collections.abc import Iterator
 
 
 class Turns:
@@ -15,29 +16,43 @@ class Turns:
     def __init__(self, at_once: int) -> None:
         self._free = max(1, at_once)
         self._waiting: deque[threading.Lock] = deque()
+        self._last: deque[threading.Lock] = deque()
         self._lock = threading.Lock()
 
     @property
     def waiting(self) -> int:
         """Number of workers that wait for their turn."""
-        return len(self._waiting)
+        return len(self._waiting) + len(self._last)
 
-    def __enter__(self) -> None:
+    @contextlib.contextmanager
+    def turn(self, *, last: bool = False) -> Iterator[None]:
+        """A turn of one worker.
+
+        Args:
+            last: whether the workers that ask without it go first.
+        """
+        self._begin(self._last if last else self._waiting)
+        try:
+            yield
+        finally:
+            self._end()
+
+    def _begin(self, queue: deque[threading.Lock]) -> None:
         with self._lock:
-            if self._free and not self._waiting:
+            if self._free and not self.waiting:
                 self._free -= 1
                 return
             mine = threading.Lock()
             mine.acquire()
-            self._waiting.append(mine)
+            queue.append(mine)
         mine.acquire()  # until the turn is handed over
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def _end(self) -> None:
         with self._lock:
             if self._waiting:
                 self._waiting.popleft().release()
+            elif self._last:
+                self._last.popleft().release()
             else:
                 self._free += 1
 

@@ -242,7 +242,7 @@ class StreamWorker:
             pause_s = max(0.0, self._pause_until - time.monotonic())
             self._take(self.duty.wait_s(pause_s if self.stream.lanes.has_backlog else _IDLE_BEAT_S))
         if self._pending:
-            with self._slots.serving:
+            with self._slots.serving.turn(last=self.duty.can_wait):
                 self._work_next(outlet)
         elif self.stream.lanes.has_backlog:
             self._pause_until = time.monotonic() + self._run_standby()

@@ -9,10 +9,10 @@ def test_turns_are_given_in_the_order_in_which_they_were_asked_for():
     threads = []
 
     def work(name):
-        with turns:
+        with turns.turn():
             order.append(name)
 
-    with turns:
+    with turns.turn():
         for name in range(5):
             threads.append(threading.Thread(target=work, args=(name,)))
             threads[-1].start()
@@ -28,7 +28,7 @@ def test_no_more_workers_than_allowed_have_their_turn_at_once():
 
     def work():
         for _ in range(200):
-            with turns:
+            with turns.turn():
                 with lock:
                     counts["now"] += 1
                     counts["most"] = max(counts.values())
@@ -47,9 +47,26 @@ def test_no_more_workers_than_allowed_have_their_turn_at_once():
 def test_an_error_gives_the_turn_back():
     turns = Turns(1)
     try:
-        with turns:
+        with turns.turn():
             raise RuntimeError("planted")
     except RuntimeError:
         pass
-    with turns:
+    with turns.turn():
         pass
+
+
+def test_a_worker_that_asks_for_the_last_turn_waits_for_those_that_came_later():
+    turns, order, threads = Turns(1), [], []
+
+    def work(name, last):
+        with turns.turn(last=last):
+            order.append(name)
+
+    with turns.turn():
+        for name, last in (("follows", True), ("answers", False), ("answers too", False)):
+            threads.append(threading.Thread(target=work, args=(name, last)))
+            threads[-1].start()
+            wait_until(lambda: turns.waiting == len(threads))
+    for thread in threads:
+        thread.join(60)
+    assert order == ["answers", "answers too", "follows"]
