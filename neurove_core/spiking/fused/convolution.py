@@ -71,7 +71,7 @@ class _Convolution(torch.autograd.Function):
         outputs = weight.shape[0]
         by_input = weight.detach().permute(2, 3, 1, 0).contiguous().numpy().reshape(9 * channels, outputs)
         currents = np.empty((maps, (rows + 1) // 2, (columns + 1) // 2, outputs), np.float32)
-        _convolve(*ctx.fired, cells.shape, by_input, currents.reshape(-1, outputs))
+        _convolve(indices[:total], starts, cells.shape, by_input, currents.reshape(-1, outputs))
         return torch.from_numpy(currents).permute(0, 3, 1, 2)
 
     @staticmethod
@@ -89,7 +89,8 @@ class _Convolution(torch.autograd.Function):
             outputs = len(weight)
             sums = np.zeros((3, 3, channels, outputs), np.float32)
             given = by_currents.permute(0, 2, 3, 1).reshape(-1, outputs).numpy()
-            _add_gradients(*ctx.fired, (maps, rows, columns, channels), given, sums.reshape(-1, outputs))
+            indices, starts = ctx.fired
+            _add_gradients(indices, starts, (maps, rows, columns, channels), given, sums.reshape(-1, outputs))
             by_weight = torch.from_numpy(sums).permute(3, 2, 0, 1)
         return by_spikes, by_weight
 
