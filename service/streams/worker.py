@@ -170,14 +170,9 @@ class StreamWorker:
     ) -> None:
         self.stream, self.duty = stream, open_duty(inbox.wake)
         self._inbox, self.beat_ns = inbox, time.monotonic_ns()
-        self._open_outlet, self._limits, self._slots, self._guard = (
-            open_outlet,
-            limits,
-            slots or Slots(),
-            guard or Guard(),
-        )
-        self._taken_ns = 0  # when the queue was last emptied
-        self._pause_until = 0.0  # a time, not a duration: packets that arrive in a pause must not extend it
+        self._open_outlet, self._limits = open_outlet, limits
+        self._slots, self._guard = slots or Slots(), guard or Guard()
+        self._pause_until, self._taken_ns = 0.0, 0  # times: packets that arrive in a pause must not extend it
         self._pending: deque[Sample] = deque()  # taken out of the queue, not yet processed
         self._cameras = Cameras(stream, inbox.wake, self._guard)
         self._overload, self._stopping = Overload(inbox.max_age_s), threading.Event()
