@@ -48,7 +48,7 @@ MAY_IMPORT = {
     "neurove_core.live": "extras io io.formats",
     "neurove_core.sources": "io io.formats live sim",
     "neurove_core.series": "files io.formats sources tasks",
-    "neurove_core.evaluation": "compiled figures geometry networks models estimator inertial aided io sources",
+    "neurove_core.evaluation": "compiled figures geometry ingest networks models estimator inertial aided io sources",
     "neurove_core.training": (
         "config files extras figures geometry ingest networks "
         "engine models estimator self_test io io.formats sim sources tasks timescales"

@@ -31,6 +31,7 @@ ALL = (
     "processes",
     "metrics",
     "narrow",
+    "gpu",
 )
 
 FIGURES = "figures"
@@ -75,7 +76,7 @@ def bench(args: argparse.Namespace) -> int:
 
 
 def _rows(name: str, args: argparse.Namespace, missing: list[str]) -> Iterator["Row"]:
-    from neurove_core.bench import ingest, processes, refinement, served, simulate, sine, window
+    from neurove_core.bench import device, ingest, processes, refinement, served, simulate, sine, window
     from neurove_service.cli import bench_metrics
     from neurove_service.clients import bench_wire
 
@@ -95,6 +96,7 @@ def _rows(name: str, args: argparse.Namespace, missing: list[str]) -> Iterator["
         "processes": lambda: processes.processes(_rounds(args, 7), quick=args.quick),
         "metrics": lambda: bench_metrics.metrics(_rounds(args, 11), quick=args.quick),
         "narrow": lambda: _narrow(args, missing),
+        "gpu": lambda: device.gpu(_rounds(args, 15), missing, quick=args.quick),
     }
     yield from run[name]()
 
