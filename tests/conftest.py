@@ -16,6 +16,7 @@ if installed("torch"):  # tests.long.pythons also runs what needs none
     import torch
 
     torch.set_num_threads(1)
+os.environ.setdefault("NEUROVE_AHEAD", "off")  # tests count what is compiled, also where `make wheel` has run
 
 
 def pytest_collection_modifyitems(items):
