@@ -369,14 +369,17 @@ def _turned(estimate: WindowEstimate, found: RotationFound, velocity: refining.V
 
 
 def _with_errors(estimate: WindowEstimate, found: RotationFound, height_m: float) -> WindowEstimate:
-    """An estimate without the ground, whose covariance has the terms of `refine.errors`."""
+    """An estimate without the ground, with the terms of `refine.errors`, and less of a speed that is not seen."""
     if estimate.covariance is None:
         return estimate
+    twists = standing.towards_zero(estimate.twists, estimate.covariance)
     covariance = estimate.covariance.copy()
     if found.errors is not None:
         covariance[3:, 3:] = (found.errors + found.errors.T) / 2
-    rate_rad_s = float(np.linalg.norm(estimate.twists.mean(axis=0)[3:]))
-    return estimate._replace(covariance=errors.of_unknown_depth(covariance, found.shift, rate_rad_s, height_m))
+    rate_rad_s = float(np.linalg.norm(twists.mean(axis=0)[3:]))
+    return estimate._replace(
+        twists=twists, covariance=errors.of_unknown_depth(covariance, found.shift, rate_rad_s, height_m)
+    )
 
 
 def _over_ground(
