@@ -235,8 +235,8 @@ class Estimator:
         state = state._replace(stages=found.state, ground=state.ground if found.level else GroundState())
         estimate = _turned(estimate, found.turn, found.velocity)
         answer, state = _over_ground(window, estimate, state, found)
-        if answer is estimate and found.velocity is None:
-            answer = _with_errors(estimate, found.turn, given.height_m)
+        if answer is estimate:
+            answer = _with_errors(estimate, found, given.height_m)
         return answer._replace(uncertain=self.is_uncertain(answer.twists, answer.covariance)), state
 
     def is_uncertain(self, twists: NDArray[np.float64], covariance: NDArray[np.float64] | None) -> bool:
@@ -368,18 +368,18 @@ def _turned(estimate: WindowEstimate, found: RotationFound, velocity: refining.V
     return estimate._replace(twists=twists, covariance=covariance, source="refined")
 
 
-def _with_errors(estimate: WindowEstimate, found: RotationFound, height_m: float) -> WindowEstimate:
+def _with_errors(estimate: WindowEstimate, found: refining.Stages, height_m: float) -> WindowEstimate:
     """An estimate without the ground, with the terms of `refine.errors`, and less of a speed that is not seen."""
     if estimate.covariance is None:
         return estimate
-    twists = standing.towards_zero(estimate.twists, estimate.covariance)
-    covariance = estimate.covariance.copy()
-    if found.errors is not None:
-        covariance[3:, 3:] = (found.errors + found.errors.T) / 2
-    rate_rad_s = float(np.linalg.norm(twists.mean(axis=0)[3:]))
-    return estimate._replace(
-        twists=twists, covariance=errors.of_unknown_depth(covariance, found.shift, rate_rad_s, height_m)
-    )
+    twists, covariance, turn = estimate.twists, estimate.covariance.copy(), found.turn
+    if turn.errors is not None:
+        covariance[3:, 3:] = (turn.errors + turn.errors.T) / 2
+    if found.velocity is None:
+        twists = standing.towards_zero(twists, estimate.covariance)
+        rate_rad_s = float(np.linalg.norm(twists.mean(axis=0)[3:]))
+        covariance = errors.of_unknown_depth(covariance, turn.shift, rate_rad_s, height_m)
+    return estimate._replace(twists=twists, covariance=covariance)
 
 
 def _over_ground(
@@ -414,14 +414,14 @@ def _over_ground(
     if answer.outcome not in ("accepted", "turning") or answer.motion is None:
         return estimate, state
     twist, after = answer.motion.twist, answer.state
-    covariance = errors.of_ground(twist, answer.motion.covariance, after.tilt, after.pitch_sigma, height_m)
+    seen = after.tilt, after.pitch_sigma, height_m, state.stages.odds
+    covariance = errors.of_ground(twist, answer.motion.covariance, *seen)
     twists = np.tile(twist, (len(estimate.twists), 1))
     if answer.outcome == "turning":
         rate = Rate(twist[3:], covariance[3:, 3:])
         twists, covariance = _with_rate(estimate.twists, estimate.covariance, rate, np.zeros(3))
     if state.stages.is_free:
-        before = estimate if found.velocity is not None else _with_errors(estimate, found.turn, height_m)
-        twists, covariance = _without_rate(twists, covariance, before)
+        twists, covariance = _without_rate(twists, covariance, _with_errors(estimate, found, height_m))
     return estimate._replace(twists=twists, covariance=covariance, source="refined"), state
 
 

@@ -19,6 +19,7 @@ class Row(NamedTuple):
         float | None
     )  # the limit of this machine, measured in the same run, over our time; None without a limit
     equal: bool | None  # whether the results agree; None if the peer computes another result by design
+    deviation: float | None = None  # of a peer that rounds otherwise: its result over ours, minus 1
 
 
 def rows(name: str, times: dict[str, float], equal: dict[str, bool | None], limit_ms: float | None = None) -> list[Row]:

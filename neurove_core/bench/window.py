@@ -101,11 +101,20 @@ def train(rounds: int, missing: peers.Missing, *, quick: bool, with_peers: bool)
             runs[peer] = _inside_plain(step)
         loss = ours.loss()
         equal: dict[str, bool | None] = {
-            peer: None if peer in peers.DIFFERENT_BY_DESIGN else abs(value - loss) < 1e-4 * abs(loss)
+            peer: None if peer in peers.DIFFERENT_BY_DESIGN else _same_loss(peer, value / loss - 1)
             for peer, value in losses.items()
         }
-        found += rows(f"training step {name}, batch 4", interleaved(runs, rounds, warm_up=1), equal)
+        for row in rows(f"training step {name}, batch 4", interleaved(runs, rounds, warm_up=1), equal):
+            rounded = row.equal is None and row.peer in peers.ROUNDED_OTHERWISE
+            found.append(row._replace(deviation=losses[row.peer] / loss - 1) if rounded else row)
     return found
+
+
+def _same_loss(peer: str, deviation: float) -> bool | None:
+    """Whether a peer has our loss; None where it only rounds otherwise, see peers.ROUNDED_OTHERWISE."""
+    if abs(deviation) < 1e-4:
+        return True
+    return None if abs(deviation) < peers.ROUNDED_OTHERWISE.get(peer, 0) else False
 
 
 def streams(rounds: int, *, quick: bool) -> list[Row]:

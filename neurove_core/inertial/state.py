@@ -146,7 +146,7 @@ def aid(state: InertialState, window: Window) -> tuple[Aided, InertialState]:
     if covariance is not None:
         covariance = covariance.copy()
         covariance[3:] = covariance[:, 3:] = 0.0
-        covariance[range(3, 6), range(3, 6)] = found.variance + state.bias.variance_at(window.end_us)
+        covariance[range(3, 6), range(3, 6)] = found.variance + state.bias.error_variance_at(window.end_us)
     return Aided(twists, covariance, used=True, resting=False), state
 
 

@@ -128,6 +128,8 @@ def _rounds(args: argparse.Namespace, usual: int) -> int:
 
 def _sentence(row: "Row") -> str:
     agree = {True: "equal answers", False: "DIFFERENT ANSWERS", None: "a different computation by design"}[row.equal]
+    if row.deviation is not None:
+        agree = f"rounded in another order, its result deviates by {row.deviation:+.2%}"
     share = "" if row.share_of_limit is None else f", {row.share_of_limit:.0%} of this machine's limit"
     against = f"{row.ratio:.2f} times as fast as {row.peer} ({row.peer_ms:.3g} ms; {agree})"
     return f"{row.name}: {row.ours_ms:.3g} ms{share}; {against}"

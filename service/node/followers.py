@@ -97,14 +97,14 @@ class Followers:
         follows = [one for one in duties if one.role == "follows" and one.leader in self._others.names(one.stream)]
         late = any(_is_late(one, int(1e9 * now_s)) for one in streams)
         with self._lock:
+            self._began_s = {name: at_s for name, at_s in self._began_s.items() if now_s - at_s < _JOINING_S}
+            self._left_out_s = {name: at_s for name, at_s in self._left_out_s.items() if now_s - at_s < 2 * _GROW_S}
             self._late_s = (now_s if self._late_s is None else self._late_s) if late else None
             if self._late_s is not None and now_s - self._late_s > LATE_S:
                 return self._shrink(follows, now_s)
             if not late and now_s > self._grow_s:
                 self._grow(now_s)
-            joining = sum(
-                not one.equal and now_s - self._began_s.get(one.stream, -_JOINING_S) < _JOINING_S for one in duties
-            )
+            joining = sum(not one.equal and one.stream in self._began_s for one in duties)
             self._free = 0 if late else int(max(0, min(AT_ONCE - joining, self._most - len(follows))))
             return ()
 
@@ -128,7 +128,6 @@ class Followers:
         self._grow_s, self._most = now_s + _GROW_S, self._most + AT_ONCE
         if not any(now_s - at_s < _GROW_S for at_s in self._left_out_s.values()):
             self._most = float("inf")
-            self._left_out_s.clear()
             log.info("keeps up: follows all streams again")
 
 

@@ -4,6 +4,10 @@ import contextlib
 import threading
 from collections import deque
 from collections.abc import Iterator
+from typing import Final
+
+LAST_S: Final = 0.02
+"""A worker that lets others go first waits so long for its turn; then it can see whether its duty has changed."""
 
 
 class Turns:
@@ -25,27 +29,34 @@ class Turns:
         return len(self._waiting) + len(self._last)
 
     @contextlib.contextmanager
-    def turn(self, *, last: bool = False) -> Iterator[None]:
-        """A turn of one worker.
+    def turn(self, *, last: bool = False) -> Iterator[bool]:
+        """A turn of one worker; gives whether there is one.
 
         Args:
-            last: whether the workers that ask without it go first.
+            last: whether the workers that ask without it go first; then there may be no turn within `LAST_S`.
         """
-        self._begin(self._last if last else self._waiting)
+        begun = self._begin(self._last, LAST_S) if last else self._begin(self._waiting, -1)
         try:
-            yield
+            yield begun
         finally:
-            self._end()
+            if begun:
+                self._end()
 
-    def _begin(self, queue: deque[threading.Lock]) -> None:
+    def _begin(self, queue: deque[threading.Lock], timeout_s: float) -> bool:
         with self._lock:
             if self._free and not self.waiting:
                 self._free -= 1
-                return
+                return True
             mine = threading.Lock()
             mine.acquire()
             queue.append(mine)
-        mine.acquire()  # until the turn is handed over
+        if mine.acquire(timeout=timeout_s):  # until the turn is handed over
+            return True
+        with self._lock:
+            if mine in queue:
+                queue.remove(mine)
+                return False
+        return True  # it was handed over a moment ago
 
     def _end(self) -> None:
         with self._lock:

@@ -3,8 +3,8 @@
 The streams have 20 windows a second each. A node joins, one is killed (-9), and it comes back. For each change the
 command reports, in windows: how late the latest window of any stream was, how late the windows of the last 3 s were
 (what remains of the change), the longest time without a window of one stream, and for how long two nodes answered one
-stream. At the end it compares all estimates that a consumer took with a run without changes. With `--copies 1` the
-streams of the killed node begin anew, so these are reported and not counted.
+stream. At the end it compares all estimates that a consumer took with a run without changes. Streams of the killed node
+that no other node followed, such as all with `--copies 1`, begin anew: they are reported and not counted.
 
 Windows that a node skipped, or computed with missing packets, have a flag; they, and what follows from them, are
 reported and not counted, and so are windows that were published and lost on the way.
@@ -21,6 +21,7 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 from neurove_service.node.sharing import drawn
 from tests.live.conftest import client, free_endpoint, start_router, wait_until
@@ -31,6 +32,15 @@ START_S = 300
 END_US = 1 << 62
 LAST_S = 3
 """Windows of this time before the next change show what remains of the last one."""
+
+
+class Change(NamedTuple):
+    """What the command did, and when."""
+
+    at_ns: int
+    kind: str
+    of: set  # the streams that it concerns
+    alone: set  # those of them that no other node followed with equal state
 
 
 def main() -> int:
@@ -65,7 +75,7 @@ def main() -> int:
 
 def run(transport, nodes, consumer, driver, streams, args):
     """Let nodes join, die and come back; the time, the kind and the streams of each change."""
-    changes = []
+    changes, alone = [], set()
 
     def join(*names):
         for name in names:
@@ -92,12 +102,13 @@ def run(transport, nodes, consumer, driver, streams, args):
         counts = {node: sum(consumer.leader(one) == node for one in streams) for node in alive}
         missing = f", {len(waiting)} of {sum(map(len, owners.values()))} places not ready yet" if waiting else ""
         load = os.getloadavg()[0]
+        alone.clear()
+        alone.update(one for one, _ in waiting)
         print(f"after {time.monotonic() - began:.1f} s: answers {counts}{missing}; load {load:.1f}", flush=True)
 
     def change(kind, of, act, *alive):
-        changes.append(
-            (time.monotonic_ns(), kind, {one for one in streams if of is None or consumer.leader(one) == of})
-        )
+        of = {one for one in streams if of is None or consumer.leader(one) == of}
+        changes.append(Change(time.monotonic_ns(), kind, of, of & alone))
         print(kind, flush=True)
         act()
         settle(*alive)
@@ -112,7 +123,7 @@ def run(transport, nodes, consumer, driver, streams, args):
     change("n2 is killed", "n2", nodes["n2"].kill, "n1", "n3")
     change("n2 joins again", None, lambda: join("n2"), "n1", "n2", "n3")
     driver.stop()
-    changes.append((time.monotonic_ns(), "end", set()))
+    changes.append(Change(time.monotonic_ns(), "end", set(), set()))
     return changes
 
 
@@ -137,11 +148,12 @@ def report(consumer, driver, streams, model, changes, copies):
     """Print the figures; return 0 if no window is doubled, missing, out of order or wrong."""
     bad, anew, losses, excused = 0, 0, 0, 0
     late, remains, silent, twice, usual = {}, {}, {}, {}, []
-    ends = [at_ns for at_ns, _, _ in changes]
-    killed = next(of for _, kind, of in changes if kind.endswith("killed")) if copies == 1 else set()
+    ends = [one.at_ns for one in changes]
+    kill = next(one for one in changes if one.kind.endswith("killed"))
+    killed = kill.of if copies == 1 else kill.alone
 
     def kind_at(at_ns):
-        return next((kind for began_ns, kind, _ in reversed(changes) if at_ns >= began_ns), "before")
+        return next((one.kind for one in reversed(changes) if at_ns >= one.at_ns), "before")
 
     for stream in streams:
         found = compared(consumer, driver, stream, model, WINDOW_US)
@@ -190,7 +202,7 @@ def report(consumer, driver, streams, model, changes, copies):
             f"{losses} streams lost packets or skipped windows, and said so: {excused} windows missing or of another "
             "state from then on, or lost on the way to the consumer"
         )
-    if copies == 1:
+    if killed:
         print(f"{len(killed)} streams of the killed node began anew: {anew} gaps and windows of another state")
     usual.sort()
     high = usual[int(0.99 * len(usual))]

@@ -55,18 +55,38 @@ def test_an_error_gives_the_turn_back():
         pass
 
 
-def test_a_worker_that_asks_for_the_last_turn_waits_for_those_that_came_later():
+def test_a_worker_that_asks_for_the_last_turn_lets_those_that_came_later_go_first():
     turns, order, threads = Turns(1), [], []
 
-    def work(name, last):
-        with turns.turn(last=last):
-            order.append(name)
+    def follow():
+        while "follows" not in order:
+            with turns.turn(last=True) as begun:
+                if begun:
+                    order.append("follows")
+
+    def answer():
+        with turns.turn():
+            order.append("answers")
 
     with turns.turn():
-        for name, last in (("follows", True), ("answers", False), ("answers too", False)):
-            threads.append(threading.Thread(target=work, args=(name, last)))
+        threads.append(threading.Thread(target=follow))
+        threads[-1].start()
+        wait_until(lambda: turns.waiting == 1)
+        for number in (1, 2):
+            threads.append(threading.Thread(target=answer))
             threads[-1].start()
-            wait_until(lambda: turns.waiting == len(threads))
+            wait_until(lambda: turns.waiting == 1 + number)  # noqa: B023
     for thread in threads:
         thread.join(60)
-    assert order == ["answers", "answers too", "follows"]
+    assert order == ["answers", "answers", "follows"]
+
+
+def test_a_worker_that_lets_others_go_first_does_not_wait_for_ever():
+    turns = Turns(1)
+    with turns.turn(), turns.turn(last=True) as begun:
+        assert not begun
+        assert turns.waiting == 0
+    with turns.turn(last=True) as begun:
+        assert begun
+    with turns.turn() as begun:
+        assert begun
