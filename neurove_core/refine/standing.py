@@ -132,4 +132,5 @@ def towards_zero(twists: Array, covariance: Array) -> Array:
     mean = twists[:, :3].mean(axis=0)
     square = float(mean @ mean)
     share = square / (square + UNSEEN**2 * float(np.trace(covariance[:3, :3])) + 1e-12)
-    return twists * np.repeat([share, 1.0], 3)
+    shrunk: Array = twists * np.repeat([share, 1.0], 3)
+    return shrunk
