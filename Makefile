@@ -10,7 +10,7 @@ JOBS ?= 2
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 
-.PHONY: run test coverage ros2 format picture docs image clean
+.PHONY: run test coverage ros2 format picture docs wheel image clean
 
 run: $(VENV)/warm
 	@echo "with a live page for browsers: $(BIN)/neurove demo --page"
@@ -38,6 +38,9 @@ picture: $(VENV)/installed  # the pictures in README and in the guides, of simul
 
 docs: $(VENV)/installed  # the documentation site in build/docs/site; a broken link is an error
 	@$(BIN)/python deploy/docs/build.py build/docs
+
+wheel: $(VENV)/installed  # in dist, with compiled code for x86-64-v3; CPUS: for these processors instead
+	@$(BIN)/python deploy/wheel.py dist $(CPUS)
 
 image:  # the container image `neurove`, with buildah; IMAGE_ARGS: further arguments of `buildah build`
 	@deploy/image.sh neurove $(IMAGE_ARGS)

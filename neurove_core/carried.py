@@ -12,6 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.estimator import StreamState
+from neurove_core.inertial.agreement import Agreement, Track
+from neurove_core.inertial.bias import Bias
+from neurove_core.inertial.moving import Tilt
+from neurove_core.inertial.state import Learned
 from neurove_core.networks.arrays import ArrayState
 from neurove_core.refine.ground import GroundEvents, GroundState
 from neurove_core.refine.ground_sway import Sway
@@ -27,11 +31,15 @@ MAX_BYTES: Final = 32 << 20
 
 _KINDS: Final[dict[str, Any]] = {
     kind.__name__: kind
-    for kind in (ArrayState, Filter, GroundEvents, GroundState, Longer, Scene, Stages, Standing, Sway)
+    for kind in (
+        *(ArrayState, Filter, GroundEvents, GroundState, Longer, Scene, Stages, Standing, Sway),
+        *(Agreement, Bias, Learned, Tilt, Track),
+    )
 }
 _DTYPES: Final = ("|u1", "|i1", "|b1", "<u2", "<i2", "<u4", "<i4", "<i8", "<u8", "<f4", "<f8")
 _PARTS: Final = ("network", "age", "end_us", "stages", "ground", "recent", "longer")
 _WHAT: Final = "stream state"
+_MAX_TEXT: Final = 256
 
 
 class Carried(NamedTuple):
@@ -44,15 +52,16 @@ class Carried(NamedTuple):
     ground: GroundState
     recent: tuple[NDArray[np.uint8], ...]
     longer: Longer
+    inertial: Learned | None = None  # of the inertial unit; None without one
 
     def into(self, state: StreamState) -> StreamState:
         """A state with these parts; sensor, lens and the open window are its own."""
-        return state._replace(**self._asdict())
+        return state._replace(**{name: getattr(self, name) for name in _PARTS})
 
 
-def encode(state: StreamState) -> bytes:
-    """The carried parts of a state that has processed a window."""
-    packed: bytes = msgpack.packb([_packed(getattr(state, name)) for name in _PARTS])
+def encode(state: StreamState, inertial: Learned | None = None) -> bytes:
+    """The carried parts of a state that has processed a window, and of its inertial unit."""
+    packed: bytes = msgpack.packb([_packed(one) for one in (*(getattr(state, name) for name in _PARTS), inertial)])
     return packed
 
 
@@ -79,11 +88,23 @@ def decode(data: bytes, own: StreamState) -> Carried:
         raise InvalidField(_WHAT, "network", type(carried.network).__name__, "the shapes of this node's model")
     if not (_is_count(carried.age) and isinstance(carried.end_us, int) and carried.network.finite()):
         raise InvalidField(_WHAT, "network", carried.age, "finite numbers, an age and the end of a window")
-    kinds = (Stages, GroundState, tuple, Longer)
-    for name, value, kind in zip(_PARTS[3:], carried[3:], kinds, strict=True):
+    kinds = (Stages, GroundState, tuple, Longer, Learned | None)
+    for name, value, kind in zip(Carried._fields[3:], carried[3:], kinds, strict=True):
         if not isinstance(value, kind):
             raise InvalidField(_WHAT, name, type(value).__name__, str(kind))
+    if carried.inertial is not None and not _is_sound(carried.inertial):
+        raise InvalidField(_WHAT, "inertial", type(carried.inertial).__name__, "arrays of its shapes, finite")
     return carried
+
+
+def _is_sound(inertial: Learned) -> bool:
+    kinds = (Bias, Tilt, Track, Agreement, int, bool)
+    if not all(isinstance(value, kind) for value, kind in zip(inertial, kinds, strict=True)):
+        return False
+    try:
+        return inertial.is_sound()
+    except (AttributeError, TypeError):
+        return False
 
 
 def _is_count(value: object) -> bool:
@@ -91,7 +112,7 @@ def _is_count(value: object) -> bool:
 
 
 def _packed(value: Any) -> Any:
-    if value is None or isinstance(value, bool | int | float):
+    if value is None or isinstance(value, bool | int | float | str):
         return value
     if _is_tensor(value):
         return ["tensor", *_bytes_of(value.detach().numpy())]
@@ -113,7 +134,9 @@ def _unpacked(value: Any) -> Any:
     if not isinstance(value, list):
         if value is None or isinstance(value, bool | int | float):
             return value
-        raise ValueError("neither a number nor a list")
+        if isinstance(value, str) and len(value) <= _MAX_TEXT:
+            return value
+        raise ValueError("neither a number, a short text nor a list")
     kind, *rest = value
     if kind == "tuple":
         return tuple(_unpacked(one) for one in rest[0])

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from neurove_core.geometry.tables import TABLES
 from neurove_core.ingest import windows
-from neurove_core.ingest.channels import Recent, remembered, with_history
+from neurove_core.ingest.channels import Recent, remembered
 from neurove_core.ingest.windows import Pushed, Window, WindowsState
 from neurove_core.io.packets import slices
 from neurove_core.io.recording import Recording
@@ -27,7 +27,7 @@ from neurove_core.refine.rotation import Given, Rate
 from neurove_core.refine.rotation import Refined as RotationFound
 from neurove_core.refine.view import View
 from neurove_core.running import form_of, runner_of
-from neurove_core.timescales import Answer, Longer, chosen, followed, jobs, slowed, watched
+from neurove_core.timescales import Answer, Answered, Longer, Turn, answered
 from neurove_core.warming import compile_refinement, warm_camera, warm_events
 from neurove_protocol import CameraInfo, Events, Sensor
 from neurove_protocol.errors import BadModel
@@ -207,9 +207,15 @@ class Estimator:
         These are the network's estimates; `refine` is the last step of a push. Where a window does not begin at the end
         of the one before, the network state is reset, unless it is bridged.
         """
-        stream = _Progress(state, tuple(complete))
-        self._answer([stream])
-        return stream.estimates, stream.state
+        return self.follow_many([(complete, state)])[0]
+
+    def follow_many(
+        self, streams: Iterable[tuple[Iterable[Window], StreamState]]
+    ) -> list[tuple[list[WindowEstimate], StreamState]]:
+        """As `follow`, for the complete windows of several streams with their states, in common batches."""
+        found = [_Progress(state, tuple(complete)) for complete, state in streams]
+        self._answer(found)
+        return [(stream.estimates, stream.state) for stream in found]
 
     def refine(self, window: Window, estimate: WindowEstimate, state: StreamState) -> Refined:
         """The last step of push: an estimate, refined by the sample of its window and by those before.
@@ -229,8 +235,8 @@ class Estimator:
         state = state._replace(stages=found.state, ground=state.ground if found.level else GroundState())
         estimate = _turned(estimate, found.turn, found.velocity)
         answer, state = _over_ground(window, estimate, state, found)
-        if answer is estimate and found.velocity is None:
-            answer = _with_errors(estimate, found.turn, given.height_m)
+        if answer is estimate:
+            answer = _with_errors(estimate, found, given.height_m)
         return answer._replace(uncertain=self.is_uncertain(answer.twists, answer.covariance)), state
 
     def is_uncertain(self, twists: NDArray[np.float64], covariance: NDArray[np.float64] | None) -> bool:
@@ -248,23 +254,10 @@ class Estimator:
             due = [stream for stream in streams if turn < len(stream.windows)]
             for stream in due:
                 self._reset_after_gap(stream, stream.windows[turn])
-            counts = [with_history(stream.windows[turn].counts, stream.state.recent, self.config) for stream in due]
-            steps = self._runner.run(counts, [stream.state.network for stream in due])
-            for stream, (twists, network) in zip(due, steps, strict=True):
-                self._take(stream, stream.windows[turn], twists * self._scale + self._offset, network)
-
-    def _chosen(self, stream: _Progress, window: Window, answer: Answer) -> Answer:
-        """The answer of the time scale that fits the motion; longer windows run on the way."""
-        if not self.config.scales:
-            return answer
-        wanted, longer = jobs(window.counts, stream.state.longer, self._runner, self.config)
-        runs = self._runner.run([job.counts for job in wanted], [job.state for job in wanted]) if wanted else []
-        longer = followed(longer, [(job, state) for job, (_, state) in zip(wanted, runs, strict=True)], self.config)
-        stream.state = stream.state._replace(longer=watched(longer, answer.twists, self.config))
-        answers = [answer]
-        for job, (twists, state) in zip(wanted, runs, strict=True):
-            answers.append(Answer(slowed(twists * self._scale + self._offset, job.scale), state, job.scale))
-        return chosen(answers, stream.state.longer, self.config.scale_bounds)
+            turns = [_turn(stream, stream.windows[turn]) for stream in due]
+            found = answered(turns, self._runner, self.config, self._offset, self._scale)
+            for stream, one in zip(due, found, strict=True):
+                self._take(stream, stream.windows[turn], one)
 
     def _reset_after_gap(self, stream: _Progress, window: Window) -> None:
         """Reset the network state where a window does not follow the one before it."""
@@ -272,13 +265,13 @@ class Estimator:
             fresh = self._runner.initial_state()
             stream.state = stream.state._replace(network=fresh, age=0, recent=(), longer=Longer())
 
-    def _take(self, stream: _Progress, window: Window, twists: NDArray[np.float64], network: State) -> None:
-        answer = self._chosen(stream, window, Answer(twists, network))
+    def _take(self, stream: _Progress, window: Window, found: Answered) -> None:
         state = stream.state
-        stream.estimates.append(self._estimate(window, answer, state))
+        stream.estimates.append(self._estimate(window, found.answer, state))
         end_us = window.start_us + self.config.window.duration_us
         recent = remembered(window.counts, state.recent, self.config)
-        stream.state = state._replace(network=network, age=state.age + 1, end_us=end_us, recent=recent)
+        after = state._replace(network=found.network, age=state.age + 1, end_us=end_us, recent=recent)
+        stream.state = after._replace(longer=found.longer)
 
     def warm_up(self) -> None:
         """Compile all code and run all parts, so that the first packet does not wait for it.
@@ -318,6 +311,10 @@ def _begin(push: Push, pushed: Pushed) -> _Progress:
     outside = sum(window.outside for window in pushed.windows)
     lost = (pushed.late_events, outside, pushed.skipped_windows)
     return _Progress(push.state._replace(windows=pushed.state), pushed.windows, lost)
+
+
+def _turn(stream: _Progress, window: Window) -> Turn:
+    return Turn(window.counts, stream.state.recent, stream.state.network, stream.state.longer)
 
 
 def _with_rate(
@@ -371,15 +368,17 @@ def _turned(estimate: WindowEstimate, found: RotationFound, velocity: refining.V
     return estimate._replace(twists=twists, covariance=covariance, source="refined")
 
 
-def _with_errors(estimate: WindowEstimate, found: RotationFound, height_m: float) -> WindowEstimate:
+def _with_errors(estimate: WindowEstimate, found: refining.Stages, height_m: float) -> WindowEstimate:
     """An estimate without the ground, whose covariance has the terms of `refine.errors`."""
     if estimate.covariance is None:
         return estimate
-    covariance = estimate.covariance.copy()
-    if found.errors is not None:
-        covariance[3:, 3:] = (found.errors + found.errors.T) / 2
-    rate_rad_s = float(np.linalg.norm(estimate.twists.mean(axis=0)[3:]))
-    return estimate._replace(covariance=errors.of_unknown_depth(covariance, found.shift, rate_rad_s, height_m))
+    covariance, turn = estimate.covariance.copy(), found.turn
+    if turn.errors is not None:
+        covariance[3:, 3:] = (turn.errors + turn.errors.T) / 2
+    if found.velocity is None:
+        rate_rad_s = float(np.linalg.norm(estimate.twists.mean(axis=0)[3:]))
+        covariance = errors.of_unknown_depth(covariance, turn.shift, rate_rad_s, height_m)
+    return estimate._replace(covariance=covariance)
 
 
 def _over_ground(
@@ -414,14 +413,14 @@ def _over_ground(
     if answer.outcome not in ("accepted", "turning") or answer.motion is None:
         return estimate, state
     twist, after = answer.motion.twist, answer.state
-    covariance = errors.of_ground(twist, answer.motion.covariance, after.tilt, after.pitch_sigma, height_m)
+    seen = after.tilt, after.pitch_sigma, height_m, state.stages.odds
+    covariance = errors.of_ground(twist, answer.motion.covariance, *seen)
     twists = np.tile(twist, (len(estimate.twists), 1))
     if answer.outcome == "turning":
         rate = Rate(twist[3:], covariance[3:, 3:])
         twists, covariance = _with_rate(estimate.twists, estimate.covariance, rate, np.zeros(3))
     if state.stages.is_free:
-        before = estimate if found.velocity is not None else _with_errors(estimate, found.turn, height_m)
-        twists, covariance = _without_rate(twists, covariance, before)
+        twists, covariance = _without_rate(twists, covariance, _with_errors(estimate, found, height_m))
     return estimate._replace(twists=twists, covariance=covariance, source="refined"), state
 
 

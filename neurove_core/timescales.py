@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.config import ModelConfig
-from neurove_core.ingest.channels import Counts, add_saturating
-from neurove_core.networks.arrays import Begins, State
+from neurove_core.ingest.channels import Counts, Recent, add_saturating, with_history
+from neurove_core.networks.arrays import Begins, Runner, State
 
 STEPS: Final = 3
 """Long windows that a state must have seen before its scale answers."""
@@ -43,6 +43,57 @@ class Answer(NamedTuple):
     twists: NDArray[np.float64]  # (n, 6), in the model's linear unit and rad/s
     network: State
     scale: int = 1  # windows that it is from
+
+
+class Turn(NamedTuple):
+    """The newest window of one stream, and what the network needs to answer it."""
+
+    window: Counts  # (2n * parts, H, W)
+    recent: Recent
+    network: State
+    longer: Longer
+
+
+class Answered(NamedTuple):
+    """The answer to the newest window of one stream, and what the stream carries to its next window."""
+
+    answer: Answer
+    network: State
+    longer: Longer
+
+
+def answered(
+    turns: Sequence[Turn],
+    runner: Runner,
+    config: ModelConfig,
+    offset: NDArray[np.float64],
+    scale: NDArray[np.float64],
+) -> list[Answered]:
+    """Answer the newest window of each of B streams: one batch for these windows, a second one for the longer windows.
+
+    Args:
+        turns: one for each stream.
+        runner: of the network.
+        config: of the model.
+        offset: (6) of the bundle; twists are `twists * scale + offset`.
+        scale: (6) of the bundle.
+    """
+    counts = [with_history(turn.window, turn.recent, config) for turn in turns]
+    steps = runner.run(counts, [turn.network for turn in turns])
+    first = [Answer(twists * scale + offset, network) for twists, network in steps]
+    if not config.scales:
+        return [Answered(one, one.network, turn.longer) for one, turn in zip(first, turns, strict=True)]
+    asked = [jobs(turn.window, turn.longer, runner, config) for turn in turns]
+    every = [job for wanted, _ in asked for job in wanted]
+    runs = iter(runner.run([job.counts for job in every], [job.state for job in every]) if every else [])
+    found = []
+    for one, (wanted, begun) in zip(first, asked, strict=True):
+        done = [(job, *next(runs)) for job in wanted]
+        longer = followed(begun, [(job, state) for job, _, state in done], config)
+        longer = watched(longer, one.twists, config)
+        more = [Answer(slowed(twists * scale + offset, job.scale), state, job.scale) for job, twists, state in done]
+        found.append(Answered(chosen([one, *more], longer, config.scale_bounds), one.network, longer))
+    return found
 
 
 class Job(NamedTuple):

@@ -3,11 +3,17 @@
 The parts share almost no code, so processes can compile them at the same time into one cache.
 """
 
+import contextlib
+import functools
+import hashlib
+import sys
+from pathlib import Path
 from typing import Any, Final
 
+import numba
 import numpy as np
 
-from neurove_core.compiled import work
+from neurove_core.compiled import ahead, folder_of, work
 from neurove_core.config import ModelConfig
 from neurove_core.engine.fallback import vectors_work
 from neurove_core.geometry.tables import TABLES
@@ -30,13 +36,67 @@ PARTS: Final = ("network", "events", "refinement")
 _FIRING: Final = 0.2  # share of the cells with events in made-up windows
 
 
-def is_cold() -> bool:
-    """Whether the cache has no compiled code; a process that has compiled or loaded code already gets False.
+def lacks_code(config: ModelConfig) -> bool:
+    """Whether a part of the code is neither in the cache nor in the package; it compiles or loads one small kernel.
 
-    It compiles or loads one small kernel, which is the first one that all others need.
+    The cache is complete where `note_complete` has noted so for the present sources.
+
+    Args:
+        config: of the model that is to run.
+
+    Returns:
+        False where there is no place for a cache, and in a process that has compiled or loaded code already.
     """
     before = work()
-    return before.compiled + before.loaded == 0 and vectors_work() and work().compiled > 0
+    if before.compiled + before.loaded or not vectors_work():
+        return False
+    if work().compiled == 0 and (_noted() == sources() or ahead.complete_for() == complete_for(config)):
+        return False
+    return _note() is not None
+
+
+def note_complete() -> None:
+    """Note in the cache that it has all code of the present sources, for `lacks_code`."""
+    file = _note()
+    if file is not None:
+        with contextlib.suppress(OSError):  # then the next start finds out by itself
+            file.write_text(sources())
+
+
+def complete_for(config: ModelConfig) -> str:
+    """The sources and the model whose code a package brings, as a digest."""
+    shape = config.kind, config.window, config.network, config.canonical
+    return hashlib.sha256(f"{sources()} {shape!r}".encode()).hexdigest()
+
+
+@functools.cache
+def sources() -> str:
+    """The digest of all files from which the code of a service is compiled, and of what compiles them."""
+    found = hashlib.sha256(f"{sys.implementation.cache_tag} {numba.__version__}".encode())
+    package = Path(__file__).parent
+    for folder in _FOLDERS:
+        for file in sorted((package / folder).rglob("*.py")):
+            found.update(file.relative_to(package).as_posix().encode())
+            found.update(file.read_bytes())
+    return found.hexdigest()
+
+
+_FOLDERS: Final = ("engine", "geometry", "ingest", "networks", "refine", "spiking")
+
+
+def _note() -> Path | None:
+    from neurove_core.engine.spike_lists import fill_spikes
+
+    folder = folder_of(fill_spikes)
+    return folder / "complete" if folder else None
+
+
+def _noted() -> str:
+    file = _note()
+    try:
+        return file.read_text() if file else ""
+    except (OSError, ValueError):
+        return ""
 
 
 def compile_part(part: str, config: ModelConfig) -> None:

@@ -91,6 +91,8 @@ _OF_KUBERNETES = re.compile(
     r"(\w+_)?(SERVICE_HOST|SERVICE_PORT(_\w+)?|PORT(_\d+_(TCP|UDP|SCTP)(_(PROTO|PORT|ADDR))?)?)"
 )
 """What follows NEUROVE_ in the variables that Kubernetes sets in every pod for a service whose name begins so."""
+_OF_ENGINE = ("form", "ahead")
+"""The same of variables that neurove_core reads: engine/choice.py and compiled/ahead.py."""
 
 
 class _Settings(BaseSettings):
@@ -337,7 +339,7 @@ def _from_file(file: Path) -> dict[str, Any]:
 
 def _from_environment(kind: type[_Settings]) -> dict[str, Any]:
     """The settings in the environment; an empty variable counts as unset."""
-    known = {*ServiceConfig.model_fields, *ClientConfig.model_fields}
+    known = {*ServiceConfig.model_fields, *ClientConfig.model_fields, *_OF_ENGINE}
     foreign = []
     for name, value in os.environ.items():
         rest = name.removeprefix(ENVIRONMENT)

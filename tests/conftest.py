@@ -13,6 +13,7 @@ from hypothesis import settings
 from neurove_service.cli import main
 
 torch.set_num_threads(1)
+os.environ.setdefault("NEUROVE_AHEAD", "off")  # tests count what is compiled, also where `make wheel` has run
 
 
 def pytest_collection_modifyitems(items):

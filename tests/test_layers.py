@@ -41,14 +41,14 @@ MAY_IMPORT = {
     "neurove_core.estimator": "geometry ingest networks models io refine running timescales warming",
     "neurove_core.self_test": "config models estimator",
     "neurove_core.aided": "estimator inertial",
-    "neurove_core.carried": "spiking networks refine estimator timescales",
+    "neurove_core.carried": "spiking networks refine inertial estimator timescales",
     "neurove_core.io": "files extras figures geometry",
     "neurove_core.io.formats": "compiled files extras geometry io",
     "neurove_core.sim": "compiled config figures geometry io io.formats",
     "neurove_core.live": "extras io io.formats",
     "neurove_core.sources": "io io.formats live sim",
     "neurove_core.series": "files io.formats sources tasks",
-    "neurove_core.evaluation": "compiled figures geometry networks models estimator inertial aided io sources",
+    "neurove_core.evaluation": "compiled figures geometry ingest networks models estimator inertial aided io sources",
     "neurove_core.training": (
         "config files extras figures geometry ingest networks "
         "engine models estimator self_test io io.formats sim sources tasks timescales"

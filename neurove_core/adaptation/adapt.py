@@ -19,7 +19,7 @@ from neurove_core.adaptation.pieces import Span as Times
 from neurove_core.adaptation.pieces import within
 from neurove_core.adaptation.prepare import Prepared
 from neurove_core.estimator import Estimator
-from neurove_core.evaluation.evaluate import Estimates, estimate_recording
+from neurove_core.evaluation.estimates import Estimates, estimate_recording
 from neurove_core.models import bundle as bundles
 from neurove_core.models.bundle import Bundle
 from neurove_core.tasks import Pool

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.adaptation.pieces import Span, inside_any
-from neurove_core.evaluation.evaluate import Estimates
+from neurove_core.evaluation.estimates import Estimates
 from neurove_core.evaluation.metrics import ANGULAR_FLOOR_RAD_S, LINEAR_FLOOR_M_S, relative_error, rmse
 from neurove_core.geometry.motion import Twists
 from neurove_core.models.uncertainty import LEVEL, coverage, half_width

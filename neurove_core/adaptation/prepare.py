@@ -13,7 +13,7 @@ from neurove_core.adaptation import truth as truths
 from neurove_core.adaptation.pieces import Pieces, divide, in_seconds
 from neurove_core.adaptation.truth import Asked, Truth
 from neurove_core.estimator import Estimator
-from neurove_core.evaluation.evaluate import Estimates, estimate_recording
+from neurove_core.evaluation.estimates import Estimates, estimate_recording
 from neurove_core.geometry.motion import Twists
 from neurove_core.io import Recording
 from neurove_core.io.calibration import with_lens

@@ -19,6 +19,7 @@ class Row(NamedTuple):
         float | None
     )  # the limit of this machine, measured in the same run, over our time; None without a limit
     equal: bool | None  # whether the results agree; None if the peer computes another result by design
+    deviation: float | None = None  # of a peer that rounds otherwise: its result over ours, minus 1
 
 
 def rows(name: str, times: dict[str, float], equal: dict[str, bool | None], limit_ms: float | None = None) -> list[Row]:
@@ -36,15 +37,22 @@ def rows(name: str, times: dict[str, float], equal: dict[str, bool | None], limi
     return [Row(name, ours, peer, times[peer], times[peer] / ours, share, equal[peer]) for peer in peers]
 
 
-def interleaved(runs: dict[str, Callable[[], object]], rounds: int, warm_up: int = 2) -> dict[str, float]:
-    """Median CPU time [ms] of each function. Every round runs all in turn, so that a busy machine slows all alike.
+def interleaved(
+    runs: dict[str, Callable[[], object]],
+    rounds: int,
+    warm_up: int = 2,
+    clock: Callable[[], float] = time.thread_time,
+) -> dict[str, float]:
+    """Median time [ms] of each function, by default the CPU time of this thread.
 
-    Each round has another order, the same in every run, because a function that fills the caches slows the next one.
+    Every round runs all in turn, so that a busy machine slows all alike. Each round has another order, the
+    same in every run, because a function that fills the caches slows the next one.
 
     Args:
         runs: the functions to time, by name.
         rounds: number of timed rounds.
         warm_up: number of rounds before them, not timed.
+        clock: the time [s]; work on a GPU takes no CPU time.
     """
     times: dict[str, list[float]] = {name: [] for name in runs}
     order, shuffle = list(runs), random.Random(0).shuffle
@@ -52,8 +60,8 @@ def interleaved(runs: dict[str, Callable[[], object]], rounds: int, warm_up: int
         shuffle(order)
         for name in order:
             run = runs[name]
-            began = time.thread_time()
+            began = clock()
             run()
             if turn >= warm_up:
-                times[name].append(1e3 * (time.thread_time() - began))
+                times[name].append(1e3 * (clock() - began))
     return {name: statistics.median(values) for name, values in times.items()}

@@ -46,6 +46,10 @@ def networks(network: NeuroVE, missing: Missing) -> dict[str, NeuroVE]:
 DIFFERENT_BY_DESIGN: Final = ("snnTorch", "norse")
 """Peers with other results by design: snnTorch resets one step later, norse rounds its potential in another place."""
 
+ROUNDED_OTHERWISE: Final = {"sinabs": 0.01}
+"""Peers whose loss in training may deviate from ours by so much of it: the spikes of sinabs are not channels last in
+memory, so torch sums the statistics of the next norm in another order, and a few of a million spikes differ."""
+
 Neurons = Callable[[SpikingBlock], tuple[Callable[[Tensor], Tensor], Callable[[], None]]]
 """For one block: a function from currents to spikes, and one that resets its state."""
 

@@ -5,7 +5,7 @@ import sys
 from typing import Literal, NamedTuple
 
 from neurove_core.estimator import Estimator
-from neurove_core.evaluation.evaluate import Estimates, estimate_recording
+from neurove_core.evaluation.estimates import Estimates, estimate_recording
 from neurove_core.io.calibration import with_lens
 from neurove_core.models import bundle
 from neurove_core.sources import open_source

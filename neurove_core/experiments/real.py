@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.estimator import Estimator
-from neurove_core.evaluation.evaluate import NoTruth, estimate_recording
+from neurove_core.evaluation.estimates import estimate_recording
+from neurove_core.evaluation.evaluate import NoTruth
 from neurove_core.evaluation.metrics import SKIP_S
 from neurove_core.experiments import save_text
 from neurove_core.geometry.motion import Twists

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from neurove_core import models
 from neurove_core.estimator import Estimator
-from neurove_core.evaluation.evaluate import Estimates, NoTruth, estimate_recording
+from neurove_core.evaluation.estimates import Estimates, estimate_recording
+from neurove_core.evaluation.evaluate import NoTruth
 from neurove_core.evaluation.metrics import SKIP_S
 from neurove_core.experiments import real, save_text
 from neurove_core.figures import blank_figure, save_figure

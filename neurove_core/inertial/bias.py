@@ -14,6 +14,10 @@ DRIFT_RAD_S: Final = 1e-4
 FLOOR_RAD_S: Final = 5e-4
 """Standard deviation that no number of samples falls below."""
 
+MOTION_SHARE: Final = 0.45
+"""Share of sigma of a bias that motion has taught well: the filter counts a window as a tenth of a measurement, and
+expects worse events than those that it gets. Measured on own drives, see decision 169."""
+
 NOISE_RAD_S: Final = 0.004
 """Standard deviation of one sample before the first rest."""
 
@@ -38,6 +42,14 @@ class Bias(NamedTuple):
             return self.variance
         grown = self.variance + DRIFT_RAD_S**2 * max(0, t_us - self.at_us) * 1e-6
         return np.minimum(grown, UNKNOWN_RAD_S**2)
+
+    def error_variance_at(self, t_us: int) -> NDArray[np.float64]:
+        """Variance (3,) of the error of `mean_rad_s` at a time [us]; that of the filter is larger, see MOTION_SHARE."""
+        variance = self.variance_at(t_us)
+        if self.rested:
+            return variance
+        share = MOTION_SHARE + (1 - MOTION_SHARE) * (variance / UNKNOWN_RAD_S**2)
+        return np.asarray(variance * share**2)
 
 
 def learned(bias: Bias, gyro_rad_s: NDArray[np.float64], samples: int, noise_rad_s: float, t_us: int) -> Bias:

@@ -43,6 +43,43 @@ class InertialState(NamedTuple):
         return self.doubts >= 2
 
 
+class Learned(NamedTuple):
+    """What an `InertialState` holds apart from the samples: another process that has the samples can go on with it."""
+
+    bias: Bias
+    tilt: Tilt
+    track: Track
+    agreement: Agreement
+    doubts: int
+    resting: bool
+
+    @classmethod
+    def of(cls, state: InertialState) -> "Learned":
+        """That of a state."""
+        return cls(*state[1:])
+
+    def into(self, state: InertialState) -> InertialState:
+        """The state that goes on with this and its own samples."""
+        return state._replace(**self._asdict())
+
+    def is_sound(self) -> bool:
+        """Whether the arrays have the shapes that the stage expects, and all numbers are finite."""
+        bias, track = self.bias, self.track
+        windows, angles = track.start_us.size, track.grid_us.size
+        shapes = [
+            (bias.mean_rad_s, (3,)),
+            (bias.variance, (3,)),
+            (track.start_us, (windows,)),
+            (track.end_us, (windows,)),
+            (track.events_rad_s, (windows, 3)),
+            (track.refined, (windows,)),
+            (track.grid_us, (angles,)),
+            (track.angle_rad, (angles, 3)),
+            (self.tilt.velocities_m_s, (len(self.tilt.velocities_m_s), 3)),
+        ]
+        return all(array.shape == shape and bool(np.isfinite(array).all()) for array, shape in shapes)
+
+
 class Window(NamedTuple):
     """The estimate of one window by the events."""
 
@@ -109,7 +146,7 @@ def aid(state: InertialState, window: Window) -> tuple[Aided, InertialState]:
     if covariance is not None:
         covariance = covariance.copy()
         covariance[3:] = covariance[:, 3:] = 0.0
-        covariance[range(3, 6), range(3, 6)] = found.variance + state.bias.variance_at(window.end_us)
+        covariance[range(3, 6), range(3, 6)] = found.variance + state.bias.error_variance_at(window.end_us)
     return Aided(twists, covariance, used=True, resting=False), state
 
 

@@ -12,7 +12,9 @@ from neurove_core.networks.quantisation import rounded, rounded_input
 from neurove_core.networks.state import is_finite
 from neurove_core.spiking.alif import diffuse
 from neurove_core.spiking.aslstm import ASLSTM, ASLSTMState
+from neurove_core.spiking.fused import convolution as fused
 from neurove_core.spiking.lif import LIFParams, LIFState, lif_scan
+from neurove_core.spiking.plain import is_plain
 from neurove_core.spiking.readout import readout_scan
 
 
@@ -32,16 +34,19 @@ class SpikingBlock(nn.Module):
     """Convolution of stride 2, threshold-dependent batch norm (tdBN, Zheng 2021), LIF.
 
     Differs: tdBN's factor v_th is the initial value of the norm's learnable weight, which spans the same functions.
-    With `int8` the convolution's weights are rounded to 8 bits, also in training (decision 38).
+    With `int8` the convolution's weights are rounded to 8 bits, also in training (decision 38). With `of_spikes`, all
+    input is 0 or 1, and training on a CPU convolves the neurons that fired alone (spiking/fused/convolution.py).
     """
 
-    def __init__(self, inputs: int, outputs: int, lif: LIFParams, *, int8: bool = False) -> None:
+    def __init__(
+        self, inputs: int, outputs: int, lif: LIFParams, *, int8: bool = False, of_spikes: bool = False
+    ) -> None:
         super().__init__()
         self.conv = nn.Conv2d(inputs, outputs, 3, stride=2, padding=1, bias=False)
         self.norm = nn.BatchNorm2d(outputs)
         nn.init.constant_(self.norm.weight, lif.v_th)
         self.lif = lif
-        self._int8 = int8
+        self._int8, self._of_spikes = int8, of_spikes
 
     def forward(self, spikes: Tensor, state: LIFState) -> tuple[Tensor, LIFState]:
         """(T, B, C, H, W) to (T, B, C', H', W'); the norm's statistics run over time and batch together."""
@@ -49,10 +54,11 @@ class SpikingBlock(nn.Module):
         frames = spikes.flatten(0, 1).contiguous(
             memory_format=torch.channels_last
         )  # the fastest layout for convolutions on CPUs
-        if self._int8:
-            current = self.norm(conv2d(frames, rounded(self.conv.weight), stride=2, padding=1))
+        weight = rounded(self.conv.weight) if self._int8 else self.conv.weight
+        if self._of_spikes and not is_plain() and fused.fits(frames, weight):
+            current = self.norm(fused.convolve(frames, weight))
         else:
-            current = self.norm(self.conv(frames))
+            current = self.norm(conv2d(frames, weight, stride=2, padding=1))
         return lif_scan(current.unflatten(0, (steps, batch)), state, self.lif)
 
 
@@ -71,7 +77,10 @@ class NeuroVE(nn.Module):
         lif = LIFParams(net.decay, net.v_th, net.surrogate, net.surrogate_width * net.v_th)
         widths = (config.input_shape[0], *net.channels)
         self._int8 = net.precision == "int8"
-        self.blocks = nn.ModuleList(SpikingBlock(a, b, lif, int8=self._int8) for a, b in itertools.pairwise(widths))
+        self.blocks = nn.ModuleList(
+            SpikingBlock(a, b, lif, int8=self._int8, of_spikes=index > 0)
+            for index, (a, b) in enumerate(itertools.pairwise(widths))
+        )
         rows, columns = self.map_sizes()[-1]
         self.project = nn.Linear(net.channels[-1] * rows * columns, net.features, bias=False)
         self.project_norm = nn.BatchNorm1d(net.features)

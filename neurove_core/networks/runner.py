@@ -46,7 +46,7 @@ def log_sigma_of(network: Network, state: State) -> NDArray[np.float64] | None:
     if not isinstance(network, NeuroVE) or not isinstance(state, NetworkState):
         return None
     found = network.log_sigma(state)
-    return None if found is None else found[0].double().numpy()
+    return None if found is None else found[0].double().cpu().numpy()
 
 
 def batch_of(counts: Sequence[NDArray[np.uint8]]) -> Tensor:

@@ -5,7 +5,7 @@ last for many windows, and the curvature of the search does not know of them. Ea
 shows it: the translation over depth, what the network says, the rates of pitch and roll.
 
 The rules that accept a motion compare covariances without these terms. The constants make 90 % intervals hold on own
-sequences; see decision 115.
+sequences; see decisions 115 and 169.
 """
 
 import math
@@ -13,6 +13,8 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+
+from neurove_core.refine.vehicle import START
 
 Array = NDArray[np.float64]
 
@@ -34,8 +36,11 @@ SHIFT_CHANGE: Final = np.array([0.6, 0.0, 0.3])
 AHEAD: Final = 0.4
 """Error of the pitch rate by the translation ahead over depth: the ground below is near."""
 
-NETWORK: Final = np.array([0.3, 0.15, 0.15])
+NETWORK: Final = np.array([0.2, 0.1, 0.1])
 """Error of a rate, as a share of its distance from that of the network."""
+
+TREMBLE_RAD_S: Final = 0.04
+"""Error of a rate of a camera in the air: it trembles within a window, while a refined rate changes evenly."""
 
 DEPTH: Final = 0.6
 """Error of the velocity over the height of the camera, by the translation over depth: the depth is not known."""
@@ -62,11 +67,21 @@ ASIDE_SPEED: Final = 0.03
 ASIDE_YAW: Final = 0.01
 """Error of the yaw rate by the sideways acceleration over the height of the camera [s]."""
 
-SLOW_SHARE: Final = 0.6
-"""Share of sigma of a camera that hardly moves: the search sees it well, and its prior hides that."""
+SLOW_SHARE: Final = np.array([0.42, 0.33, 0.28, 0.55, 0.55, 0.3])
+"""Share of the sigma of the search over the ground, for a camera that hardly moves: the search sees it better than its
+curvature says."""
 
-SLOW: Final = 3.0
-"""Speed over the height from which on the share is 1 [1/s]."""
+FAST_SHARE: Final = np.array([0.5, 0.85, 0.9, 0.85, 0.7, 0.65])
+"""The same from SLOW on; linear between."""
+
+SLOW: Final = 2.0
+"""Speed over the height of the camera from which on it is fast [1/s]."""
+
+SURE: Final = 2.0
+"""Growth of the odds of a vehicle since their start (see `vehicle`) from which on these shares hold in full."""
+
+UNSURE: Final = np.array([2.5, 3.0, 1.0, 4.0, 3.0, 3.0])
+"""The same share while the odds are below their start: such a camera is often in the air."""
 
 
 def of_rotation(motion: Array, covariance: Array, before: Array, network_rad_s: Array) -> Array:
@@ -87,6 +102,7 @@ def of_rotation(motion: Array, covariance: Array, before: Array, network_rad_s: 
         SHIFT_CHANGE * shift_change,
         np.array([AHEAD * float(shift[2]), 0.0, 0.0]),
         NETWORK * np.abs(rate - network_rad_s),
+        np.full(3, TREMBLE_RAD_S),
     ]
     return covariance[:3, :3] * np.outer(SEARCH_SHARE, SEARCH_SHARE) + np.diag(np.square(terms).sum(axis=0))
 
@@ -104,7 +120,7 @@ def of_unknown_depth(covariance: Array, shift: float, rate_rad_s: float, scale_m
     return covariance + np.diag([more] * 3 + [0.0] * 3)
 
 
-def of_ground(twist: Array, covariance: Array, tilt: float, pitch_sigma: float, height_m: float) -> Array:
+def of_ground(twist: Array, covariance: Array, tilt: float, pitch_sigma: float, height_m: float, odds: float) -> Array:
     """Covariance (6, 6) of a motion over the ground.
 
     Args:
@@ -113,9 +129,12 @@ def of_ground(twist: Array, covariance: Array, tilt: float, pitch_sigma: float, 
         tilt: mean square rate of pitch and roll in the last second, before the search over the ground [rad^2/s^2].
         pitch_sigma: of the pitch [rad].
         height_m: of the camera.
+        odds: logarithm of the odds that the camera is on a vehicle; below 0, the angular part is not used.
     """
-    share = SLOW_SHARE + (1 - SLOW_SHARE) * min(1.0, float(np.linalg.norm(twist[:3])) / (SLOW * height_m))
-    shares = np.array([share, 1.0, share, share, share, share])
+    fast = min(1.0, float(np.linalg.norm(twist[:3])) / (SLOW * height_m))
+    of_vehicle = SLOW_SHARE + (FAST_SHARE - SLOW_SHARE) * fast
+    sure = min(max((odds - START) / SURE, 0.0), 1.0)
+    shares = UNSURE if 0 <= odds < START else 1 + sure * (of_vehicle - 1)
     tilting = math.sqrt(max(0.0, tilt - TILT_FLOOR_RAD_S**2)) * min(1.0, pitch_sigma / UNKNOWN_PITCH)
     metres = np.array([height_m] * 3 + [1.0] * 3)
     aside_m_s2 = float(np.linalg.norm(twist[:3])) * abs(float(twist[4]))

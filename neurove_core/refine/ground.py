@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from neurove_core.ingest.sample import Sample
 from neurove_core.refine import ground_kernels as kernels
+from neurove_core.refine import ground_pitch
 from neurove_core.refine.ground_kernels import Image, Rays
 from neurove_core.refine.ground_search import UNKNOWNS, Prior, climb, motion_of, objective
 from neurove_core.refine.ground_sway import Sway, swayed
@@ -106,8 +107,6 @@ _DRAWN: Final = 4 / 9  # mean square of the weights of an event that is drawn in
 _STEPS: Final = 14  # evaluations of a search
 _TOLERANCE: Final = 0.02  # of a search [sigma]
 _CALIBRATION: Final = np.array([0.6, 0.5, 1.0, 0.42, 0.7, 0.4, 0.7, 0.7, 0.7])  # of sigma
-_PITCH_DRIFT: Final = math.radians(0.2)  # from window to window
-_LEAST_PITCH_SIGMA: Final = math.radians(0.5)
 _TILT_SHARE: Final = 0.1  # of a new window in the mean square rate of pitch and roll
 
 
@@ -226,7 +225,7 @@ def refine(
     if max(near, far) < LEAST_EVENTS:
         return Answer("few events", None, state._replace(last=None))
     begin_us = end_us - window_us * len(used)
-    found, unknowns, pitch_sigma = _searched(seen, (begin_us + end_us) // 2, camera, twist, sigma_rad_s, state)
+    found, unknowns, by_events = _searched(seen, (begin_us + end_us) // 2, camera, twist, sigma_rad_s, state)
     if found.structure < MIN_STRUCTURE[0] + MIN_STRUCTURE[1] * (found.events / EVENTS) ** 2:
         return Answer("noise", found, state._replace(last=None))
     if found.distance > MAX_SIGMAS or _distance(found, twist, measured) > MAX_RATE_SIGMAS:
@@ -236,7 +235,8 @@ def refine(
     if near < max(LEAST_EVENTS, LEAST_SHARE * far):
         twist, sway = swayed(found.twist, state.pitch, state.sway)
         return Answer("turning", found._replace(twist=twist), state._replace(last=None, sway=sway))
-    pitch, pitch_sigma = _learned(state, found.pitch, pitch_sigma, 1 / len(used))
+    known = ground_pitch.Pitch(state.pitch, state.pitch_sigma)
+    pitch, pitch_sigma = ground_pitch.learned(known, by_events, 1 / len(used), PITCH_SIGMA)
     twist, sway = swayed(found.twist, found.pitch, state.sway, height_m)
     found, answers = _on_time(found._replace(twist=twist), state.answers, begin_us, end_us, window_us)
     ahead = math.sqrt(found.covariance[2, 2]) / height_m
@@ -284,16 +284,6 @@ def _windows(span_us: int, window_us: int) -> int:
     return -(-span_us // window_us)
 
 
-def _learned(state: GroundState, pitch: float, sigma: float, share: float) -> tuple[float, float]:
-    """The pitch for the next window and its sigma [rad], by a Kalman filter: only a share of the events is new."""
-    known = state.pitch_sigma**-2
-    after = max(min(sigma, state.pitch_sigma), 1e-4) ** -2
-    new = (after - known) * share
-    moved = (pitch - state.pitch) / max(1 - known / after, 1e-3)  # what the events alone say
-    sigma = max((known + new) ** -0.5, _LEAST_PITCH_SIGMA)
-    return state.pitch + new / (known + new) * moved, min(math.hypot(sigma, _PITCH_DRIFT), PITCH_SIGMA)
-
-
 def _kept(new: GroundEvents, pitch: float) -> GroundEvents:
     """The events of a window that may be on the ground, or far away, for all likely pitches; thinned."""
     depth, margin = math.cos(pitch) * new.y + math.sin(pitch), _NEAREST_HORIZON / 2
@@ -328,8 +318,8 @@ def on_ground(recent: Sequence[GroundEvents], pitch: float) -> GroundEvents:
 
 def _searched(
     seen: GroundEvents, reference_us: int, camera: CameraInfo, twist: Array, sigma_rad_s: Array, state: GroundState
-) -> tuple[GroundMotion, Array, float]:
-    """The most probable motion, as a motion (9,) of `sharpness` too, and sigma of the pitch [rad]."""
+) -> tuple[GroundMotion, Array, ground_pitch.Pitch]:
+    """The most probable motion, as a motion (9,) of `sharpness` too, and the pitch for the next window."""
     height_m = camera.height_m or 1.0
     image = image_of(camera)
     rays = rays_of(seen, reference_us, state.pitch, image, (state.walls[0] * height_m, state.walls[1] * height_m))
@@ -352,7 +342,7 @@ def _searched(
         distance=float(np.linalg.norm(z[:6])),
         events=rays.x.size,
     )
-    return found, motion, math.sqrt(covariance[6, 6]) / float(_CALIBRATION[6])
+    return found, motion, ground_pitch.by_events(z, information, prior)
 
 
 def image_of(camera: CameraInfo) -> Image:

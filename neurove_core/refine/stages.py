@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.refine import rotation, scene, search, vehicle
+from neurove_core.refine import errors, rotation, scene, search, vehicle
 from neurove_core.refine.alignment import Grid
 from neurove_core.refine.ground import Outcome
 from neurove_core.refine.rotation import MAX_AGAINST, MIN_SPREAD, Filter, Given, Rate, Refined, drives, floored, spread
@@ -149,7 +149,9 @@ def _turn(given: Given, found: Moved, before: Scene | None) -> Refined:
     covariance = found.covariance[:3, :3] + np.eye(3) * (_DEPTH_ERROR * float(np.linalg.norm(found.shift))) ** 2
     filtered = Filter(motion, found.covariance, end_us, MAX_AGAINST)  # it outweighs no network
     rate = Rate(found.w_rad_s, covariance)
-    return Refined(rate, "accepted", filtered, change, np.sqrt(np.diagonal(covariance)), motion=motion)
+    wider = covariance + np.eye(3) * errors.TREMBLE_RAD_S**2
+    sigma = np.sqrt(np.diagonal(covariance))
+    return Refined(rate, "accepted", filtered, change, sigma, errors=wider, motion=motion)
 
 
 def _velocity(given: Given, found: Moved) -> Velocity:

@@ -31,6 +31,7 @@ ALL = (
     "processes",
     "metrics",
     "narrow",
+    "gpu",
 )
 
 FIGURES = "figures"
@@ -75,7 +76,7 @@ def bench(args: argparse.Namespace) -> int:
 
 
 def _rows(name: str, args: argparse.Namespace, missing: list[str]) -> Iterator["Row"]:
-    from neurove_core.bench import ingest, processes, refinement, served, simulate, sine, window
+    from neurove_core.bench import device, ingest, processes, refinement, served, simulate, sine, window
     from neurove_service.cli import bench_metrics
     from neurove_service.clients import bench_wire
 
@@ -95,6 +96,7 @@ def _rows(name: str, args: argparse.Namespace, missing: list[str]) -> Iterator["
         "processes": lambda: processes.processes(_rounds(args, 7), quick=args.quick),
         "metrics": lambda: bench_metrics.metrics(_rounds(args, 11), quick=args.quick),
         "narrow": lambda: _narrow(args, missing),
+        "gpu": lambda: device.gpu(_rounds(args, 15), missing, quick=args.quick),
     }
     yield from run[name]()
 
@@ -126,6 +128,8 @@ def _rounds(args: argparse.Namespace, usual: int) -> int:
 
 def _sentence(row: "Row") -> str:
     agree = {True: "equal answers", False: "DIFFERENT ANSWERS", None: "a different computation by design"}[row.equal]
+    if row.deviation is not None:
+        agree = f"rounded in another order, its result deviates by {row.deviation:+.2%}"
     share = "" if row.share_of_limit is None else f", {row.share_of_limit:.0%} of this machine's limit"
     against = f"{row.ratio:.2f} times as fast as {row.peer} ({row.peer_ms:.3g} ms; {agree})"
     return f"{row.name}: {row.ours_ms:.3g} ms{share}; {against}"

@@ -10,6 +10,7 @@ from typing import Any
 from neurove_protocol.errors import EXIT_FAILURE, InvalidField
 from neurove_service.cli.arguments import add_refine_flag, check_folder, commit, count, seed, subcommand
 from neurove_service.cli.bars import progress
+from neurove_service.cli.devices import add_device_flag, runner_on
 from neurove_service.cli.parser import Parser
 from neurove_service.cli.pools import add_pool_flags, pool_of
 
@@ -130,6 +131,7 @@ def reproduce_motion(args: argparse.Namespace) -> int:
 
     from neurove_core import models
     from neurove_core.estimator import Estimator
+    from neurove_core.evaluation.estimates import AT_ONCE
     from neurove_core.experiments.motion import run, sets
 
     groups = args.sets.split(",") if args.sets else (*sets.GROUPS, sets.REAL)
@@ -142,9 +144,13 @@ def reproduce_motion(args: argparse.Namespace) -> int:
     for folder in (args.out, args.data):
         _check_out(folder)
     torch.set_num_threads(1)
-    estimator = Estimator(models.find(args.model), refine=args.refine == "auto")
+    model = models.find(args.model)
+    estimator = Estimator(model, runner_on(args, model, "reproduce motion"), refine=args.refine == "auto")
+    at_once = 1 if args.device is None else AT_ONCE
     with pool_of(args) as pool, progress() as show:
-        found = run.run(estimator, groups, args.recordings, args.data, show, quick=args.quick, pool=pool)
+        found = run.run(
+            estimator, groups, args.recordings, args.data, show, quick=args.quick, pool=pool, at_once=at_once
+        )
     results = {"model": estimator.bundle.info.model_dump()} | _made_by() | {"quick": args.quick} | found
     print(json.dumps(results) + "\n" if args.json else run.markdown(results), end="")
     for file in run.save(results, args.out) if args.out else []:
@@ -268,6 +274,7 @@ def _add_motion(parser: argparse.ArgumentParser) -> None:
     about = "one second of one recording per set through a tiny camera, to check that the command works"
     parser.add_argument("--quick", action="store_true", help=about)
     add_refine_flag(parser)
+    add_device_flag(parser)
     add_pool_flags(parser, "simulate")
     _add_out(parser, "folder for motion.json and motion.md")
 

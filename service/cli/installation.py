@@ -36,10 +36,23 @@ def check_kernels() -> Check:
     if not _writable(folder):
         state = f"{count} cached; {folder} is not writable"
         return Check("compiled kernels", state, "bad", "set NUMBA_CACHE_DIR to a folder that the service may write")
+    if not count and _brings_code():
+        return Check("compiled kernels", "in the package, for the built-in model", "ok")
     if not count:
         advice = "nothing: the first start compiles them and is slow"
         return Check("compiled kernels", f"none cached in {folder}", "info", advice)
     return Check("compiled kernels", f"{count} cached in {folder}", "ok")
+
+
+def _brings_code() -> bool:
+    """Whether the installation has compiled code for this processor, of the present sources."""
+    if absent("serve"):
+        return False
+    from neurove_core import models
+    from neurove_core.compiled import ahead
+    from neurove_core.warming import complete_for
+
+    return ahead.complete_for() == complete_for(models.find(models.DEFAULT).config)
 
 
 def _cache_root() -> Path:

@@ -52,6 +52,13 @@ def settings_for(processor: str | None, cache: Path) -> dict[str, str]:
     return folder | {"NUMBA_CPU_NAME": processor, "NUMBA_CPU_FEATURES": ",".join(f"+{one}" for one in features)}
 
 
+def name_here() -> str:
+    """What LLVM calls the processor of this machine."""
+    from llvmlite import binding
+
+    return str(binding.get_host_cpu_name())
+
+
 def missing(features: tuple[str, ...]) -> list[str]:
     """Those of some features that this machine lacks; on another architecture all of them."""
     if platform.machine() not in ("x86_64", "AMD64"):

@@ -21,13 +21,14 @@ from neurove_service.cli.arguments import (
     tell_faults,
 )
 from neurove_service.cli.bars import event_count, progress
+from neurove_service.cli.devices import add_device_flag, refuse_pool, runner_on
 from neurove_service.cli.extras import one_thread
 from neurove_service.cli.pools import add_pool_flags, pool_of
 from neurove_service.lifecycle import end_with_parent
 
 if TYPE_CHECKING:
     from neurove_core.estimator import Estimator
-    from neurove_core.evaluation.evaluate import Estimates
+    from neurove_core.evaluation.estimates import Estimates
     from neurove_core.geometry.motion import Twists
     from neurove_core.io import Recording
     from neurove_core.tasks import FailedTasks, Pool
@@ -147,7 +148,9 @@ def evaluate(args: argparse.Namespace) -> int:
     from neurove_core.sources import open_source
 
     one_thread()
-    estimator = Estimator(models.find(args.model), refine=args.refine == "auto")
+    refuse_pool(args, "evaluate")
+    model = models.find(args.model)
+    estimator = Estimator(model, runner_on(args, model, "evaluate"), refine=args.refine == "auto")
     given = motion.twists(read_truth(args.truth)) if args.truth else None
     if args.plot:
         check_folder("evaluate", "--plot", args.plot)
@@ -178,10 +181,17 @@ def _estimates(
     args: argparse.Namespace, estimator: "Estimator", recordings: "list[Recording]", pool: "Pool"
 ) -> "tuple[dict[int, Estimates], FailedTasks | None]":
     """The estimates for each recording, by its number, and the error that names the recordings that failed."""
-    from neurove_core.evaluation.evaluate import estimate_recording
+    from neurove_core.evaluation.estimates import estimate_recording, estimate_recordings
     from neurove_core.tasks import HERE, FailedTasks
 
     found: dict[int, Estimates] = {}
+    if args.device is not None:
+        estimator.warm_up()
+        with event_count(f"{len(recordings)} recordings on {args.device}") as show:
+            together = estimate_recordings(estimator, recordings, show, inertial=not args.no_imu)
+        for recording in recordings:
+            tell_faults(recording)
+        return dict(enumerate(together)), None
     if pool is HERE:
         estimator.warm_up()
         for number, recording in enumerate(recordings):
@@ -317,6 +327,7 @@ def add_evaluate(parser: argparse.ArgumentParser) -> None:
     add_refine_flag(parser)
     parser.add_argument("--no-imu", action="store_true", help="use the events alone, not the inertial samples")
     parser.add_argument("--plot", type=Path, metavar="DIR", help="draw truth and estimate over time into this folder")
+    add_device_flag(parser)
     add_pool_flags(parser, "run the model on one recording each")
 
 

@@ -5,6 +5,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from itertools import islice
@@ -15,7 +16,7 @@ from neurove_protocol.errors import InvalidField
 from neurove_service.cli.arguments import command
 from neurove_service.cli.bars import progress
 from neurove_service.cli.extras import absent
-from neurove_service.cli.processors import FILE, PROCESSORS, settings_for, write_settings
+from neurove_service.cli.processors import FILE, PROCESSORS, name_here, settings_for, write_settings
 
 _SCENES: Final = ("street", "room", "wall")
 """Scenes of the simulator that together run all of its loops."""
@@ -32,9 +33,13 @@ class _Step(NamedTuple):
 
 def warm_up(args: argparse.Namespace) -> int:
     """Compile ahead what serve, demo, drive and simulate run, and say where it is kept."""
+    if args.ahead:
+        return _ahead(args)
     if args.cpu or args.out:
         return _elsewhere(args)
-    from neurove_core.compiled import work
+    from neurove_core import models
+    from neurove_core.compiled import work, write_ahead
+    from neurove_core.warming import complete_for, note_complete
     from neurove_service import logs
 
     logs.configure("warning")
@@ -45,6 +50,10 @@ def warm_up(args: argparse.Namespace) -> int:
             show("compiling", done, len(steps), step.name)
             step.run()
         show("compiling", len(steps), len(steps), "done")
+    if args.ahead_as:
+        print(write_ahead(args.ahead_as, complete_for(models.find(args.model).config)))
+        return 0
+    note_complete()
     found, took_s = work(), time.monotonic() - began
     caches = _roots(found.folders)
     if args.json:
@@ -64,7 +73,9 @@ def warm_up(args: argparse.Namespace) -> int:
 def _elsewhere(args: argparse.Namespace) -> int:
     """Compile for a named processor, or into a folder, in a process that is set up so."""
     if args.out is None:
-        raise InvalidField("warm-up", "--out", "", "a folder, because --cpu makes code that this machine does not use")
+        raise InvalidField(
+            "warm-up", "--out", "", "a folder, or --ahead, because --cpu makes code that this machine does not use"
+        )
     settings = settings_for(args.cpu, args.out)
     try:
         args.out.mkdir(parents=True, exist_ok=True)
@@ -83,6 +94,40 @@ def _elsewhere(args: argparse.Namespace) -> int:
     print(f"cache: {args.out}; a service uses it with the environment in {written}:")
     for name, value in settings.items():
         print(f"  {name}={value}")
+    return 0
+
+
+def _ahead(args: argparse.Namespace) -> int:
+    """Compile in one process, and let a second one, which loads all of it, write it into the package.
+
+    The second process loads only what Python code calls, not the functions that these call.
+    """
+    from neurove_core.compiled.ahead import FOLDER, SWITCH
+
+    if args.out is not None:
+        raise InvalidField("warm-up", "--out", str(args.out), "absent with --ahead, which writes into the package")
+    with tempfile.TemporaryDirectory() as cache:
+        settings = settings_for(args.cpu, Path(cache)) | {SWITCH: "off"}
+        name = args.cpu or name_here()
+        own = FOLDER / name
+        try:
+            own.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            why = f"a package that this user may write; {error.strerror}"
+            raise InvalidField("warm-up", "--ahead", str(own), why) from error
+        command = [sys.executable, "-m", "neurove_service.cli", "warm-up", "--model", str(args.model), "--json"]
+        for more in ([], ["--ahead-as", name]):
+            child = subprocess.run(
+                [*command, *more], env=os.environ | settings, stdout=subprocess.PIPE, text=True, check=False
+            )
+            if child.returncode != 0:
+                return child.returncode
+    size = sum(one.stat().st_size for one in own.iterdir())
+    if args.json:
+        print(json.dumps({"files": int(child.stdout), "bytes": size, "folder": str(own), "processor": name}))
+        return 0
+    print(f"{int(child.stdout)} files of compiled code for {name}, {size / 1e6:.1f} MB: {own}")
+    print("All users of this installation start with it on processors of this kind, and compile nothing.")
     return 0
 
 
@@ -124,8 +169,14 @@ def add_warm_up(parser: argparse.ArgumentParser) -> None:
     made.add_argument(
         "--cpu",
         metavar="NAME",
-        help=f"compile for this processor instead of the one of this machine; needs --out ({', '.join(PROCESSORS)})",
+        help=f"compile for this processor instead of this machine's; needs --out or --ahead ({', '.join(PROCESSORS)})",
     )
+    made.add_argument(
+        "--ahead",
+        action="store_true",
+        help="write the compiled code into the installed package: for all users of it, for an image or for a wheel",
+    )
+    made.add_argument("--ahead-as", metavar="NAME", help=argparse.SUPPRESS)
     made.add_argument(
         "--out",
         metavar="DIR",

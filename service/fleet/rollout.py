@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 
 from neurove_protocol.control import HealthReply
 from neurove_service.config import ClientConfig
-from neurove_service.fleet import plan, roster
+from neurove_service.fleet import pairs, plan, roster
 from neurove_service.fleet.changing import Changer, Crew
 from neurove_service.fleet.journal import Event, Journal
 from neurove_service.fleet.ledger import Ledger, Target, Terms
@@ -163,6 +163,8 @@ class Rollout:
             for one in self.ledger.of("pending")
             if one.node in found.replies and self._retry_at_s.get(one.node, now_s) <= now_s
         ]
+        busy = [one.node for one in self.ledger.of("changing", "active")]
+        heard = pairs.apart(heard, found.replies, busy)
         wanted = [one for one in self._interrupted() if one.node in found.replies] + heard[: max(0, due)]
         return {one.node for one in wanted[: self._crew.free] if self._change(one, found.replies[one.node])}
 
@@ -195,6 +197,8 @@ class Rollout:
 
     def _judge(self, found: Roster, now_s: float) -> None:
         """Apply the answers to the nodes that have the bundle; only an answer makes a node fine."""
+        others = pairs.partners(found.replies)
+        unchanged = {one.node for one in self.ledger.of("pending", "changing")}
         for target in self.ledger.of("active", "fine"):
             was_fine, reply = target.state == "fine", found.replies.get(target.node)
             if target.node not in self._soaks:  # of a resumed rollout: a soak that was interrupted begins again
@@ -202,6 +206,7 @@ class Rollout:
             soak = self._soaks[target.node]
             if reply is None and was_fine:
                 continue
+            reply = reply and pairs.excused(reply, others[target.node], unchanged)
             silence = found.silent.get(target.node, roster.NOT_CONNECTED)
             finding = soak.heard(reply, now_s, found.asked_s) if reply is not None else soak.silent(now_s, silence)
             if finding.result == "failed":

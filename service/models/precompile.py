@@ -2,7 +2,8 @@
 
 numba compiles for seconds in Python code. In the process of the node each step of a stream would wait for its turn in
 between. The child compiles into the cache on disk, at low priority; the node then reads the cache. Networks of a known
-shape need none of this. At a start with an empty cache, children compile the parts of all code at the same time.
+shape need none of this. At a start with a cache that is empty or stale, children compile the parts of all code at the
+same time.
 
 `python -m neurove_service.models.precompile CONFIG [PART...]` takes the configuration of the model as JSON. It lowers
 its priority where it names no part.
@@ -18,7 +19,7 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from neurove_core.config import ModelConfig
-from neurove_core.warming import PARTS, compile_part, is_cold
+from neurove_core.warming import PARTS, compile_part, lacks_code, note_complete
 from neurove_service import logs
 
 log = logs.get(__name__)
@@ -64,21 +65,23 @@ def in_child(config: ModelConfig, stop: threading.Event, timeout_s: float = TIME
 
 
 def at_start(config: ModelConfig, free_bytes: Callable[[], int | None]) -> None:
-    """Compile all code for the first model of a node in children, where the cache is empty.
+    """Compile all code for the first model of a node in children, where the cache lacks a part of it.
 
-    What they do not compile, the node compiles by itself.
+    It is empty, or its code was made of other sources, as after an update. What they do not compile, the node compiles
+    by itself.
 
     Args:
         config: of the model.
         free_bytes: says the free memory [bytes], if it is known; it limits the number of children.
     """
-    if config.kind != "neurove" or not is_cold():
+    if config.kind != "neurove" or not lacks_code(config):
         return
     free = free_bytes()
     most = len(_GROUPS) if free is None else free // CHILD_BYTES
     if most and (os.cpu_count() or 1) > 1:
         groups = _GROUPS[min(most, len(_GROUPS)) - 1]
-        _finish([_start(config, parts) for parts in groups], threading.Event(), _START_S)
+        if _finish([_start(config, parts) for parts in groups], threading.Event(), _START_S):
+            note_complete()
 
 
 _GROUPS: Final = ((PARTS,), (PARTS[:1], PARTS[1:]), tuple((part,) for part in PARTS))

@@ -23,6 +23,7 @@ from neurove_service.node import memory
 from neurove_service.node.condition import Watch
 from neurove_service.node.fellows import Fellows
 from neurove_service.node.folders import check_folders
+from neurove_service.node.followers import Followers
 from neurove_service.node.handlers import Handlers
 from neurove_service.node.housekeeping import Housekeeping
 from neurove_service.node.namesakes import Namesakes
@@ -88,6 +89,24 @@ def _fellows(config: ServiceConfig, transport: Transport) -> Fellows | None:
 
 def _sharing(config: ServiceConfig) -> Sharing:
     return Sharing(config.node, config.streams, config.copies, config.capacity)
+
+
+def _registry(
+    config: ServiceConfig,
+    slot: ModelSlot,
+    transport: Transport,
+    guard: Guard,
+    fellows: Fellows | None,
+    takes: Callable[[str], bool],
+) -> StreamRegistry:
+    return StreamRegistry(
+        slot,
+        _stream_settings(config),
+        lambda name: open_outlet(transport, config.keys, config.node, name),
+        guard,
+        fellows.open_duty if fellows else alone,
+        takes,
+    )
 
 
 def _housekeeping(
@@ -165,23 +184,23 @@ class Service:
             raise
         with opened as transport:
             fellows, sharing = _fellows(self._config, transport), _sharing(self._config)
-            registry = StreamRegistry(
-                self._slot,
-                _stream_settings(self._config),
-                lambda name: open_outlet(transport, self._keys, self._config.node, name),
-                self._guard,
-                fellows.open_duty if fellows else alone,
-                sharing.takes,
-            )
+            followers = Followers(sharing.takes, fellows) if fellows else None
+            takes = followers.takes if followers else sharing.takes
+            registry = _registry(self._config, self._slot, transport, self._guard, fellows, takes)
             namesakes = Namesakes(transport, self._keys, self._config.node)
             namesakes.join(self._stop, allowed=self._config.allow_same_name)
             watch = Watch(
-                self._config.node, registry, self._guard, self._config.expect_streams, lambda: namesakes.count
+                self._config.node,
+                registry,
+                self._guard,
+                self._config.expect_streams,
+                lambda: namesakes.count,
+                lambda: followers.left_out if followers else (),
             )
-            if fellows:
-                fellows.join()
+            if fellows and followers:
+                fellows.join(self._stop)
                 sharing.join(transport, self._keys)
-                Moving(sharing, registry, fellows, self._guard).start(self._stop)
+                Moving(sharing, registry, fellows, followers, self._guard).start(self._stop)
             handlers = self._declare(transport, registry, watch)
             self._log_ready()
             housekeeping = _housekeeping(self._config, transport, registry, watch, self._guard)

@@ -1,13 +1,14 @@
 """Condition: what is wrong with a node as a whole, apart from its streams and its models."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
 from neurove_protocol.control import StreamStatus
 from neurove_service import logs
 from neurove_service.guard import Guard
+from neurove_service.node.followers import unfollowed
 from neurove_service.node.health import stream_status
 from neurove_service.streams.activity import IDLE_NS
 from neurove_service.streams.registry import StreamRegistry
@@ -25,6 +26,7 @@ class Condition(NamedTuple):
     missing_streams: tuple[str, ...] = ()  # expected, and without packets now
     namesakes: int = 0  # other nodes of this name on the network
     other_models: Mapping[str, str] = MappingProxyType({})  # stream -> model of the node that answers it, or did before
+    unfollowed: Sequence[str] = ()  # streams that it follows no more, because it cannot keep up
 
     def reasons(self) -> list[str]:
         """Why the node is not ok, each as the part of a sentence."""
@@ -39,6 +41,8 @@ class Condition(NamedTuple):
             f"the standby of stream {stream} is not warm: the other node has the model {model}, this one another"
             for stream, model in self.other_models.items()
         ]
+        if self.unfollowed:
+            reasons.append(unfollowed(self.unfollowed))
         if self.refused_streams:
             reasons.append(f"{self.refused_streams} streams refused: max_streams reached")
         return reasons
@@ -53,6 +57,7 @@ class Watch:
         guard: its internal errors.
         expected: the streams that it must serve.
         namesakes: number of other nodes of its name.
+        left_out: the streams that it follows no more.
     """
 
     def __init__(
@@ -62,9 +67,10 @@ class Watch:
         guard: Guard,
         expected: tuple[str, ...] = (),
         namesakes: Callable[[], int] = lambda: 0,
+        left_out: Callable[[], Sequence[str]] = tuple,
     ) -> None:
         self._node, self._registry, self._guard = node, registry, guard
-        self._expected, self._namesakes = expected, namesakes
+        self._expected, self._namesakes, self._left_out = expected, namesakes, left_out
 
     def statuses(self) -> list[StreamStatus]:
         """Status of every stream; one that cannot be told is left out."""
@@ -88,6 +94,7 @@ class Watch:
             stuck_streams=tuple(self._registry.stuck()),
             missing_streams=tuple(name for name in self._expected if name not in present),
             namesakes=self._namesakes(),
+            unfollowed=self._left_out(),
             other_models={
                 stream.name: standby.other_model
                 for stream in self._registry.streams()

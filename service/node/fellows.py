@@ -21,6 +21,7 @@ from neurove_protocol.keys import Keys
 from neurove_service import logs
 from neurove_service.streams.duty import Duty
 from neurove_service.streams.pair import Pair
+from neurove_service.streams.pulse import Pulse
 from neurove_service.streams.tenure import Tenure
 from neurove_service.transport import Transport
 
@@ -28,6 +29,8 @@ log = logs.get(__name__)
 
 _STATE_S = 0.5  # for a state, on both sides
 _STATES_AT_ONCE = 16  # requests for a state; each waits until its stream has reached the window
+_FETCHES_AT_ONCE = 2  # of the states of other nodes; each keeps a worker waiting
+_TOKENS_S = 1.0
 _TAKE_S = 1.0
 _POLL_S = 0.005
 
@@ -46,11 +49,14 @@ class Fellows:
         self._transport, self._keys, self._node, self._reluctant = transport, keys, node, reluctant
         self._pairs: dict[str, Pair] = {}
         self._serving: defaultdict[str, set[str]] = defaultdict(set)  # stream -> the other nodes that serve it
+        self._heard_ns: dict[str, int] = {}  # other node -> when anything was heard of it last
+        self._fetches, self._pulse = threading.BoundedSemaphore(_FETCHES_AT_ONCE), Pulse()
         self._lock = threading.Lock()
         self._draining = False
 
-    def join(self) -> None:
-        """Hear the other nodes and answer their questions; before the first packet."""
+    def join(self, stop: threading.Event) -> None:
+        """Hear the other nodes and answer their questions, until the event is set; before the first packet."""
+        self._pulse.start(stop)
         keys, node, transport = self._keys, self._node, self._transport
         transport.watch_tokens(keys.serves(), self._on_token)
         transport.subscribe_timed(keys.velocity(), self._on_estimate, remote=True)
@@ -58,11 +64,14 @@ class Fellows:
         transport.answer_streaming(keys.state(node), lambda request, _: self._state(request), _STATES_AT_ONCE)
         transport.answer(keys.take(node), self._take)
         transport.answer_streaming(keys.drain(node), lambda request, _: self._drain(request))
+        transport.tokens(keys.serves(), _TOKENS_S)  # once these are there, those that are watched are known too
 
     def open_duty(self, stream: str, wake: Callable[[], None]) -> Duty:
         """The duty of a stream that begins."""
         tenure = Tenure(self._node, stream, self, reluctant=self._reluctant)
-        pair = Pair(tenure, self, wake, on_close=lambda closed: self._forget(stream, closed))
+        pair = Pair(
+            tenure, self, wake, on_close=lambda one: self._forget(stream, one), suspended_ns=self._pulse.longest_ns
+        )
         pair.drain(draining=self._draining)
         self._pairs[stream] = pair
         return pair
@@ -72,15 +81,30 @@ class Fellows:
         with self._lock:
             return sorted(self._serving.get(stream, ()))
 
+    def heard_ns(self, node: str) -> int:
+        """When an estimate or a reply of another node was heard last (monotonic); 0 if none was [ns]."""
+        return self._heard_ns.get(node, 0)
+
+    def duties(self) -> list[DutyReply]:
+        """What this node does on each of its streams."""
+        return [pair.reply() for pair in list(self._pairs.values())]
+
     def roles(self, stream: str, timeout_s: float) -> list[DutyReply]:
         """What the other nodes do on a stream, as far as they reply in time."""
         replies = self._ask(self._keys.duty(), DutyRequest(stream=stream), DutyReply, timeout_s)
-        return [one for one in replies if one.node != self._node]
+        others = [one for one in replies if one.node != self._node]
+        self._heard_ns |= dict.fromkeys([one.node for one in others], time.monotonic_ns())
+        return others
 
     def state(self, stream: str, node: str, digest: str, after_us: int | None = None) -> StateReply | None:
-        """The state of a stream on another node, after a window with this end or a later one."""
-        request = StateRequest(stream=stream, digest=digest, after_us=after_us)
-        replies = self._ask(self._keys.state(node), request, StateReply, _STATE_S)
+        """The state of a stream on another node, after a window with this end or a later one; a few at once."""
+        if not self._fetches.acquire(blocking=False):
+            return None
+        try:
+            request = StateRequest(stream=stream, digest=digest, after_us=after_us)
+            replies = self._ask(self._keys.state(node), request, StateReply, _STATE_S)
+        finally:
+            self._fetches.release()
         return replies[0] if replies else None
 
     def take(self, stream: str, node: str, term: int, last_us: int | None, timeout_s: float) -> bool:
@@ -131,7 +155,7 @@ class Fellows:
         if resigned is None:
             return "", "this node did not stop to answer"
         self.take(stream, target, resigned.term, resigned.start_us, patience_s)
-        if not pair.flows:
+        if not pair.pauses.flows:
             return target, ""
         deadline = time.monotonic() + 5 * patience_s
         while time.monotonic() < deadline:
@@ -162,11 +186,12 @@ class Fellows:
                 log.warning("reply refused", key=answer.key, why=error.message)
         return found
 
-    def _on_estimate(self, key: str, payload: bytes, _received_ns: int, _sent_us: int | None) -> None:
+    def _on_estimate(self, key: str, payload: bytes, received_ns: int, _sent_us: int | None) -> None:
         pair = self._pairs.get(self._keys.stream_of(key))
         if pair is not None:
             estimate = TwistEstimate.decode(payload)
             if estimate.node != self._node:
+                self._heard_ns[estimate.node or ""] = received_ns
                 pair.heard(estimate)
 
     def _on_token(self, key: str, present: bool) -> None:  # as transport calls it

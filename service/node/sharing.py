@@ -4,18 +4,21 @@ import fnmatch
 import hashlib
 import math
 import threading
+import time
 from collections.abc import Mapping
 
 from neurove_protocol.keys import Keys
 from neurove_service import logs
 from neurove_service.guard import Guard
 from neurove_service.node.fellows import Fellows
+from neurove_service.node.followers import Followers
 from neurove_service.streams.registry import StreamRegistry
 from neurove_service.transport import Transport
 
 log = logs.get(__name__)
 
 _TURN_S = 0.1
+_RETRY_S = 0.5  # after a stream could not be given away
 
 
 def drawn(stream: str, capacities: Mapping[str, int]) -> list[str]:
@@ -88,31 +91,43 @@ class Sharing:
 class Moving:
     """Gives away the streams that other nodes take now: first another node follows with equal state, then it answers.
 
+    It also ends the workers of streams that this node follows no more because it cannot keep up.
+
     Args:
         sharing: which streams this node takes.
         registry: the streams that it serves.
         fellows: the other nodes.
+        followers: which streams it follows.
         guard: counts internal errors.
     """
 
-    def __init__(self, sharing: Sharing, registry: StreamRegistry, fellows: Fellows, guard: Guard) -> None:
+    def __init__(
+        self, sharing: Sharing, registry: StreamRegistry, fellows: Fellows, followers: Followers, guard: Guard
+    ) -> None:
         self._sharing, self._registry, self._fellows = sharing, registry, fellows
-        self._guard = guard
+        self._followers, self._guard = followers, guard
+        self._next_s: dict[str, float] = {}  # stream -> when to try again to give it away
 
     def start(self, stop: threading.Event) -> None:
-        """Look for such streams on a thread until the event is set; does nothing where streams do not move."""
-        if self._sharing.copies:
-            threading.Thread(target=self._run, args=(stop,), name="sharing", daemon=True).start()
+        """Look for such streams on a thread until the event is set."""
+        threading.Thread(target=self._run, args=(stop,), name="sharing", daemon=True).start()
 
     def _run(self, stop: threading.Event) -> None:
         while not stop.wait(_TURN_S):
+            with self._guard.at("sharing"):
+                self._registry.release(*self._followers.turn(self._registry.streams()))
             for stream in self._registry.streams():
                 if not self._sharing.takes(stream.name):
                     with self._guard.at("sharing", stream=stream.name):
                         self._give_away(stream.name)
 
     def _give_away(self, stream: str) -> None:
-        others = len(self._fellows.names(stream))
-        if others >= self._sharing.copies and self._fellows.leaves(stream):
+        now_s, others = time.monotonic(), len(self._fellows.names(stream))
+        if others < self._sharing.copies or now_s < self._next_s.get(stream, 0.0):
+            return
+        if self._fellows.leaves(stream):
+            self._next_s.pop(stream, None)
             self._registry.release(stream)
             log.info("stream given away", stream=stream)
+        else:
+            self._next_s[stream] = time.monotonic() + _RETRY_S

@@ -68,6 +68,7 @@ class Activity:
         self.last_packet_ns = self.last_estimate_ns = self.flow_began_ns = now_ns()
         self.last_loss_ns: int | None = None
         self.arrived_ns = 0  # when the newest packet arrived, which may still wait; written by Zenoh's thread
+        self.waited_ns = 0  # how long the newest packet waited in the queue
         self.taken_ns = 0  # when the newest packet was taken out of the queue
         self.reset_ns: deque[int] = deque(maxlen=_RESETS)  # times of the newest resets
         self.newest_ns: dict[str, int] = {}  # counter or flag -> when it last grew

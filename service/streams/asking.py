@@ -1,4 +1,4 @@
-"""Asking: what a node that answers a stream asks the others before it publishes, after a pause or a loss of its own."""
+"""Asking: what a node asks the others before it publishes, after a pause or a loss of its own, or while it is late."""
 
 import time
 from collections.abc import Callable
@@ -6,17 +6,19 @@ from typing import Final
 
 from neurove_protocol.duty import DutyReply
 from neurove_service import logs
+from neurove_service.streams.pauses import LONG_PAUSE_NS
 from neurove_service.streams.tenure import Peers, Tenure
 
 log = logs.get(__name__)
 
-LONG_PAUSE_NS: Final = 1_000_000_000
 LONG_WINDOWS: Final = 10
 """After a pause of so many windows, at most `LONG_PAUSE_NS`, packets may be lost, and another node may answer."""
 
 _REPLY_WINDOWS: Final = 2  # how long to wait for replies
 _LONG_REPLY_WINDOWS: Final = 8  # after a long pause
 _SILENT_NS: Final = 2_000_000_000  # how long a node that did not reply is not asked again after a short pause
+_ALIVE_NS: Final = 300_000_000  # a node that was heard within this time is not asked whether it is there
+_STUCK_NS: Final = 5_000_000_000  # a node that replies, but publishes nothing for this time, does not answer
 _LOSS_NS: Final = 1_000_000_000  # between two questions because of lost packets
 
 
@@ -41,7 +43,7 @@ class Asking:
     def __init__(self, tenure: Tenure, peers: Peers, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
         self._tenure, self._peers, self._now_ns = tenure, peers, now_ns
         self._silent: dict[str, int] = {}  # nodes that did not reply, and until when they are not asked again [ns]
-        self._next_loss_ns = 0
+        self._next_loss_ns = self._followed_ns = 0
 
     def after_pause(self, pause_ns: int, window_ns: int) -> None:
         """This node has paused: another node may have taken over.
@@ -87,6 +89,26 @@ class Asking:
         )
         if complete and self._peers.take(tenure.stream, complete[0], tenure.term, last_us, window_ns / 1e9):
             tenure.listen(f"packets are missing here, not on {complete[0]}", wary=True)
+
+    def is_answered(self, window_ns: int, *, patient: bool) -> bool:
+        """Whether another node answers the stream, though its estimates are late; then this node follows it.
+
+        Args:
+            window_ns: duration of a window.
+            patient: whether to wait longer for replies, because nothing is lost by it.
+        """
+        tenure, now_ns = self._tenure, self._now_ns()
+        names, leader = set(self._peers.names(tenure.stream)), tenure.leader
+        if not names or (leader and now_ns - max(tenure.heard_ns, self._followed_ns) > _STUCK_NS):
+            return False
+        if leader and now_ns - self._peers.heard_ns(leader) < _ALIVE_NS:
+            return True
+        replies = self._ask(names, (_LONG_REPLY_WINDOWS if patient else _REPLY_WINDOWS) * window_ns)
+        found = [(one.term, one.node) for one in replies if one.role == "answers" and one.term >= tenure.term]
+        if found and max(found) != (tenure.term, leader):
+            self._followed_ns = self._now_ns()
+            tenure.follow(max(found)[1], max(found)[0])
+        return bool(found)
 
     def _ask(self, names: set[str], timeout_ns: int) -> list[DutyReply]:
         replies = self._peers.roles(self._tenure.stream, timeout_ns / 1e9)

@@ -11,6 +11,10 @@ from neurove_service.streams.stream import Stream
 class Duty(Protocol):
     """Asked by the worker of a stream, on its thread."""
 
+    @property
+    def can_wait(self) -> bool:
+        """Whether workers of other streams go first."""
+
     def answer(self, estimate: TwistEstimate, /) -> list[TwistEstimate]:
         """The estimates to publish now that this one is there."""
 
@@ -29,6 +33,11 @@ class Duty(Protocol):
 
 class Alone:
     """The duty of a node without standby: it publishes every estimate."""
+
+    @property
+    def can_wait(self) -> bool:
+        """False."""
+        return False
 
     def answer(self, estimate: TwistEstimate) -> list[TwistEstimate]:
         """The estimate itself."""

@@ -20,6 +20,9 @@ KEPT: Final = 256
 BEHIND: Final = 8
 """A node that is so many windows behind the other one, or that catches up so many, is not ready to answer."""
 
+MAX_AHEAD_US: Final = 500_000
+"""A node that is further behind is not asked for the state: it waits at most so long before it replies."""
+
 _INCOMPLETE: Final = frozenset({Flag.GAP.value, Flag.OVERLOAD.value})
 _ANEW_US: Final = 5_000_000  # a clock that goes back further has begun anew
 _RETRY_NS, _MAX_RETRY_NS = 200_000_000, 60_000_000_000  # between requests for the state
@@ -53,6 +56,11 @@ class Following:
     def equal(self) -> bool:
         """Whether this node can go on with the estimates of the other one, bit for bit: it is equal and not behind."""
         return self._equal and not self._catches_up and len(self._heard) <= BEHIND
+
+    @property
+    def ahead_us(self) -> int:
+        """How far this node is ahead of the other one [us]; 0 if nothing was heard."""
+        return self._own_us - self._newest.start_us if self._newest is not None else 0
 
     @property
     def since_ns(self) -> int | None:
@@ -230,13 +238,26 @@ class Sync:
                 if asked.after_us is not None and lane.state.end_us < asked.after_us:
                     self._asked.append(asked)
                     continue
-                asked.found.append(Found(lane.state.end_us, carried.encode(lane.state)))
+                asked.found.append(Found(lane.state.end_us, carried.encode(lane.state, stream.inertial.learned)))
             asked.done.set()
 
     def is_used(self, stream: Stream) -> bool:
         """Whether the stream went on with the state that was fetched last."""
         lane = stream.lanes.serving_lane
         return lane is not None and self._end_us is not None and lane.adopted_us == self._end_us
+
+    def renew(
+        self,
+        stream: Stream,
+        following: Following,
+        ask: Callable[[str, int | None], StateReply | None],
+        now_ns: int,
+    ) -> bool:
+        """Take the state of the other node if the estimates differ, and if that node keeps up; whether it was asked."""
+        if following.ahead_us > MAX_AHEAD_US or not following.wants_state(now_ns, used=self.is_used(stream)):
+            return False
+        following.took(self.fetch(stream, ask))
+        return True
 
     def fetch(self, stream: Stream, ask: Callable[[str, int | None], StateReply | None]) -> int | None:
         """Ask the other node for its state, to go on with it where its next window begins, which is returned.
@@ -253,10 +274,12 @@ class Sync:
         if reply is None or reply.digest != lane.estimator.bundle.digest:
             return None
         try:
-            lane.adopt(reply.end_us, carried.decode(reply.data, lane.state))
+            found = carried.decode(reply.data, lane.state)
         except NeuroVEError as error:
             log.warning("state refused", stream=self._stream, leader=reply.node, why=error.message)
             return None
+        lane.adopt(reply.end_us, found)
+        stream.inertial.adopt(reply.end_us, found.inertial)
         log.info("state taken", stream=self._stream, leader=reply.node)
         self._end_us = reply.end_us
         return reply.end_us

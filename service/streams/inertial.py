@@ -7,7 +7,7 @@ from neurove_core.aided import aided
 from neurove_core.estimator import Estimator, WindowEstimate
 from neurove_core.inertial import state as inertial
 from neurove_core.inertial.gyro import EXTRAPOLATED_US
-from neurove_core.inertial.state import InertialState
+from neurove_core.inertial.state import InertialState, Learned
 from neurove_protocol import CameraInfo
 from neurove_protocol.control import ImuStatus
 from neurove_protocol.errors import InvalidField, NeuroVEError
@@ -40,6 +40,7 @@ class Inertial:
         self._received_ns = 0
         self._samples = self._lost = self._refused = self._late = self._dropped = 0
         self._used = self._missed = False
+        self._adopted: tuple[int, Learned] | None = None
         self._apart_us = 0  # the newest sample is later than the newest window by this
 
     def accept(self, payload: bytes, received_ns: int) -> None:
@@ -75,6 +76,21 @@ class Inertial:
         """Forget what was compared with the events: the stream restarts. The bias stays."""
         self._state = InertialState(samples=self._state.samples, bias=self._state.bias)
 
+    @property
+    def learned(self) -> Learned | None:
+        """What this node has learned of the unit up to the newest window; None without a unit."""
+        return Learned.of(self._state) if self._samples else None
+
+    def adopt(self, start_us: int, learned: Learned | None) -> None:
+        """Go on with what another node has learned from the window that begins here; dropped if there is none."""
+        self._adopted = (start_us, learned) if learned is not None else None
+
+    def _adopt_at(self, start_us: int) -> None:
+        if self._adopted is not None and start_us >= self._adopted[0]:
+            if start_us == self._adopted[0]:
+                self._state = self._adopted[1].into(self._state)
+            self._adopted = None
+
     def aid(
         self, estimates: list[WindowEstimate], estimator: Estimator, camera: CameraInfo | None
     ) -> list[WindowEstimate]:
@@ -89,6 +105,7 @@ class Inertial:
             return estimates
         found = []
         for estimate in estimates:
+            self._adopt_at(estimate.start_us)
             disagreed = self._state.disagrees
             try:
                 one, self._state = aided(estimator, estimate, self._state, camera)

@@ -6,21 +6,27 @@ its estimate is `LATE_WINDOWS` late, a follower takes the next term and publishe
 
 A node that was suspended may have been superseded without having heard of it. So a node that answers and finds a pause
 of `DOUBT_WINDOWS` in its own work asks the others before it publishes.
+
+A node that is late itself, or whose state is not equal, does not take over from a node that replies: on machines that
+are overloaded all nodes are late, and each change would make them later.
 """
 
 import math
+import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from functools import partial
 from typing import Final, NamedTuple
 
 from neurove_protocol import TwistEstimate
 from neurove_protocol.control import StandbyStatus
 from neurove_protocol.duty import DutyReply, StateReply
 from neurove_service import logs
-from neurove_service.streams.asking import LONG_PAUSE_NS, Asking, is_long
+from neurove_service.streams.asking import Asking, is_long
 from neurove_service.streams.following import Following, Sync
+from neurove_service.streams.pauses import Pauses
 from neurove_service.streams.stream import Stream
 from neurove_service.streams.tenure import Peers, Tenure
 
@@ -46,6 +52,7 @@ class Pair:
         wake: lets the worker of the stream turn at once.
         now_ns: monotonic clock [ns].
         on_close: called when the worker ends.
+        suspended_ns: see `Pauses`; without it the process counts as suspended in every pause of the worker.
     """
 
     def __init__(
@@ -55,20 +62,19 @@ class Pair:
         wake: Callable[[], None],
         now_ns: Callable[[], int] = time.monotonic_ns,
         on_close: Callable[["Pair"], None] = lambda _: None,
+        suspended_ns: Callable[[int], int] = lambda _: sys.maxsize,
     ) -> None:
         self._tenure, self._peers, self._wake, self._now_ns, self._on_close = tenure, peers, wake, now_ns, on_close
         self._stream, self._asking = tenure.stream, Asking(tenure, peers, now_ns)
         self._following, self._sync = Following(), Sync(tenure.stream)
         self._calls: deque[Callable[[], None]] = deque()  # from other threads, for the worker
-        self._turned_ns = self._answered_ns = now_ns()
-        self._pause_ns, self._window_ns = 0, 50_000_000  # longest pause of the worker since the last answer
         self._last_us: int | None = None  # start of the window that was published last
-        self._renewed = False  # since an estimate was heard
+        self.pauses, self._window_ns, self._renewed = Pauses(now_ns, suspended_ns), 50_000_000, False
 
     @property
-    def flows(self) -> bool:
-        """Whether this node has computed a window recently."""
-        return self._now_ns() - self._answered_ns < LONG_PAUSE_NS
+    def can_wait(self) -> bool:
+        """Whether other workers go first: no consumer waits for a node that follows."""
+        return self._tenure.role == "follows"
 
     def heard(self, estimate: TwistEstimate) -> None:
         """Another node has published an estimate."""
@@ -136,16 +142,14 @@ class Pair:
     def answer(self, estimate: TwistEstimate) -> list[TwistEstimate]:
         """The estimates to publish now that this one is there."""
         self._window_ns = (estimate.end_us - estimate.start_us) * 1000
-        pause_ns = self._note_pause()
-        silent_ns, self._answered_ns, self._pause_ns = self._turned_ns - self._answered_ns, self._turned_ns, 0
-        pause_ns = max(pause_ns, silent_ns) if silent_ns > LONG_PAUSE_NS else pause_ns
+        pause_ns = self.pauses.answer(estimate)
         self._run_calls()
         lacks = self._following.note(estimate)
         if self._tenure.answers and pause_ns > DOUBT_WINDOWS * self._window_ns:
             self._asking.after_pause(pause_ns, self._window_ns)
             self._asked()
         elif not self._tenure.answers and is_long(pause_ns, self._window_ns):
-            self._following.renew(self._turned_ns, doubt=True)
+            self._following.renew(self._now_ns(), doubt=True)
             self._tenure.set_patience()
         if self._tenure.answers and lacks:
             self._asking.after_loss(estimate.start_us, self._last_us, self._window_ns)
@@ -157,7 +161,7 @@ class Pair:
 
     def turn(self, stream: Stream) -> list[TwistEstimate]:
         """The estimates to publish now; also gives and takes the state of the stream."""
-        self._note_pause()
+        self.pauses.turn()
         self._run_calls()
         self._sync.serve(stream)
         self._take_state(stream)
@@ -179,15 +183,9 @@ class Pair:
         while self._calls:
             self._calls.popleft()()
 
-    def _note_pause(self) -> int:
-        """The longest pause between two turns of the worker since the last answer [ns]."""
-        now_ns = self._now_ns()
-        self._pause_ns, self._turned_ns = max(self._pause_ns, now_ns - self._turned_ns), now_ns
-        return self._pause_ns
-
     def _asked(self) -> None:
         """Go on after a question to other nodes, which is no pause, with what was heard meanwhile."""
-        self._turned_ns = self._now_ns()
+        self.pauses.skip()
         self._run_calls()
 
     @property
@@ -206,6 +204,13 @@ class Pair:
             self._renewed = True
             self._following.renew(self._now_ns(), doubt=is_long(late_ns, self._window_ns))
             return []
+        if not tenure.at_once and (self.pauses.late or not self._following.equal):
+            answered = self._asking.is_answered(self._window_ns, patient=not self._following.equal)
+            self._asked()
+            if answered:
+                self._following.renew(self._now_ns(), doubt=False)
+            if self._due_in_s > 0:
+                return []
         tenure.take_over(f"{tenure.leader} is late" if tenure.leader else "no other node answers", self._now_ns())
         if self._following.other_model:
             log.warning("another model than before answers", stream=self._stream, before=self._following.other_model)
@@ -216,10 +221,11 @@ class Pair:
         return estimate.model_copy(update={"seq": self._following.seq_of(estimate), "term": self._tenure.term})
 
     def _take_state(self, stream: Stream) -> None:
-        ask, leader = self._peers.state, self._tenure.leader if self._tenure.role == "follows" else ""
-        if leader and self._following.wants_state(self._now_ns(), used=self._sync.is_used(stream)):
-            self._following.took(self._sync.fetch(stream, lambda *wanted: ask(self._stream, leader, *wanted)))
-            self._note_pause()
+        """Ask for the state if it differs, unless this node cannot keep up."""
+        if self._tenure.role == "follows" and self._tenure.leader and not self.pauses.late:
+            ask = partial(self._peers.state, self._stream, self._tenure.leader)
+            if self._sync.renew(stream, self._following, ask, self._now_ns()):
+                self.pauses.turn()
 
     def _hear(self, estimate: TwistEstimate) -> None:
         if self._tenure.hear(estimate.node or "", estimate.term or 0, self._now_ns()):
@@ -229,7 +235,7 @@ class Pair:
     def _lose(self, node: str) -> None:
         if node == self._tenure.leader:
             ready = self._following.equal or not self._peers.names(self._stream)
-            at_once = self.flows and not self._tenure.draining and self._tenure.rank() == 0 and ready
+            at_once = self.pauses.flows and not self._tenure.draining and self._tenure.rank() == 0 and ready
             self._tenure.listen(f"{node} has left", at_once=at_once)
 
     def _take(self, node: str, term: int, start_us: int | None) -> None:

@@ -3,7 +3,7 @@
 import os
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from neurove_protocol.control import StandbyStatus
@@ -130,9 +130,9 @@ class StreamRegistry:
             log.info("stream evicted", stream=name, idle_s=self._settings.idle_evict_s)
         return idle
 
-    def release(self, name: str) -> None:
-        """End the worker of a stream that another node serves."""
-        self._end([name])
+    def release(self, *names: str) -> None:
+        """End the workers of streams that other nodes serve."""
+        self._end(names)
 
     def close(self) -> None:
         """End all workers and start no new ones."""
@@ -187,7 +187,7 @@ class StreamRegistry:
         if known or len(self._refused) < MAX_REFUSED:
             self._refused[name] = time.monotonic()
 
-    def _end(self, names: list[str]) -> None:
+    def _end(self, names: Sequence[str]) -> None:
         with self._lock:
             ending = [self._workers.pop(name) for name in names if name in self._workers]
         for worker in ending:

@@ -124,7 +124,7 @@ class Stream:
         self.counters.packets_received += packets
         self.counters.events_received += packet.events.n
         self.activity.heard(arrival.received_ns)
-        self.activity.taken_ns = arrival.queued_ns
+        self.activity.taken_ns, self.activity.waited_ns = arrival.queued_ns, arrival.queued_ns - arrival.received_ns
 
     def _process(self, packet: Packet, arrival: Arrival, first: Packet) -> list[TwistEstimate]:
         activity, window = self.activity, self.lanes.open_window

@@ -31,6 +31,9 @@ class Peers(Protocol):
     def names(self, stream: str, /) -> Sequence[str]:
         """Their names, by their tokens."""
 
+    def heard_ns(self, node: str, /) -> int:
+        """When anything was heard of a node last, on a monotonic clock; 0 if nothing was [ns]."""
+
     def roles(self, stream: str, timeout_s: float, /) -> list[DutyReply]:
         """What they do on the stream, as far as they reply in time."""
 
@@ -60,7 +63,7 @@ class Tenure:
         self.role: Role = "listens"
         self.term, self.leader = 0, ""
         self.draining = False
-        self._heard_ns = 0
+        self.heard_ns = 0  # when the newest estimate of the other node was heard
         self._wary = False  # another node may answer, though it is not known now
         self._patience = 1.0
         self._slack, self._slack_ns = 1, 0  # times the patience, because of slow links, and since when
@@ -80,7 +83,7 @@ class Tenure:
 
     def hear(self, sender: str, term: int, now_ns: int) -> bool:
         """Another node has published; False if it does not know yet that it was superseded."""
-        known, quiet = (self.term, self.leader), now_ns - self._heard_ns > QUIET_NS
+        known, quiet = (self.term, self.leader), now_ns - self.heard_ns > QUIET_NS
         if (term, sender) < known and (self.answers or (self.leader and not quiet)):
             if self.answers and 0 <= now_ns - self._took_ns < HASTY_WINDOWS * self._window_ns:
                 self._took_ns -= HASTY_WINDOWS * self._window_ns  # once
@@ -90,7 +93,7 @@ class Tenure:
             self._slack, self._slack_ns = self._slack // 2, now_ns
         if (term, sender) != known or self.role != "follows":
             self.follow(sender, term)
-        self._heard_ns = now_ns
+        self.heard_ns = now_ns
         return True
 
     def follow(self, leader: str, term: int) -> None:

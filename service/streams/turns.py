@@ -1,8 +1,13 @@
-"""Turns: how many workers of a node work at once, each in the order in which it asked."""
+"""Turns: how many workers of a node work at once, each in the order in which it asked; workers that answer go first."""
 
+import contextlib
 import threading
 from collections import deque
-from types import TracebackType
+from collections.abc import Iterator
+from typing import Final
+
+LAST_S: Final = 0.02
+"""A worker that lets others go first waits so long for its turn; then it can see whether its duty has changed."""
 
 
 class Turns:
@@ -15,29 +20,50 @@ class Turns:
     def __init__(self, at_once: int) -> None:
         self._free = max(1, at_once)
         self._waiting: deque[threading.Lock] = deque()
+        self._last: deque[threading.Lock] = deque()
         self._lock = threading.Lock()
 
     @property
     def waiting(self) -> int:
         """Number of workers that wait for their turn."""
-        return len(self._waiting)
+        return len(self._waiting) + len(self._last)
 
-    def __enter__(self) -> None:
+    @contextlib.contextmanager
+    def turn(self, *, last: bool = False) -> Iterator[bool]:
+        """A turn of one worker; gives whether there is one.
+
+        Args:
+            last: whether the workers that ask without it go first; then there may be no turn within `LAST_S`.
+        """
+        begun = self._begin(self._last, LAST_S) if last else self._begin(self._waiting, -1)
+        try:
+            yield begun
+        finally:
+            if begun:
+                self._end()
+
+    def _begin(self, queue: deque[threading.Lock], timeout_s: float) -> bool:
         with self._lock:
-            if self._free and not self._waiting:
+            if self._free and not self.waiting:
                 self._free -= 1
-                return
+                return True
             mine = threading.Lock()
             mine.acquire()
-            self._waiting.append(mine)
-        mine.acquire()  # until the turn is handed over
+            queue.append(mine)
+        if mine.acquire(timeout=timeout_s):  # until the turn is handed over
+            return True
+        with self._lock:
+            if mine in queue:
+                queue.remove(mine)
+                return False
+        return True  # it was handed over a moment ago
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def _end(self) -> None:
         with self._lock:
             if self._waiting:
                 self._waiting.popleft().release()
+            elif self._last:
+                self._last.popleft().release()
             else:
                 self._free += 1
 

@@ -172,10 +172,9 @@ class StreamWorker:
         self._inbox, self.beat_ns = inbox, time.monotonic_ns()
         self._open_outlet, self._limits = open_outlet, limits
         self._slots, self._guard = slots or Slots(), guard or Guard()
-        self._pause_until = 0.0  # a time, not a duration: packets that arrive in a pause must not extend it
+        self._pause_until, self._taken_ns = 0.0, 0  # times: packets that arrive in a pause must not extend it
         self._pending: deque[Sample] = deque()  # taken out of the queue, not yet processed
         self._cameras = Cameras(stream, inbox.wake, self._guard)
-        self._taken_ns = 0  # when the queue was last emptied
         self._overload, self._stopping = Overload(inbox.max_age_s), threading.Event()
         self._thread = threading.Thread(target=self._run, name=f"stream {stream.name}", daemon=True)
         self._thread.start()
@@ -242,8 +241,9 @@ class StreamWorker:
             pause_s = max(0.0, self._pause_until - time.monotonic())
             self._take(self.duty.wait_s(pause_s if self.stream.lanes.has_backlog else _IDLE_BEAT_S))
         if self._pending:
-            with self._slots.serving:
-                self._work_next(outlet)
+            with self._slots.serving.turn(last=self.duty.can_wait) as begun:
+                if begun:
+                    self._work_next(outlet)
         elif self.stream.lanes.has_backlog:
             self._pause_until = time.monotonic() + self._run_standby()
 

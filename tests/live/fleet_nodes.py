@@ -4,6 +4,7 @@ import contextlib
 import threading
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 from neurove_core.models import bundle
 from neurove_service.config import ServiceConfig
@@ -31,7 +32,9 @@ class Fleet:
     def bundle(self, name: str) -> Path:
         return self.folder / f"{name}.safetensors"
 
-    def add(self, name: str, *, stores: bool = True, **labels: str) -> None:
+    def add(
+        self, name: str, *, stores: bool = True, standby: Literal["off", "lot", "last"] = "off", **labels: str
+    ) -> None:
         """Start a node; without `stores` it refuses every push."""
         state = self.folder / name
         state.mkdir()
@@ -42,7 +45,9 @@ class Fleet:
             model=str(self.bundle("one")),
             state_dir=state if stores else None,
             probation_s=0.05,
+            max_age_s=60.0,
             labels=labels,
+            standby=standby,
         )
         stop = threading.Event()
         thread = threading.Thread(target=Service(config, stop).run, name=name)

@@ -8,6 +8,7 @@ import pytest
 from neurove_service.config import ClientConfig
 from neurove_service.fleet import roster
 from tests.live.conftest import Process, wait_until
+from tests.live.fellows import Driver, follows
 from tests.live.fleet_nodes import Fleet
 
 pytestmark = pytest.mark.live
@@ -142,3 +143,23 @@ def test_wrong_use_is_explained_and_changes_nothing(fleet, rollout, tmp_path):
     assert "the file exists" in rollout(two, "--journal", tmp_path / "j").err
     with pytest.raises(SystemExit):
         rollout(two, "--soak", "ten")
+
+
+def test_nodes_that_stand_by_for_each_other_are_changed_one_after_the_other(run, tmp_path):
+    with contextlib.ExitStack() as stack:
+        fleet = Fleet(tmp_path, stack)
+        for name in ("left", "right"):
+            fleet.add(name, standby="lot")
+        driver = Driver(fleet.transport, ["cam0"], step_us=25_000).start()
+        stack.callback(driver.stop)
+        wait_until(lambda: any(follows(fleet.transport, name, "cam0") for name in ("left", "right")))
+        journal = tmp_path / "journal.jsonl"
+        ran = run(
+            *("rollout", fleet.bundle("two"), "--connect", fleet.endpoint, "--timeout", "60", "--plan", "100%"),
+            *("--soak", "1", "--grace", "60", "--patience", "600", "--journal", journal),
+        )
+        assert ran.code == 0, ran.out
+        changes = [(one["event"], one["node"]) for one in events_of(journal) if one["event"] in {"change", "fine"}]
+        first = changes[0][1]
+        (second,) = {"left", "right"} - {first}
+        assert changes == [("change", first), ("fine", first), ("change", second), ("fine", second)]

@@ -7,6 +7,7 @@ import pytest
 from neurove_core import carried
 from neurove_core.config import ModelConfig
 from neurove_core.estimator import Estimator
+from neurove_core.inertial.state import InertialState, Learned
 from neurove_core.ingest.windows import Window
 from neurove_core.models import bundle
 from neurove_core.refine import scene
@@ -87,3 +88,20 @@ def test_only_known_classes_and_plain_numbers_are_made(values):
     estimator = Estimator(make_bundle())
     with pytest.raises(NeuroVEError):
         carried.decode(msgpack.packb(values), estimator.initial_state(SENSOR))
+
+
+def test_an_inertial_part_of_other_shapes_is_refused():
+    estimator = Estimator(make_bundle())
+    _, state = estimator.follow(windows(CONFIG, 3), estimator.initial_state(SENSOR))
+    learned = Learned.of(InertialState())
+    assert carried.decode(carried.encode(state, learned), state).inertial.bias.rested is False
+    assert carried.decode(carried.encode(state), state).inertial is None
+    for wrong in (
+        learned._replace(bias=learned.bias._replace(mean_rad_s=np.zeros(2))),
+        learned._replace(bias=learned.bias._replace(variance=np.full(3, np.nan))),
+        learned._replace(track=learned.track._replace(angle_rad=np.zeros((4, 3)))),
+        learned._replace(track=learned.bias),
+        learned._replace(tilt=None),
+    ):
+        with pytest.raises(NeuroVEError, match="inertial"):
+            carried.decode(carried.encode(state, wrong), state)

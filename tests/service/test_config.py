@@ -192,3 +192,9 @@ def test_in_client_mode_the_service_listens_only_if_configured():
     assert config.listen == ()
     explicit, _ = load(ServiceConfig, {"mode": "client", "connect": "tcp/127.0.0.1:7447", "listen": "tcp/127.0.0.1:9"})
     assert explicit.listen == ("tcp/127.0.0.1:9",)
+
+
+def test_the_variables_of_the_engine_are_no_unknown_settings(monkeypatch):
+    monkeypatch.setenv("NEUROVE_FORM", "sparse")
+    monkeypatch.setenv("NEUROVE_AHEAD", "off")
+    load(ServiceConfig, {})

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.estimator import Estimator
-from neurove_core.evaluation.evaluate import Evaluation, estimate_recording, evaluate, reliability
+from neurove_core.evaluation.estimates import estimate_recordings
+from neurove_core.evaluation.evaluate import Evaluation, evaluate, reliability
 from neurove_core.evaluation.metrics import figures, relative_error
 from neurove_core.experiments import real, save_text
 from neurove_core.experiments.motion import goals, sets
@@ -37,6 +38,7 @@ def run(
     *,
     quick: bool = False,
     pool: Pool = HERE,
+    at_once: int = 1,
 ) -> dict[str, Any]:
     """Evaluate a model.
 
@@ -48,6 +50,7 @@ def run(
         show: receives the progress.
         quick: see `sets.items`.
         pool: where the simulations run; the model runs in this process.
+        at_once: recordings of a batch, see `estimate_recordings`.
 
     Returns:
         `rows` as of `goals.row`; `coverage` and `uncertain_share` by set, None for a model without uncertainty; and
@@ -61,13 +64,18 @@ def run(
         for done, name in enumerate(fill(items, data, pool), 1):
             show("simulated ahead", done, len(items), name)
     found: Found = {}
+    recordings_of = []
     for done, item in enumerate(items, 1):
         show("simulated", done, len(items), f"{item.group}: {item.name}")
-        recording = kept(item, data)
-        truth = recording.twists()
-        assert truth is not None  # a simulation with an end has its truth
-        estimates = estimate_recording(estimator, recording, inertial="imu" in recording.streams)
-        found.setdefault(item.group, []).append((item.name, evaluate(estimates, truth)))
+        recordings_of.append(kept(item, data))
+        if len(recordings_of) < at_once and done < len(items):
+            continue
+        estimates = estimate_recordings(estimator, recordings_of, inertial=True, at_once=at_once)
+        for own, recording, one in zip(items[done - len(recordings_of) : done], recordings_of, estimates, strict=True):
+            truth = recording.twists()
+            assert truth is not None  # a simulation with an end has its truth
+            found.setdefault(own.group, []).append((own.name, evaluate(one, truth)))
+        recordings_of = []
     rows = simulated_rows(found, groups)
     if sets.REAL in groups:
         rows += _real_rows(estimator, recordings)

@@ -7,7 +7,8 @@ import pytest
 
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.estimator import Estimator
-from neurove_core.evaluation.evaluate import NoTruth, estimate_recording, evaluate, report
+from neurove_core.evaluation.estimates import estimate_recording
+from neurove_core.evaluation.evaluate import NoTruth, evaluate, report
 from neurove_core.geometry.motion import Twists
 from neurove_core.io.packets import slices
 from neurove_core.models import bundle

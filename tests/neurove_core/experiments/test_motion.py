@@ -6,7 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from neurove_core.evaluation.evaluate import Estimates, evaluate
+from neurove_core.evaluation.estimates import Estimates
+from neurove_core.evaluation.evaluate import evaluate
 from neurove_core.experiments.motion import goals, sets
 from neurove_core.experiments.motion import run as motion
 from neurove_core.experiments.motion.kept import kept
@@ -100,6 +101,17 @@ def test_the_command_evaluates_every_set_and_writes_what_it_prints(run, tmp_path
     assert set(results["coverage"]) == set(sets.GROUPS) - {"trajectories"}
     skipped = {row["group"] for row in results["rows"] if row["skipped"]}
     assert skipped == {"trajectories", sets.REAL}
+
+
+def test_the_network_on_a_device_gives_the_same_figures(run, tmp_path):
+    arguments = ("reproduce", "motion", "--quick", "--data", tmp_path, "--sets", "slow,turning", "--json")
+    (_, engine, _), (code, device, err) = run(*arguments), run(*arguments, "--device", "cpu")
+    assert code == 0, err
+    found, wanted = (json.loads(text)["recordings"] for text in (device, engine))
+    assert list(found) == list(wanted)
+    for name, figures in wanted.items():
+        known = {figure: value for figure, value in figures.items() if value is not None}
+        assert {figure: found[name][figure] for figure in known} == pytest.approx(known, rel=0.02, abs=1e-3)
 
 
 def test_an_unknown_set_is_refused_before_anything_is_simulated(run, tmp_path):

@@ -9,7 +9,7 @@ import pytest
 from neurove_core import models
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.estimator import Estimator
-from neurove_core.evaluation.evaluate import estimate_recording
+from neurove_core.evaluation.estimates import estimate_recording
 from neurove_core.experiments import real
 from neurove_core.models import bundle
 from neurove_core.sources import open_source

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from neurove_core.estimator import Estimator
-from neurove_core.evaluation.evaluate import estimate_recording, evaluate
+from neurove_core.evaluation.estimates import estimate_recording
+from neurove_core.evaluation.evaluate import evaluate
 from neurove_core.experiments import real
 from neurove_core.experiments.velocity import report, run
 from neurove_core.experiments.velocity.held_out import (

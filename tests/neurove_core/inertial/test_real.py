@@ -5,7 +5,7 @@ import pytest
 
 from neurove_core import models
 from neurove_core.estimator import Estimator
-from neurove_core.evaluation.evaluate import Estimates, estimate_recording
+from neurove_core.evaluation.estimates import Estimates, estimate_recording
 from neurove_core.sources import open_source
 from tests.recordings import shared
 

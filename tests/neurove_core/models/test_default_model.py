@@ -11,7 +11,8 @@ import torch
 from neurove_core import models
 from neurove_core.engine.engine import Engine
 from neurove_core.estimator import Estimator
-from neurove_core.evaluation.evaluate import estimate_recording, evaluate, report
+from neurove_core.evaluation.estimates import estimate_recording
+from neurove_core.evaluation.evaluate import evaluate, report
 from neurove_core.models import bundle
 from neurove_core.networks.encoding import to_spikes
 from neurove_core.sources import open_source

@@ -11,7 +11,8 @@ from torch import nn
 from neurove_core import self_test
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig
 from neurove_core.estimator import Estimator, Push
-from neurove_core.evaluation.evaluate import estimate_recording, evaluate, report
+from neurove_core.evaluation.estimates import estimate_recording
+from neurove_core.evaluation.evaluate import evaluate, report
 from neurove_core.models import bundle
 from neurove_core.models.bundle import PER_HEIGHT
 from neurove_core.models.uncertainty import Uncertainty

@@ -1,11 +1,16 @@
 """neurove evaluate, end to end on a tiny model and tiny sequences."""
 
 import json
+import os
+import re
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 
 from neurove_core.sources import open_source
+from tests.refusing import environment
 
 SOURCE = "sim://street?seed=3&seconds=0.8&camera=pinhole:24x18:75"
 
@@ -39,6 +44,49 @@ def test_processes_give_the_figures_of_this_process(run):
     for figure in ("windows", "rmse_v_l_m_s", "per_axis", "firing_rate", "source_share"):
         assert found[figure] == wanted[figure]
     assert [one["name"] for one in found["recordings"]] == [one["name"] for one in wanted["recordings"]]
+
+
+def test_the_network_on_a_device_gives_the_figures_of_the_engine(trained, run):
+    words = ("evaluate", trained / "out" / "tiny.safetensors", SOURCE, SOURCE.replace("seed=3", "seed=20321"), "--json")
+    (_, engine, _), (code, device, err) = run(*words), run(*words, "--device", "cpu")
+    assert code == 0, err
+    found, wanted = json.loads(device), json.loads(engine)
+    assert [one["name"] for one in found["recordings"]] == [one["name"] for one in wanted["recordings"]]
+    assert found["windows"] == wanted["windows"]
+    for figure in ("rmse_v_l_m_s", "rmse_v_a_deg_s"):
+        assert found[figure] == pytest.approx(wanted[figure], rel=1e-3)
+    assert found["firing_rate"] == pytest.approx(wanted["firing_rate"], abs=0.01)
+
+
+@pytest.mark.parametrize("command", [("evaluate", "default", SOURCE), ("reproduce", "motion", "--quick")])
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (("--device", "cuda:999"), "--device='cuda:999': (this build of torch has no CUDA|torch sees)"),
+        (("--device", "gpu"), "--device='gpu': cpu, cuda or cuda:N is expected"),
+    ],
+)
+def test_a_device_that_is_missing_is_refused_in_one_line(run, tmp_path, monkeypatch, command, words, why):
+    monkeypatch.chdir(tmp_path)
+    code, out, err = run(*command, *words)
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert re.search(why, err)
+
+
+def test_a_device_and_other_processes_are_refused(run):
+    code, _, err = run("evaluate", "default", SOURCE, "--device", "cpu", "--workers", "2")
+    assert code == 2
+    assert "--device='cpu': not together with --workers or --dask" in err
+
+
+def test_without_torch_the_device_is_refused_by_name(tmp_path):
+    words = ("-m", "neurove_service.cli", "evaluate", "default", SOURCE, "--device", "cuda")
+    env = os.environ | environment(tmp_path, ["torch"])
+    run = subprocess.run([sys.executable, *words], env=env, capture_output=True, text=True, check=False)
+    assert (run.returncode, run.stdout) == (2, "")
+    assert run.stderr == (
+        "neurove: evaluate: --device='cuda': torch is needed and not installed: pip install 'neurove[train]'\n"
+    )
 
 
 @pytest.mark.parametrize(

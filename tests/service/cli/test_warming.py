@@ -37,3 +37,10 @@ def test_an_unknown_model_is_named(run, tmp_path):
     code, _, err = run("warm-up", "--model", tmp_path / "none.safetensors")
     assert code != 0
     assert "none.safetensors" in err
+
+
+def test_code_for_the_package_has_no_other_folder(run, tmp_path):
+    code, _, err = run("warm-up", "--ahead", "--out", tmp_path)
+    assert code != 0
+    assert "--out" in err
+    assert not list(tmp_path.iterdir())

@@ -1,7 +1,7 @@
 import threading
 
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from neurove_core.warming import compile_part, is_cold
+from neurove_core.warming import compile_part, lacks_code
 from neurove_service.models import precompile
 
 SMALL = ModelConfig(canonical=CanonicalConfig(width=24, height=16), network=NetworkConfig(channels=(4,), hidden=4))
@@ -40,7 +40,7 @@ def test_a_child_that_cannot_start_or_that_is_stopped_leaves_the_work_to_the_nod
 
 def test_a_node_with_little_memory_or_another_network_starts_no_children(monkeypatch, capsys):
     monkeypatch.setattr("sys.executable", "/no/such/program")  # a child would be a warning in the log
-    monkeypatch.setattr(precompile, "is_cold", lambda: True)
+    monkeypatch.setattr(precompile, "lacks_code", lambda _: True)
     precompile.at_start(SMALL, lambda: precompile.CHILD_BYTES - 1)
     precompile.at_start(SMALL.model_copy(update={"kind": "ann"}), lambda: None)
     assert "by the node itself" not in capsys.readouterr().out
@@ -48,12 +48,12 @@ def test_a_node_with_little_memory_or_another_network_starts_no_children(monkeyp
 
 def test_children_of_a_first_start_that_cannot_start_leave_the_work_to_the_node(monkeypatch, capsys):
     monkeypatch.setattr("sys.executable", "/no/such/program")
-    monkeypatch.setattr(precompile, "is_cold", lambda: True)
+    monkeypatch.setattr(precompile, "lacks_code", lambda _: True)
     monkeypatch.setattr("os.cpu_count", lambda: 2)
     precompile.at_start(SMALL, lambda: None)
     assert capsys.readouterr().out.count("code is compiled by the node itself") == 3
 
 
-def test_a_process_that_has_run_compiled_code_is_not_cold():
+def test_a_process_that_has_run_compiled_code_lacks_none():
     compile_part("events", SMALL)
-    assert not is_cold()
+    assert not lacks_code(SMALL)

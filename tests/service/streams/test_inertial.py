@@ -5,6 +5,7 @@ import time
 import numpy as np
 import pytest
 
+from neurove_core import carried
 from neurove_core.estimator import WindowEstimate
 from neurove_protocol import ImuPacket
 from neurove_protocol.events import PacketLimits
@@ -18,7 +19,7 @@ from neurove_service.streams.inertial import Inertial
 from neurove_service.streams.registry import StreamRegistry, StreamSettings
 from neurove_service.streams.stream import Stream
 from neurove_service.streams.worker import Inbox, Sample
-from tests.builders import make_packets
+from tests.builders import SENSOR, make_packets
 from tests.neurove_core.inertial import units
 from tests.service.conftest import arrived
 
@@ -102,10 +103,10 @@ def test_a_unit_on_another_clock_is_told(stream):
     assert "s after the events: its clock is not that of the camera" in stream.inertial.status().problem
 
 
-def aided(unit, estimator, imu, seen, windows, *, speed=0.0):
+def aided(unit, estimator, imu, seen, windows, *, speed=0.0, first=0):
     """The estimates of consecutive windows whose events show the motion `seen`, with these samples."""
-    at, found = 0, []
-    for seq, end_us in enumerate(range(50_000, 50_000 * (windows + 1), 50_000)):
+    at, found = int(imu.t.searchsorted(50_000 * first + 4_000)) if first else 0, []
+    for seq, end_us in enumerate(range(50_000 * (first + 1), 50_000 * (windows + 1), 50_000), first):
         stop = int(imu.t.searchsorted(end_us + 4_000))
         unit.accept(encode_imu(ImuPacket("cam0", seq, imu.span(at, stop))), time.monotonic_ns())
         at = stop
@@ -144,6 +145,41 @@ def test_a_gyroscope_that_disagrees_is_flagged_told_and_not_used(slot):
     assert status.disagrees
     assert imu_text(status).startswith("gyroscope disagrees with the events: the gyroscope turns the other way about")
     assert imu_text(status).endswith("the estimates use the events alone")
+
+
+def still_then_shaking(t_s):
+    return np.where(np.asarray(t_s)[..., None] < 2.0, units.still(t_s), units.shaking(t_s))
+
+
+def test_a_node_that_takes_the_state_goes_on_with_the_bias_bit_for_bit(slot):
+    estimator, imu = slot.active.estimator, units.samples(still_then_shaking, 6.1, bias=(0.01, -0.02, 0.005))
+    leader, follower, cold = (Inertial("cam0", time.monotonic_ns) for _ in range(3))
+    aided(leader, estimator, imu, still_then_shaking, 80, speed=1.0)
+    for unit in (follower, cold):  # they join after the rest
+        aided(unit, estimator, imu, still_then_shaking, 80, speed=1.0, first=45)
+    state = estimator.initial_state(SENSOR)._replace(end_us=50_000 * 80)
+    taken = carried.decode(carried.encode(state, leader.learned), state)
+    follower.adopt(50_000 * 80, taken.inertial)
+    wanted, got, other = (
+        aided(unit, estimator, imu, still_then_shaking, 120, speed=1.0, first=80) for unit in (leader, follower, cold)
+    )
+    assert [one.twists.tobytes() for one in got] == [one.twists.tobytes() for one in wanted]
+    assert [one.covariance.tobytes() for one in got] == [one.covariance.tobytes() for one in wanted]
+    assert other[-1].twists.tobytes() != wanted[-1].twists.tobytes()
+    assert (follower.status().bias_rad_s, follower.status().offset_ms) == (
+        leader.status().bias_rad_s,
+        leader.status().offset_ms,
+    )
+
+
+def test_a_state_that_is_taken_too_late_changes_nothing(slot):
+    estimator, imu = slot.active.estimator, units.samples(units.shaking, 2.1, bias=(0.01, -0.02, 0.005))
+    one, two = (Inertial("cam0", time.monotonic_ns) for _ in range(2))
+    aided(one, estimator, imu, units.shaking, 20, speed=1.0)
+    two.adopt(50_000, one.learned)
+    found = aided(two, estimator, imu, units.shaking, 30, speed=1.0, first=20)
+    plain = aided(Inertial("cam0", time.monotonic_ns), estimator, imu, units.shaking, 30, speed=1.0, first=20)
+    assert [x.twists.tobytes() for x in found] == [x.twists.tobytes() for x in plain]
 
 
 def test_the_queue_of_samples_is_bounded_and_counts_what_it_drops():

@@ -1,5 +1,7 @@
 """Two nodes of one stream in one process: who answers, and who is ready to answer, after pauses and lost packets."""
 
+import sys
+
 import pytest
 
 from neurove_protocol import Trace, Twist, TwistEstimate
@@ -12,10 +14,10 @@ STREAM, WINDOW_US = "cam0", 20_000
 NOT_EQUAL = 9.0
 
 
-def estimate(node, number, value, flags, age_us):
+def estimate(node, number, value, flags, age_us, now_ns=0, waited_us=0):
     """The window with this number; `value` stands for the state of the node."""
     start_us = number * WINDOW_US
-    end_us = start_us + WINDOW_US
+    end_us, received_ns = start_us + WINDOW_US, now_ns - 1000 * waited_us
     return TwistEstimate(
         stream=STREAM,
         seq=number,
@@ -28,7 +30,7 @@ def estimate(node, number, value, flags, age_us):
         epoch=0,
         events=5,
         flags=flags,
-        trace=Trace(received_ns=0, queued_ns=0, computed_ns=0, published_ns=0),
+        trace=Trace(received_ns=received_ns, queued_ns=now_ns, computed_ns=now_ns, published_ns=now_ns),
         node=node,
         host=HostTime(end_ns=0, uncertainty_ns=0, age_ns=1000 * age_us),
     )
@@ -42,6 +44,9 @@ class Other:
 
     def names(self, _stream):
         return (self._name,)
+
+    def heard_ns(self, _node):
+        return 0
 
     def roles(self, _stream, timeout_s):
         nodes = self._nodes
@@ -62,13 +67,19 @@ class Other:
 class Nodes:
     """Two nodes on one clock that hear each other at once; a node that hangs says and hears nothing."""
 
-    def __init__(self, stream):
-        self.now_ns, self.hangs, self.asked = 0, "", 0
+    def __init__(self, stream, suspended_ns=sys.maxsize):
+        self.now_ns, self.hangs, self.asked = 10**12, "", 0
         self.stream, self.published = stream, []
         self.pairs = {}
         for name, other in ("ab", "ba"):
             peers = Other(self, other)
-            self.pairs[name] = Pair(Tenure(name, STREAM, peers), peers, lambda: None, lambda: self.now_ns)
+            self.pairs[name] = Pair(
+                Tenure(name, STREAM, peers),
+                peers,
+                lambda: None,
+                lambda: self.now_ns,
+                suspended_ns=lambda _: suspended_ns,
+            )
 
     @property
     def leader(self):
@@ -92,9 +103,10 @@ class Nodes:
     def turn(self, name):
         self._publish(name, self.pairs[name].turn(self.stream))
 
-    def compute(self, name, number, value=0.0, flags=(), age_us=0):
+    def compute(self, name, number, value=0.0, flags=(), age_us=0, waited_us=0):
         self.turn(name)
-        self._publish(name, self.pairs[name].answer(estimate(name, number, value, flags, age_us)))
+        own = estimate(name, number, value, flags, age_us, self.now_ns, waited_us)
+        self._publish(name, self.pairs[name].answer(own))
 
     def both(self, numbers):
         """Both nodes compute these windows in real time."""
@@ -193,12 +205,12 @@ def test_a_follower_that_wakes_does_not_take_over_before_it_has_heard_the_leader
 
 
 def test_a_node_that_hangs_does_not_keep_the_leader_waiting_again_and_again(nodes):
-    leader = nodes.leader
+    leader, asked = nodes.leader, nodes.asked
     nodes.hangs = nodes.follower
     for number in range(60, 70):
         nodes.wait(1.4)
         nodes.compute(leader, number)
-    assert nodes.asked == 1
+    assert nodes.asked == asked + 1
     assert [one.start_us // WINDOW_US for one in nodes.published[-10:]] == list(range(60, 70))
     assert len({one.term for one in nodes.published[-11:]}) == 1
 
@@ -217,3 +229,61 @@ def test_after_a_long_pause_without_a_reply_the_leader_listens_first(nodes):
         nodes.turn(leader)
     assert nodes.role(leader) == "answers"
     assert [one.start_us // WINDOW_US for one in nodes.published[before:]] == [60]
+
+
+def test_a_node_that_is_late_itself_does_not_take_over_from_a_node_that_replies(nodes):
+    leader, follower, before = nodes.leader, nodes.follower, len(nodes.published)
+    for number in range(60, 80):
+        nodes.wait(2)
+        nodes.compute(follower, number, waited_us=5 * WINDOW_US)
+        nodes.turn(follower)
+    assert (nodes.leader, nodes.role(follower), len(nodes.published)) == (leader, "follows", before)
+    for number in range(60, 80):  # the leader was late, not silent
+        nodes.compute(leader, number)
+    nodes.turn(follower)
+    assert nodes.ready(follower)
+
+
+def test_a_node_that_is_late_itself_takes_over_from_a_node_that_hangs(nodes):
+    follower, before = nodes.follower, len(nodes.published)
+    nodes.hangs = nodes.leader
+    for number in range(60, 64):
+        nodes.wait(1)
+        nodes.compute(follower, number, waited_us=5 * WINDOW_US)
+    for _ in range(10):
+        nodes.wait(1)
+        nodes.turn(follower)
+    assert nodes.role(follower) == "answers"
+    assert [one.start_us // WINDOW_US for one in nodes.published[before:]] == list(range(60, 64))
+
+
+def test_a_node_whose_state_differs_does_not_take_over_from_a_node_that_replies(nodes):
+    leader, follower = nodes.leader, nodes.follower
+    nodes.both([60])
+    nodes.wait(1)
+    nodes.compute(follower, 61, NOT_EQUAL)
+    nodes.compute(leader, 61)
+    for number in range(62, 162):
+        nodes.wait(1)
+        nodes.compute(follower, number, NOT_EQUAL)
+    assert (nodes.leader, nodes.role(follower)) == (leader, "follows")
+
+
+def test_a_late_node_does_not_wait_for_ever_for_a_node_that_replies_and_publishes_nothing(nodes):
+    follower = nodes.follower
+    for number in range(60, 360):
+        nodes.wait(1)
+        nodes.compute(follower, number, waited_us=5 * WINDOW_US)
+    assert nodes.role(follower) == "answers"
+
+
+def test_a_leader_that_is_late_all_the_time_asks_no_more_while_its_process_runs(slot):
+    nodes = Nodes(Stream(STREAM, slot), suspended_ns=0)
+    nodes.both(range(60))
+    leader, asked = nodes.leader, [nodes.asked]
+    for number in range(60, 90):
+        nodes.wait(5)
+        nodes.compute(leader, number, waited_us=5 * WINDOW_US)
+        asked.append(nodes.asked)
+    assert asked[0] < asked[10] == asked[-1]
+    assert nodes.role(leader) == "answers"

@@ -10,6 +10,9 @@ class NoPeers:
     def names(self, _stream):
         return ()
 
+    def heard_ns(self, _node):
+        return 0
+
     def roles(self, _stream, _timeout_s):
         return []
 

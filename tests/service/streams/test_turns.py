@@ -9,10 +9,10 @@ def test_turns_are_given_in_the_order_in_which_they_were_asked_for():
     threads = []
 
     def work(name):
-        with turns:
+        with turns.turn():
             order.append(name)
 
-    with turns:
+    with turns.turn():
         for name in range(5):
             threads.append(threading.Thread(target=work, args=(name,)))
             threads[-1].start()
@@ -28,7 +28,7 @@ def test_no_more_workers_than_allowed_have_their_turn_at_once():
 
     def work():
         for _ in range(200):
-            with turns:
+            with turns.turn():
                 with lock:
                     counts["now"] += 1
                     counts["most"] = max(counts.values())
@@ -47,9 +47,46 @@ def test_no_more_workers_than_allowed_have_their_turn_at_once():
 def test_an_error_gives_the_turn_back():
     turns = Turns(1)
     try:
-        with turns:
+        with turns.turn():
             raise RuntimeError("planted")
     except RuntimeError:
         pass
-    with turns:
+    with turns.turn():
         pass
+
+
+def test_a_worker_that_asks_for_the_last_turn_lets_those_that_came_later_go_first():
+    turns, order, threads = Turns(1), [], []
+
+    def follow():
+        while "follows" not in order:
+            with turns.turn(last=True) as begun:
+                if begun:
+                    order.append("follows")
+
+    def answer():
+        with turns.turn():
+            order.append("answers")
+
+    with turns.turn():
+        threads.append(threading.Thread(target=follow))
+        threads[-1].start()
+        wait_until(lambda: turns.waiting == 1)
+        for number in (1, 2):
+            threads.append(threading.Thread(target=answer))
+            threads[-1].start()
+            wait_until(lambda: turns.waiting == 1 + number)  # noqa: B023
+    for thread in threads:
+        thread.join(60)
+    assert order == ["answers", "answers", "follows"]
+
+
+def test_a_worker_that_lets_others_go_first_does_not_wait_for_ever():
+    turns = Turns(1)
+    with turns.turn(), turns.turn(last=True) as begun:
+        assert not begun
+        assert turns.waiting == 0
+    with turns.turn(last=True) as begun:
+        assert begun
+    with turns.turn() as begun:
+        assert begun

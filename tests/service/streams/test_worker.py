@@ -299,7 +299,7 @@ def test_an_overloaded_worker_answers_a_window_at_each_of_its_turns(slot):
     packets = iter(make_packets(500, n=SMALL_BYTES, step_us=10_000))  # five in a window, none of them small
     try:
         while len(turns) < 15:  # between two turns of the worker other streams work for 0.3 s
-            with slots.serving:
+            with slots.serving.turn():
                 began = time.monotonic()
                 while time.monotonic() < began + 0.3:
                     put(worker, encode_packet(next(packets)))

@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import hashlib
 import logging
 import pickle
 import sys
@@ -12,6 +13,8 @@ from typing import Any, Final, NamedTuple, ParamSpec, TypeVar, cast
 
 import numba
 import numpy as np
+
+from neurove_core.compiled import ahead
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -41,6 +44,7 @@ def compile_with(function: Callable[P, R], **how: Any) -> Callable[P, R]:
     else:
         _tolerate_io_errors(dispatcher)
         _compare_dependencies(dispatcher)
+    ahead.look_up(dispatcher, functools.partial(_sources, dispatcher))
     _dispatchers.append(dispatcher)
     return cast("Callable[P, R]", dispatcher)
 
@@ -66,6 +70,30 @@ def work() -> Work:
     return Work(compiled, loaded, tuple(sorted(folders)))
 
 
+def folder_of(function: Callable[..., Any]) -> Path | None:
+    """Where numba keeps the code of a compiled function; None where it cannot be kept."""
+    path = function.stats.cache_path  # type: ignore[attr-defined]  # of numba's dispatchers
+    return Path(path) if path else None
+
+
+def write_ahead(name: str, complete_for: str, folder: Path = ahead.FOLDER) -> int:
+    """Copy the code that this process has compiled or loaded into the package, for all users; see `ahead`.
+
+    Args:
+        name: of the processor that the code is for.
+        complete_for: what this is all code of.
+        folder: of the code of all processors.
+
+    Returns:
+        Number of files.
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    functions = [(one, _sources(one)) for one in _dispatchers if one.overloads and one.stats.cache_path]
+    return ahead.write(functions, name, complete_for, folder)
+
+
 _dispatchers: list[Any] = []
 
 
@@ -80,6 +108,13 @@ def _compare_dependencies(dispatcher: Any) -> None:
         file._source_stamp = (file._source_stamp, _dependencies(dispatcher))
 
 
+def _sources(dispatcher: Any) -> str:
+    """The digest of a function and of all that it takes from other modules."""
+    python = dispatcher.py_func
+    own = python.__module__, python.__qualname__, _stamp(python.__module__)
+    return hashlib.sha256(repr((own, _dependencies(dispatcher))).encode()).hexdigest()
+
+
 _OURS: Final = ("neurove_core", "neurove_protocol")
 """Packages whose functions are followed although numba did not make them, such as instructions of the processor."""
 
@@ -89,7 +124,7 @@ def _dependencies(function: Callable[..., Any]) -> tuple[tuple[str, str], ...]:
 
     Its machine code has the code of every function that it calls, and the values of every constant that it uses.
 
-    A function counts with the time and size of its file, a constant with its value. Functions that are called by those
+    A function counts with the content of its file, a constant with its value. Functions that are called by those
     that it calls count too.
     """
     found: dict[str, str] = {}
@@ -137,9 +172,14 @@ def _stamp(module: str) -> str:
     file = getattr(sys.modules.get(module), "__file__", None)
     try:
         status = Path(file).stat() if file else None
+        return _digest(Path(str(file)), status.st_mtime_ns, status.st_size) if status else ""
     except OSError:  # as in an archive, which numba does not cache either
         return ""
-    return f"{status.st_mtime} {status.st_size}" if status else ""
+
+
+@functools.cache
+def _digest(file: Path, mtime_ns: int, size: int) -> str:  # time and size: a file that changes is read again
+    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def _tolerate_io_errors(dispatcher: Any) -> None:
