@@ -10,7 +10,7 @@ JOBS ?= 2
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
 
-.PHONY: run test coverage ros2 format picture docs wheel image clean
+.PHONY: run test test-pythons coverage ros2 format picture docs wheel image clean
 
 run: $(VENV)/warm
 	@echo "with a live page for browsers: $(BIN)/neurove demo --page"
@@ -25,6 +25,9 @@ test: $(VENV)/warm $(VENV)/packages
 
 coverage: $(VENV)/warm  # the tests with the share of lines and branches that they run; it takes half as long again
 	$(BIN)/pytest --numprocesses $(JOBS) --dist loadgroup --no-loadscope-reorder --cov --cov-report=term
+
+test-pythons: $(VENV)/installed  # some tests with each Python from 3.11 to 3.14 that is at hand; PYTHONS_ARGS: see the module
+	$(BIN)/python -m tests.long.pythons $(PYTHONS_ARGS)
 
 ros2: .venv-ros2/ready  # for the tests with real nodes of ROS 2; without it they are skipped
 

@@ -7,12 +7,15 @@ from typing import NamedTuple
 
 import pytest
 import structlog
-import torch
 from hypothesis import settings
 
+from neurove_core.extras import installed
 from neurove_service.cli import main
 
-torch.set_num_threads(1)
+if installed("torch"):  # tests.long.pythons also runs what needs none
+    import torch
+
+    torch.set_num_threads(1)
 os.environ.setdefault("NEUROVE_AHEAD", "off")  # tests count what is compiled, also where `make wheel` has run
 
 

@@ -1,4 +1,4 @@
-"""The compiled code on arm64, emulated: `python -m tests.long.arm64 --folder DIR`; up to 20 minutes.
+"""The compiled code on arm64, emulated: `python -m tests.long.arm64 --folder DIR`; on a busy machine an hour.
 
 It needs Debian with mmdebstrap, its mirror and PyPI. The run unpacks a Python for arm64 and the emulator of qemu-user
 into the folder, without installing anything, and runs the same there and here: networks in float32 and int8, events to
