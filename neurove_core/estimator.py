@@ -369,16 +369,17 @@ def _turned(estimate: WindowEstimate, found: RotationFound, velocity: refining.V
 
 
 def _with_errors(estimate: WindowEstimate, found: refining.Stages, height_m: float) -> WindowEstimate:
-    """An estimate without the ground, whose covariance has the terms of `refine.errors`."""
+    """An estimate without the ground, with the terms of `refine.errors`, and less of a speed that is not seen."""
     if estimate.covariance is None:
         return estimate
-    covariance, turn = estimate.covariance.copy(), found.turn
+    twists, covariance, turn = estimate.twists, estimate.covariance.copy(), found.turn
     if turn.errors is not None:
         covariance[3:, 3:] = (turn.errors + turn.errors.T) / 2
     if found.velocity is None:
-        rate_rad_s = float(np.linalg.norm(estimate.twists.mean(axis=0)[3:]))
+        twists = standing.towards_zero(twists, estimate.covariance)
+        rate_rad_s = float(np.linalg.norm(twists.mean(axis=0)[3:]))
         covariance = errors.of_unknown_depth(covariance, turn.shift, rate_rad_s, height_m)
-    return estimate._replace(covariance=covariance)
+    return estimate._replace(twists=twists, covariance=covariance)
 
 
 def _over_ground(

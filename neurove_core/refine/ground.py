@@ -237,7 +237,7 @@ def refine(
         return Answer("turning", found._replace(twist=twist), state._replace(last=None, sway=sway))
     known = ground_pitch.Pitch(state.pitch, state.pitch_sigma)
     pitch, pitch_sigma = ground_pitch.learned(known, by_events, 1 / len(used), PITCH_SIGMA)
-    twist, sway = swayed(found.twist, found.pitch, state.sway)
+    twist, sway = swayed(found.twist, found.pitch, state.sway, height_m)
     found, answers = _on_time(found._replace(twist=twist), state.answers, begin_us, end_us, window_us)
     ahead = math.sqrt(found.covariance[2, 2]) / height_m
     standing = answered(state.standing, end_us, float(np.linalg.norm(unknowns[:3])), ahead)
@@ -262,11 +262,13 @@ def _on_time(
     if answers and middle_s - answers[-1][0] > 4 * window_us / 1e6:  # spans differ in length
         answers = ()
     ahead = np.array([0.0, -math.sin(found.pitch), math.cos(found.pitch)])
-    answers = (*answers, (middle_s, float(ahead @ found.twist[:3])))[-ANSWERS:]
+    answers = (*answers, (middle_s, float(ahead @ found.twist[:3]), float(found.twist[4])))[-ANSWERS:]
     more = change(answers, newest_s - middle_s)
     twist, covariance = found.twist.copy(), found.covariance.copy()
     twist[:3] += more.speed_m_s * ahead
     covariance[:3, :3] += more.sigma_m_s**2 * np.outer(ahead, ahead)
+    twist[4] += more.yaw_rad_s
+    covariance[4, 4] += more.sigma_rad_s**2
     return found._replace(twist=twist, covariance=covariance), answers
 
 

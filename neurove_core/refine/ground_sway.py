@@ -2,7 +2,10 @@
 
 The tilt of a vehicle stays bounded, so its pitch rate has no mean: a slow mean is an error, as of the distance of what
 the camera sees, and most of it is taken out. Both rates are then drawn towards zero, by the share of their power that
-is noise (a Wiener filter whose power of the signal is learned). The errors grow with the speed.
+is noise (a Wiener filter whose power of the signal is learned), but not below PITCH_KEPT and ROLL_KEPT. The errors grow
+with the speed.
+
+A camera that moves many heights in a second shows its yaw rate too fast, by TOO_FAST_S.
 
 A slow camera may be in a hand, so its rates stay as they are.
 """
@@ -21,6 +24,19 @@ NOISE_RAD_S: Final = 0.012
 FAST_M_S: Final = 4.0
 """From this speed on the rates are filtered in full."""
 
+PITCH_KEPT: Final = 0.8
+"""Least share of a pitch rate that is kept: the power of little motion is too uncertain to tell how little it is."""
+
+ROLL_KEPT: Final = 0.7
+"""The same for a roll rate."""
+
+TOO_FAST_S: Final = 0.01
+"""Error of the yaw rate of a search, as a share of it, by the speed over the height of the camera [s]. It was measured
+on own drives with the camera at 0.3 to 2.4 m; its cause is not known, see decision 165."""
+
+MOST_TOO_FAST: Final = 0.2
+"""Greatest share that is taken out."""
+
 _MEAN_SHARE: Final = 0.2  # of a new window in the mean of the pitch rate
 _MEAN_TAKEN: Final = 0.85  # share of the mean that is taken out
 _POWER_SHARE: Final = 0.05  # of a new window in the power
@@ -34,17 +50,20 @@ class Sway(NamedTuple):
     roll_power: float = 2 * NOISE_RAD_S**2
 
 
-def swayed(twist: Array, pitch: float, sway: Sway) -> tuple[Array, Sway]:
+def swayed(twist: Array, pitch: float, sway: Sway, height_m: float = math.inf) -> tuple[Array, Sway]:
     """The twist (6,) with filtered rates of pitch and roll, and what is known after it.
 
     Args:
         twist: of a search, in the optical frame [m/s, rad/s].
         pitch: of the camera against the ground [rad], positive downwards; yaw is about the normal of the ground.
         sway: from the window before.
+        height_m: of the camera above the ground, if its speed is known.
     """
     c, s = math.cos(pitch), math.sin(pitch)
     rate, yaw, roll = float(twist[3]), c * twist[4] + s * twist[5], c * twist[5] - s * twist[4]
-    share = min(1.0, float(np.linalg.norm(twist[:3])) / FAST_M_S)
+    speed_m_s = float(np.linalg.norm(twist[:3]))
+    share = min(1.0, speed_m_s / FAST_M_S)
+    yaw = yaw * (1 - min(TOO_FAST_S * speed_m_s / height_m, MOST_TOO_FAST))
     swing = rate - share * _MEAN_TAKEN * sway.mean_rad_s
     found = Sway(
         sway.mean_rad_s + _MEAN_SHARE * (rate - sway.mean_rad_s),
@@ -52,7 +71,8 @@ def swayed(twist: Array, pitch: float, sway: Sway) -> tuple[Array, Sway]:
         sway.roll_power + _POWER_SHARE * (float(roll) ** 2 - sway.roll_power),
     )
     noise = (share * NOISE_RAD_S) ** 2
-    swing, roll = swing * _signal(found.pitch_power, noise), roll * _signal(found.roll_power, noise)
+    swing = swing * max(_signal(found.pitch_power, noise), 1 - share * (1 - PITCH_KEPT))
+    roll = roll * max(_signal(found.roll_power, noise), 1 - share * (1 - ROLL_KEPT))
     out = twist.copy()
     out[3:] = swing, c * yaw - s * roll, s * yaw + c * roll
     return out, found

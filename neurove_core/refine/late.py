@@ -1,14 +1,16 @@
 """An answer over the ground belongs to the middle of its span; this module brings it to the newest window.
 
-A vehicle that brakes or starts is therefore answered late, by its acceleration times half the span. The acceleration is
-the slope of a line through the newest answers, drawn towards zero by how uncertain it is: spans overlap, so the
-errors of answers are alike, and a slope is less certain than their scatter says.
+A vehicle that brakes, starts, or enters a bend is therefore answered late, by its acceleration times half the span. The
+acceleration is the slope of a line through the newest answers, drawn towards zero by how uncertain it is: spans
+overlap, so the errors of answers are alike, and a slope is less certain than their scatter says. The same holds for
+the yaw rate.
 """
 
 import math
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 ANSWERS: Final = 12
 """Newest answers in a row that make a slope, and LEAST of them at least."""
@@ -24,15 +26,24 @@ ACCELERATION_M_S2: Final = 1.0
 MOST_M_S2: Final = 4.0
 """A greater slope is no acceleration, but a search that comes nearer to the motion."""
 
-Answers = tuple[tuple[float, float], ...]
-"""Time [s] of the middle of the span, and speed ahead [m/s], of the newest answers in a row, oldest first."""
+TURN_RAD_S2: Final = 0.4
+"""The same sigma for the yaw rate."""
+
+MOST_RAD_S2: Final = 1.0
+"""The same bound for the yaw rate."""
+
+Answers = tuple[tuple[float, float, float], ...]
+"""Time [s] of the middle of the span, speed ahead [m/s] and yaw rate [rad/s], of the newest answers in a row, oldest
+first."""
 
 
 class Change(NamedTuple):
-    """How much the speed ahead changes from the middle of the span to the middle of the window."""
+    """How much speed ahead and yaw rate change from the middle of the span to the middle of the window."""
 
     speed_m_s: float = 0.0
     sigma_m_s: float = 0.0
+    yaw_rad_s: float = 0.0
+    sigma_rad_s: float = 0.0
 
 
 def change(answers: Answers, delay_s: float) -> Change:
@@ -44,13 +55,20 @@ def change(answers: Answers, delay_s: float) -> Change:
     """
     if len(answers) < LEAST:
         return Change()
-    times, speeds = np.array(answers).T
-    times, speeds = times - times.mean(), speeds - speeds.mean()
+    times, speeds, rates = np.array(answers).T
+    speed, sigma = _slope(times, speeds, ACCELERATION_M_S2, MOST_M_S2)
+    yaw, yaw_sigma = _slope(times, rates, TURN_RAD_S2, MOST_RAD_S2)
+    return Change(speed * delay_s, sigma * delay_s, yaw * delay_s, yaw_sigma * delay_s)
+
+
+def _slope(times: NDArray[np.float64], values: NDArray[np.float64], known: float, most: float) -> tuple[float, float]:
+    """The slope of some values (N,) over their times (N,), with the sigma `known` before, and its sigma."""
+    times, values = times - times.mean(), values - values.mean()
     square = float(times @ times)
-    slope = float(times @ speeds) / square
-    rest = speeds - slope * times
-    variance = INFLATION * float(rest @ rest) / (len(answers) - 2) / square
-    if abs(slope) > MOST_M_S2:
-        return Change()
-    share = ACCELERATION_M_S2**2 / (ACCELERATION_M_S2**2 + variance)
-    return Change(share * slope * delay_s, math.sqrt(share * variance) * delay_s)
+    slope = float(times @ values) / square
+    if abs(slope) > most:
+        return 0.0, 0.0
+    rest = values - slope * times
+    variance = INFLATION * float(rest @ rest) / (len(values) - 2) / square
+    share = known**2 / (known**2 + variance)
+    return share * slope, math.sqrt(share * variance)

@@ -20,6 +20,10 @@ The refined motion is accepted if
 - the network sees a turn of STILL_RAD_S, or the alignment is better than without motion by MIN_SHARPER.
 Else the network's answer stands.
 
+A turn and a translation across the optical axis look nearly alike. The translation has a narrow prior until the events
+of the newest windows show one (`_aside`). Otherwise the network, which does not see a slow turn, would leave it to the
+translation.
+
 Two things outweigh the network:
 - A motion that goes on: for MAX_AGAINST windows in a row, an answer that continues the windows before (MAX_OFF) is
   accepted although the network contradicts it or sees the camera move fast.
@@ -110,6 +114,10 @@ _CHANGE_ERROR: Final = 0.12  # error of pitch and yaw rate, as a share of the ch
 _SHIFT_ERROR: Final = 0.7  # the same by the square of the translation over depth [s]: depths differ
 _ROLL_SCALE: Final = 0.75  # of the sigma of the roll rate, which no translation resembles
 _ROLL_SHARE: Final = 0.4  # of the other errors
+_NOT_ASIDE: Final = 0.03  # sigma of the translation over depth across the optical axis, where none is shown [1/s]
+_ODDS_KEPT: Final = 0.8  # share of the log odds of such a translation that goes on to the next window
+_NOISE_GAIN: Final = 1.0  # of the log of the likelihood by a free translation across the axis, where there is none
+_MAX_ODDS: Final = 8.0
 _LOST_SIGMA: Final = 0.5  # the filter begins again above this [rad/s]
 
 
@@ -127,6 +135,7 @@ class Filter(NamedTuple):
     covariance: Array  # (6, 6)
     end_us: int  # end of its newest window
     against: int = 0  # newest windows in a row that were accepted against the network
+    aside: float = 0.0  # log odds that the camera moves across its optical axis, see _aside
 
 
 class Given(NamedTuple):
@@ -219,6 +228,11 @@ def _searched(given: Given, known: Rate, before: Filter | None, not_accepted: Ra
     seconds = given.window_us / 1e6
     prior = _prior(known, before, seconds)
     found = search(rays, given.view.grid, prior, _guesses(known, before, seconds))
+    aside = _aside(found, prior, before)
+    if before is not None and before.aside < 0 <= aside:  # such a translation begins
+        before = _freed(before)
+        prior = _prior(known, before, seconds)
+        found = search(rays, given.view.grid, prior, [*_guesses(known, before, seconds), found.motion])
     posterior = found.information / _DISPERSION + prior.information
     if not np.linalg.eigvalsh(posterior)[0] > 0:
         return Refined(not_accepted, "no maximum", before, motion=found.motion / seconds)
@@ -232,7 +246,8 @@ def _searched(given: Given, known: Rate, before: Filter | None, not_accepted: Ra
     rate = Rate(motion[:3], _honest(motion, covariance, before))
     sigma, shift = np.sqrt(np.diagonal(covariance)[:3]), float(np.linalg.norm(motion[3:]))
     wider = errors.of_rotation(motion, covariance, motion if before is None else before.motion, known.w_rad_s)
-    return Refined(rate, outcome, Filter(motion, covariance, end_us), change, sigma, wider, shift, motion)
+    filtered = Filter(motion, covariance, end_us, aside=aside)
+    return Refined(rate, outcome, filtered, change, sigma, wider, shift, motion)
 
 
 def _honest(motion: Array, covariance: Array, before: Filter | None) -> Array:
@@ -275,7 +290,7 @@ def _predicted(before: Filter | None, start_us: int, window_us: int) -> Filter |
     covariance = before.covariance * np.outer(kept, kept) + np.diag(growth)
     if turn * np.sqrt(windows) > max(_LOST_SIGMA, 2 * turn):
         return None
-    return Filter(before.motion * kept, covariance, start_us, before.against)
+    return Filter(before.motion * kept, covariance, start_us, before.against, before.aside)
 
 
 def _prior(known: Rate, before: Filter | None, seconds: float) -> Gaussian:
@@ -288,7 +303,30 @@ def _prior(known: Rate, before: Filter | None, seconds: float) -> Gaussian:
         information[3:, 3:] = 0.0
         more = np.linalg.inv(before.covariance)
         information, weighted = information + more, weighted + more @ before.motion
+        if before.aside < 0:
+            information[[3, 4], [3, 4]] += 1 / _NOT_ASIDE**2
     return Gaussian(np.linalg.solve(information, weighted) * seconds, information / seconds**2)
+
+
+def _aside(found: Found, prior: Gaussian, before: Filter | None) -> float:
+    """Log odds that the camera moves across its optical axis, after a search.
+
+    The likelihood of the events is taken for a quadratic around the maximum that the search found. What a free
+    translation across the axis adds to its logarithm over none counts, less what it adds by noise alone.
+    """
+    odds = 0.0 if before is None else before.aside
+    by_events = found.information + 1e-3 * prior.information
+    best = found.motion + np.linalg.solve(by_events, prior.information @ (found.motion - prior.mean))
+    weight = np.linalg.inv(np.linalg.inv(by_events)[3:5, 3:5])  # whatever the other unknowns are
+    gain = float(best[3:5] @ weight @ best[3:5]) / 2
+    return float(np.clip(_ODDS_KEPT * odds + max(gain, 0.0) / _DISPERSION - _NOISE_GAIN, -_MAX_ODDS, _MAX_ODDS))
+
+
+def _freed(before: Filter) -> Filter:
+    """The filter without what it knows of the translation."""
+    covariance = before.covariance.copy()
+    covariance[3:, :3], covariance[:3, 3:], covariance[3:, 3:] = 0.0, 0.0, np.eye(3) * _SHIFT_SIGMA**2
+    return before._replace(covariance=covariance, motion=before.motion * np.repeat([1.0, 0.0], 3), aside=0.0)
 
 
 def _guesses(known: Rate, before: Filter | None, seconds: float) -> list[Array]:

@@ -45,6 +45,10 @@ TURN_RAD_S2: Final = 0.5
 SIGMAS: Final = 2.0
 """A motion that is faster than SLOW by so many sigmas is not slow."""
 
+UNSEEN: Final = 0.05
+"""Speed over its sigma at which a speed of the network is halved. Where it sees next to nothing, it says 0.1 heights
+a second, with a sigma of 1.4 to 1.7, whether the camera stands or crawls (decision 172)."""
+
 KEPT_US: Final = 500_000
 """Time after which an answer or a stop says nothing of the present."""
 
@@ -114,3 +118,19 @@ def answered(standing: Standing, end_us: int, speed: float, sigma: float) -> Sta
     if speed > SLOW:
         return standing
     return standing._replace(slow_us=end_us, stood_us=standing.stood_us if standing.few else None)
+
+
+def towards_zero(twists: Array, covariance: Array) -> Array:
+    """Twists (n, 6) of the network whose linear part is shrunk where it is small against its sigma.
+
+    A network that sees nothing answers with the mean of what it learned. Its sigma shows that, and stays as it is.
+
+    Args:
+        twists: (n, 6) of the network [m/s, rad/s].
+        covariance: (6, 6) of each of them.
+    """
+    mean = twists[:, :3].mean(axis=0)
+    square = float(mean @ mean)
+    share = square / (square + UNSEEN**2 * float(np.trace(covariance[:3, :3])) + 1e-12)
+    shrunk: Array = twists * np.repeat([share, 1.0], 3)
+    return shrunk

@@ -56,6 +56,43 @@ def test_a_sideways_slide_is_not_taken_for_a_turn():
     assert np.abs(found.rate.w_rad_s).max() < 0.5 * 0.3  # rotation alone would explain it as 0.3 rad/s
 
 
+def over_windows(sample, windows=8):
+    """The refined rate of the last of some windows in a row with the same events; the network sees no motion."""
+    before, found = None, None
+    for number in range(windows):
+        known = given(sample, w=np.zeros(3), covariance=SPREAD / 4, before=before)
+        found = refine(known._replace(start_us=1_000_000 + number * 50_000))
+        before = found.filter
+    return found
+
+
+def test_odds_of_a_motion_across_the_axis_follow_the_events():
+    slide = over_windows(sample_of(of_slide(ECD, np.array([0.3, 0.0]), 0.05, points=2000)), 3)
+    turn = over_windows(sample_of(of_rotation(ECD, np.array([0.3, 0.0, 0.0]), 0.05, points=4000)), 3)
+    assert slide.filter.aside > 0 > turn.filter.aside
+
+
+def test_where_no_motion_across_the_axis_is_shown_a_false_one_is_given_up():
+    """Few blurred events leave open what turned and what slid: 0.15 rad/s each before, and a turn of 0.3 rad/s now."""
+    rng, sample = (
+        np.random.default_rng(20060),
+        sample_of(of_rotation(ECD, np.array([0.3, 0.0, 0.0]), 0.05, points=4000)),
+    )
+    x, y = (np.clip(c + rng.integers(-2, 3, c.size), 0, 179).astype(c.dtype) for c in (sample.x, sample.y))
+    shared = np.array([0.15, 0.0, 0.0, 0.0, -0.15, 0.0])
+    found = []
+    for odds in (-8.0, 8.0):
+        before = Filter(shared, np.diag([0.1] * 3 + [0.05] * 3) ** 2, 1_000_000, aside=odds)
+        found.append(refine(given(Sample(sample.t_us, x, y), w=np.zeros(3), before=before)).motion)
+    assert abs(found[0][4]) < 0.5 * abs(found[1][4])
+    assert abs(found[0][0] - 0.3) < abs(found[1][0] - 0.3)
+
+
+def test_a_slide_that_goes_on_does_not_become_a_turn():
+    found = over_windows(sample_of(of_slide(ECD, np.array([0.3, 0.0]), 0.05, points=2000)))
+    assert np.abs(found.rate.w_rad_s).max() < 0.5 * 0.3
+
+
 def rejected(outcome, **fields):
     known = given(**fields)
     found = refine(known)

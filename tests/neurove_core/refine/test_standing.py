@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from neurove_core.refine.standing import KEPT_US, Standing, answered, hold, outweighs
+from neurove_core.refine.standing import KEPT_US, Standing, answered, hold, outweighs, towards_zero
 
 WINDOW_US = 50_000
 NETWORK = np.tile([0.0, 0.1, 2.0, 0.02, 0.0, 0.01], (5, 1))  # it goes on with 2 m/s
@@ -88,3 +88,21 @@ def test_an_answer_that_may_be_slow_as_well_does_not_end_what_is_known():
     """The last events of a vehicle that stops leave the motion over the ground to the network."""
     assert speed(0.01, answered(slow(), 0, 0.9, 0.5)) < 0.01
     assert speed(0.01, answered(slow(), 0, 0.9, 0.1)) == 2.0
+
+
+def test_a_speed_that_is_small_against_its_sigma_is_shrunk_and_the_turning_stays():
+    unseen = np.tile([0.0, 0.0, 0.11, 0.02, 0.0, 0.01], (5, 1))
+    found = towards_zero(unseen, np.diag([0.1, 0.1, 1.6, 0.05, 0.05, 0.05]) ** 2)
+    assert 0.0 < found[0, 2] < 0.08
+    assert np.array_equal(found[:, 3:], unseen[:, 3:])
+
+
+def test_a_speed_that_is_seen_stays():
+    found = towards_zero(NETWORK, COVARIANCE)
+    assert np.abs(found - NETWORK).max() < 0.01
+    crawl = NETWORK * 0.1
+    assert np.abs(towards_zero(crawl, COVARIANCE / 25) - crawl).max() < 0.01
+
+
+def test_no_speed_stays_none():
+    assert np.array_equal(towards_zero(np.zeros((5, 6)), COVARIANCE), np.zeros((5, 6)))
