@@ -27,7 +27,7 @@ from neurove_core.refine import ground_kernels as kernels
 from neurove_core.refine import ground_pitch
 from neurove_core.refine.ground_kernels import Image, Rays
 from neurove_core.refine.ground_search import UNKNOWNS, Prior, climb, motion_of, objective
-from neurove_core.refine.ground_sway import Sway, swayed
+from neurove_core.refine.ground_sway import Sway, steady, swayed
 from neurove_core.refine.late import ANSWERS, Answers, change
 from neurove_core.refine.standing import Standing, answered, outweighs
 from neurove_core.refine.view import View
@@ -132,6 +132,7 @@ class GroundState(NamedTuple):
     tilt: float = 0.0  # mean square rate of pitch and roll before the search [rad^2/s^2]
     standing: Standing = Standing()
     answers: Answers = ()  # accepted in a row, see `late`
+    doubted: bool = False  # whether the network's rates were too great for a vehicle in the window before
 
 
 class GroundMotion(NamedTuple):
@@ -194,7 +195,8 @@ def refine(
     Returns:
         an answer is accepted unless
         - the camera pitches or rolls faster than MAX_TILT_RAD_S, or has done so in the last SPAN_US ("tilting"): a
-          camera in a hand is not at a known height and pitch;
+          camera in a hand is not at a known height and pitch. After ANSWERS accepted ones a single window that only the
+          network says to tilt is searched about the last answer first;
         - there are fewer than LEAST_EVENTS on the ground and fewer far ones ("few events");
         - the ground has few events, as one of one colour: only the angular velocity is known ("turning");
         - its events do not belong together ("noise"), as those of a stationary camera;
@@ -202,6 +204,7 @@ def refine(
           the measured one ("contradicted"), as that of a camera whose height changes;
         - it is less certain than that the vehicle stands ("standing").
     """
+    before = state
     recent = state.recent if state.end_us in (None, start_us) else ()
     window_us = end_us - start_us
     state = state._replace(
@@ -211,7 +214,12 @@ def refine(
     tilt_rad_s = math.hypot(twist[3], c * twist[5] - s * twist[4])
     state = state._replace(tilt=state.tilt + _TILT_SHARE * (tilt_rad_s**2 - state.tilt))
     if tilt_rad_s > MAX_TILT_RAD_S:
-        state = state._replace(recent=(), last=None, pitch_sigma=PITCH_SIGMA, calm_us=0, sway=Sway())
+        if measured is None and state.last is not None and len(state.answers) == ANSWERS and not state.doubted:
+            level = steady(twist, state.last, state.pitch)
+            answer = refine(new, start_us, end_us, camera, level, sigma_rad_s, before)
+            if answer.outcome == "accepted":
+                return answer._replace(state=answer.state._replace(doubted=True))
+        state = state._replace(recent=(), last=None, pitch_sigma=PITCH_SIGMA, calm_us=0, sway=Sway(), doubted=False)
         return Answer("tilting", None, state)
     state = state._replace(calm_us=min(state.calm_us + window_us, SPAN_US))
     if state.calm_us < SPAN_US:
@@ -248,6 +256,7 @@ def refine(
         pitch_sigma=pitch_sigma,
         walls=(float(walls[0]), float(walls[1])),
         sway=sway,
+        doubted=False,
         standing=standing,
         answers=answers,
     )

@@ -1,9 +1,9 @@
 """Pitch and roll rates of a vehicle, from those that the events of some windows show.
 
-The tilt of a vehicle stays bounded, so its pitch rate has no mean: a slow mean is an error, as of the distance of what
-the camera sees, and most of it is taken out. Both rates are then drawn towards zero, by the share of their power that
-is noise (a Wiener filter whose power of the signal is learned), but not below PITCH_KEPT and ROLL_KEPT. The errors grow
-with the speed.
+The tilt of a vehicle stays bounded, so its rates of pitch and roll have no mean: a slow mean is an error, as of the
+distance of what the camera sees, and most of it is taken out. Both rates are then drawn towards zero, by the share of
+their power that is noise (a Wiener filter whose power of the signal is learned), but not below PITCH_KEPT and
+ROLL_KEPT. The errors grow with the speed.
 
 A camera that moves many heights in a second shows its yaw rate too fast, by TOO_FAST_S.
 
@@ -37,15 +37,16 @@ on own drives with the camera at 0.3 to 2.4 m; its cause is not known, see decis
 MOST_TOO_FAST: Final = 0.2
 """Greatest share that is taken out."""
 
-_MEAN_SHARE: Final = 0.2  # of a new window in the mean of the pitch rate
+_MEAN_SHARE: Final = 0.2  # of a new window in the means of the rates
 _MEAN_TAKEN: Final = 0.85  # share of the mean that is taken out
 _POWER_SHARE: Final = 0.05  # of a new window in the power
 
 
 class Sway(NamedTuple):
-    """What is known of the rates; powers are mean squares with the noise."""
+    """What is known of the rates; means [rad/s], and powers, mean squares with the noise."""
 
-    mean_rad_s: float = 0.0  # of the pitch rate
+    pitch_mean: float = 0.0
+    roll_mean: float = 0.0
     pitch_power: float = 2 * NOISE_RAD_S**2
     roll_power: float = 2 * NOISE_RAD_S**2
 
@@ -60,15 +61,17 @@ def swayed(twist: Array, pitch: float, sway: Sway, height_m: float = math.inf) -
         height_m: of the camera above the ground, if its speed is known.
     """
     c, s = math.cos(pitch), math.sin(pitch)
-    rate, yaw, roll = float(twist[3]), c * twist[4] + s * twist[5], c * twist[5] - s * twist[4]
+    pitching, yaw, rolling = float(twist[3]), c * twist[4] + s * twist[5], float(c * twist[5] - s * twist[4])
     speed_m_s = float(np.linalg.norm(twist[:3]))
     share = min(1.0, speed_m_s / FAST_M_S)
     yaw = yaw * (1 - min(TOO_FAST_S * speed_m_s / height_m, MOST_TOO_FAST))
-    swing = rate - share * _MEAN_TAKEN * sway.mean_rad_s
+    swing = pitching - share * _MEAN_TAKEN * sway.pitch_mean
+    roll = rolling - share * _MEAN_TAKEN * sway.roll_mean
     found = Sway(
-        sway.mean_rad_s + _MEAN_SHARE * (rate - sway.mean_rad_s),
+        sway.pitch_mean + _MEAN_SHARE * (pitching - sway.pitch_mean),
+        sway.roll_mean + _MEAN_SHARE * (rolling - sway.roll_mean),
         sway.pitch_power + _POWER_SHARE * (swing**2 - sway.pitch_power),
-        sway.roll_power + _POWER_SHARE * (float(roll) ** 2 - sway.roll_power),
+        sway.roll_power + _POWER_SHARE * (roll**2 - sway.roll_power),
     )
     noise = (share * NOISE_RAD_S) ** 2
     swing = swing * max(_signal(found.pitch_power, noise), 1 - share * (1 - PITCH_KEPT))
@@ -76,6 +79,13 @@ def swayed(twist: Array, pitch: float, sway: Sway, height_m: float = math.inf) -
     out = twist.copy()
     out[3:] = swing, c * yaw - s * roll, s * yaw + c * roll
     return out, found
+
+
+def steady(twist: Array, last: Array, pitch: float) -> Array:
+    """A twist (6,) with the yaw rate of the last answer (6,), without rates of pitch and roll; see `swayed`."""
+    c, s = math.cos(pitch), math.sin(pitch)
+    yaw = c * last[4] + s * last[5]
+    return np.array([*twist[:3], 0.0, c * yaw, s * yaw])
 
 
 def _signal(power: float, noise: float) -> float:

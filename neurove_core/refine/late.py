@@ -29,8 +29,8 @@ MOST_M_S2: Final = 4.0
 TURN_RAD_S2: Final = 0.4
 """The same sigma for the yaw rate."""
 
-MOST_RAD_S2: Final = 1.0
-"""The same bound for the yaw rate."""
+MOST_RAD_S2: Final = 2.0
+"""The same bound for the yaw rate; a small vehicle begins a bend with 1.2 rad/s^2."""
 
 Answers = tuple[tuple[float, float, float], ...]
 """Time [s] of the middle of the span, speed ahead [m/s] and yaw rate [rad/s], of the newest answers in a row, oldest

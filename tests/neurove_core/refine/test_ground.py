@@ -22,6 +22,7 @@ from neurove_core.refine.ground import (
     refine,
 )
 from neurove_core.refine.ground_search import Prior, climb, objective
+from neurove_core.refine.late import ANSWERS
 from neurove_protocol import CameraInfo
 
 Array = NDArray[np.float64]
@@ -159,6 +160,42 @@ def test_a_camera_that_pitches_is_not_refined_until_it_has_been_calm() -> None:
         state = found.state
         outcomes.append(found.outcome)
     assert outcomes == ["accepted", *["tilting"] * 4, "accepted", "accepted"]
+
+
+@pytest.mark.parametrize(
+    ("wild", "measured", "outcomes"),
+    [
+        (1, None, ["accepted"] * 3),
+        (2, None, ["accepted", "tilting", "tilting"]),
+        (1, np.eye(3) * 1e-4, ["tilting"] * 3),
+    ],
+)
+def test_one_window_in_which_only_the_network_tilts_a_vehicle_is_searched(
+    wild: int, measured: Array | None, outcomes: list[str]
+) -> None:
+    truth, state, found = ahead(2.0), GroundState(), []
+    tilting = truth + np.array([0.0, 0, 0, -0.3, 0, -0.2])
+    for number in range(ANSWERS + 3):
+        known = tilting if 0 <= number - ANSWERS < wild else truth
+        window = seen(truth, number * WINDOW_US), number * WINDOW_US, (number + 1) * WINDOW_US
+        one = refine(*window, camera(), known, SIGMA_RAD_S, state, measured if known is tilting else None)
+        state, found = one.state, [*found, one]
+    assert [one.outcome for one in found[ANSWERS:]] == outcomes
+    for one in found[ANSWERS:]:
+        if one.outcome == "accepted":
+            assert one.motion is not None
+            np.testing.assert_allclose(one.motion.twist[3:], 0.0, atol=0.03)
+
+
+def test_a_vehicle_that_does_tilt_is_not_searched_further() -> None:
+    level, tilting = ahead(2.0), ahead(2.0) + np.array([0.0, 0, 0, 0.5, 0, 0.3])
+    state, outcomes = GroundState(), []
+    for number in range(ANSWERS + 3):
+        truth = tilting if number >= ANSWERS else level
+        window = seen(truth, number * WINDOW_US), number * WINDOW_US, (number + 1) * WINDOW_US
+        found = refine(*window, camera(), truth, SIGMA_RAD_S, state)
+        state, outcomes = found.state, [*outcomes, found.outcome]
+    assert outcomes[-2:] == ["tilting", "tilting"]
 
 
 def test_an_answer_is_accepted_exactly_where_it_is_not_too_far_from_what_is_known() -> None:
