@@ -74,6 +74,7 @@ class WindowEstimate(NamedTuple):
     uncertain: bool = False  # the linear or the angular sigma exceeds both its bounds, see Uncertainty.is_uncertain
     source: Source = "network"  # of the angular part
     gyro_disagrees: bool = False  # the events and the gyroscope of the camera disagree
+    vehicle: bool = False  # the camera is on a vehicle by the events of many windows
 
 
 class PushResult(NamedTuple):
@@ -237,7 +238,8 @@ class Estimator:
         answer, state = _over_ground(window, estimate, state, found)
         if answer is estimate:
             answer = _with_errors(estimate, found, given.height_m)
-        return answer._replace(uncertain=self.is_uncertain(answer.twists, answer.covariance)), state
+        uncertain, vehicle = self.is_uncertain(answer.twists, answer.covariance), state.stages.on_vehicle
+        return answer._replace(uncertain=uncertain, vehicle=vehicle), state
 
     def is_uncertain(self, twists: NDArray[np.float64], covariance: NDArray[np.float64] | None) -> bool:
         """Whether sigma exceeds the bounds, see `Uncertainty.is_uncertain`; False for a model without uncertainty."""
