@@ -47,7 +47,7 @@ SIGMAS: Final = 2.0
 
 UNSEEN: Final = 0.05
 """Speed over its sigma at which a speed of the network is halved. Where it sees next to nothing, it says 0.1 heights
-a second, with a sigma of 1.4 to 1.7, whether the camera stands or crawls (decision 172)."""
+a second, with a sigma of 1.4 to 1.7, whether the camera stands or crawls (decision 167)."""
 
 KEPT_US: Final = 500_000
 """Time after which an answer or a stop says nothing of the present."""
