@@ -29,6 +29,7 @@ def aided(
             refined=estimate.source == "refined",
             scale_m=height_m or 1.0,
             scaled=height_m is not None,
+            vehicle=estimate.vehicle,
         ),
     )
     disagrees = state.disagrees

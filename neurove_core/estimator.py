@@ -35,6 +35,7 @@ from neurove_protocol.events import WireEvents
 from neurove_protocol.velocity import Source
 
 _STREAM = "cam0"
+_METRES = np.ones(6)
 
 
 class StreamState(NamedTuple):
@@ -74,6 +75,7 @@ class WindowEstimate(NamedTuple):
     uncertain: bool = False  # the linear or the angular sigma exceeds both its bounds, see Uncertainty.is_uncertain
     source: Source = "network"  # of the angular part
     gyro_disagrees: bool = False  # the events and the gyroscope of the camera disagree
+    vehicle: bool = False  # the camera is on a vehicle by the events of many windows
 
 
 class PushResult(NamedTuple):
@@ -237,7 +239,8 @@ class Estimator:
         answer, state = _over_ground(window, estimate, state, found)
         if answer is estimate:
             answer = _with_errors(estimate, found, given.height_m)
-        return answer._replace(uncertain=self.is_uncertain(answer.twists, answer.covariance)), state
+        uncertain, vehicle = self.is_uncertain(answer.twists, answer.covariance), state.stages.on_vehicle
+        return answer._replace(uncertain=uncertain, vehicle=vehicle), state
 
     def is_uncertain(self, twists: NDArray[np.float64], covariance: NDArray[np.float64] | None) -> bool:
         """Whether sigma exceeds the bounds, see `Uncertainty.is_uncertain`; False for a model without uncertainty."""
@@ -270,8 +273,8 @@ class Estimator:
         stream.estimates.append(self._estimate(window, found.answer, state))
         end_us = window.start_us + self.config.window.duration_us
         recent = remembered(window.counts, state.recent, self.config)
-        after = state._replace(network=found.network, age=state.age + 1, end_us=end_us, recent=recent)
-        stream.state = after._replace(longer=found.longer)
+        network, age, longer = found.network, state.age + 1, found.longer
+        stream.state = state._replace(network=network, age=age, end_us=end_us, recent=recent, longer=longer)
 
     def warm_up(self) -> None:
         """Compile all code and run all parts, so that the first packet does not wait for it.
@@ -285,10 +288,10 @@ class Estimator:
 
     def _covariance(self, answer: Answer, metres: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Covariance (6, 6) of the twists of an answer, in the units of the estimate."""
-        log_sigma = self._runner.log_sigma(answer.network)
-        if self.bundle.uncertainty is None or log_sigma is None:
+        unsure = self.bundle.uncertainty
+        if unsure is None or (log_sigma := self._runner.log_sigma(answer.network)) is None:
             return None
-        return self.bundle.uncertainty.covariance(log_sigma, self._scale * metres / answer.scale)
+        return unsure.covariance(log_sigma, self._scale * metres / answer.scale)
 
     def _estimate(self, window: Window, answer: Answer, before: StreamState) -> WindowEstimate:
         metres, age = _to_metres(before.camera, self.bundle.linear_unit), before.age
@@ -439,4 +442,4 @@ def _without_rate(
 def _to_metres(camera: CameraInfo | None, unit: LinearUnit) -> NDArray[np.float64]:
     """Factor (6) of a twist that converts its linear part to m/s."""
     height_m = camera.height_m if camera is not None and unit == PER_HEIGHT else None
-    return np.array([height_m or 1.0] * 3 + [1.0] * 3)
+    return np.array([height_m] * 3 + [1.0] * 3) if height_m else _METRES

@@ -78,7 +78,7 @@ class Events(NamedTuple):
 
     def before(self, t_us: int) -> int:
         """Number of events earlier than `t_us`."""
-        return int(np.searchsorted(self.t, t_us))
+        return int(self.t.searchsorted(t_us))
 
     def span(self, first: int, stop: int) -> "Events":
         """Events [first, stop), as views."""
@@ -144,7 +144,7 @@ class WireEvents(NamedTuple):
         if after_us <= 0:
             return 0
         kind = offset.dtype.type  # another type would convert the whole column
-        return self.n if after_us > np.iinfo(kind).max else int(np.searchsorted(offset, kind(after_us)))
+        return self.n if after_us > np.iinfo(kind).max else int(offset.searchsorted(kind(after_us)))
 
     def span(self, first: int, stop: int) -> "WireEvents":
         """Events [first, stop), as views."""

@@ -18,10 +18,10 @@ import pickle
 import platform
 import sys
 from collections.abc import Callable, Iterable
+from importlib import metadata
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-import llvmlite
 import numba
 import numpy as np
 
@@ -134,7 +134,7 @@ _VERSIONS: Final = (
     platform.system(),
     platform.machine(),
     numba.__version__,
-    llvmlite.__version__,
+    metadata.version("llvmlite"),  # not imported: only the vector code may need it
     np.__version__,
 )
 

@@ -155,8 +155,11 @@ class ArrayRunner:
         self, counts: Sequence[Counts], states: Sequence[ArrayState]
     ) -> list[tuple[NDArray[np.float64], ArrayState]]:
         """One window of each stream; see `Runner.run`."""
-        together = np.ascontiguousarray(counts[0])[None] if len(counts) == 1 else np.stack(counts)
-        before = [np.concatenate(maps) for maps in zip(*(state.membranes for state in states), strict=True)]
+        if len(counts) == 1:  # without a copy
+            together, before = np.ascontiguousarray(counts[0])[None], list(states[0].membranes)
+        else:
+            together = np.stack(counts)
+            before = [np.concatenate(maps) for maps in zip(*(state.membranes for state in states), strict=True)]
         extract = self._plainly if is_plain() or self._compiled is None else self._fast
         rows, after = extract(together, before)
         found = []

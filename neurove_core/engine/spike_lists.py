@@ -1,5 +1,6 @@
 """Spike lists: the neurons of a feature map that fired, by their index, and conversions between memory layouts."""
 
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
@@ -60,12 +61,21 @@ def output_shape(given: tuple[int, ...], weights: tuple[int, int], v: Array) -> 
     Raises:
         ValueError: input, weights and potentials do not fit together.
     """
+    shape, fits = _fitted(given, weights, v.shape)
+    if not fits or v.dtype != np.float32:
+        have = f"{v.dtype} {v.shape}"
+        raise ValueError(f"maps {given} and weights {weights} give {shape[1:]} for each stream, potentials are {have}")
+    return shape
+
+
+@lru_cache(256)
+def _fitted(
+    given: tuple[int, ...], weights: tuple[int, int], potentials: tuple[int, ...]
+) -> tuple[tuple[int, int, int, int], bool]:
+    """The shape of `output_shape`, and whether the shapes fit together; the same few for all windows of a model."""
     maps, rows, columns, inputs = given
     shape = (rows + 1) // 2, (columns + 1) // 2, weights[1]
-    if v.shape[1:] != shape or maps % v.shape[0] or inputs != weights[0] or v.dtype != np.float32:
-        have = f"{v.dtype} {v.shape}"
-        raise ValueError(f"maps {given} and weights {weights} give {shape} for each stream, potentials are {have}")
-    return maps, *shape
+    return (maps, *shape), potentials[1:] == shape and not maps % potentials[0] and inputs == weights[0]
 
 
 def as_numpy(x: "Tensor") -> NDArray[Any]:

@@ -76,6 +76,8 @@ class Learned(NamedTuple):
             (track.grid_us, (angles,)),
             (track.angle_rad, (angles, 3)),
             (self.tilt.velocities_m_s, (len(self.tilt.velocities_m_s), 3)),
+            *(((self.tilt.covariance, (9, 9)),) if self.tilt.covariance is not None else ()),
+            *((vector, (3,)) for vector in (self.tilt.force_m_s2, self.tilt.average_m_s2) if vector is not None),
         ]
         return all(array.shape == shape and bool(np.isfinite(array).all()) for array, shape in shapes)
 
@@ -91,6 +93,7 @@ class Window(NamedTuple):
     refined: bool
     scale_m: float = 1.0  # height of the camera that the linear part assumes or knows
     scaled: bool = False  # it is known
+    vehicle: bool = False  # the camera is on a vehicle by the events of many windows
 
 
 class Aided(NamedTuple):
@@ -163,6 +166,7 @@ def _learned_in_motion(state: InertialState, window: Window, known: Imu, found: 
         window.twists[:, :3].mean(0) if window.scaled and not window.low_activity else None,
         window.twists[:, 3:].mean(0) if window.refined else None,
         np.diagonal(window.covariance)[3:],
+        window.vehicle,
     )
     now, tilt = moving.learned(state.bias, state.tilt, seen)
     return state._replace(bias=now, tilt=tilt)

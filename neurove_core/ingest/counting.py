@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from neurove_core.compiled import compiled
 from neurove_core.geometry.camera import OUTSIDE as NO_CELL
-from neurove_core.ingest.scaling import SHIFT, Scale, scale_of
+from neurove_core.ingest.products import scaled_cell
+from neurove_core.ingest.scaling import Scale, scale_of
 from neurove_protocol.events import Events
 
 
@@ -66,7 +67,7 @@ def _count(
     """
     t, x, y, p = events.t, events.x, events.y, events.p
     pixels, columns = lut.reshape(-1), np.uint32(lut.shape[1])
-    on, shift = np.uint32(cells), np.uint32(SHIFT)
+    on = np.uint32(cells)
     by_row, by_column, width = np.uint32(scale.rows), np.uint32(scale.columns), np.uint32(scale.width)
     found, plane = np.empty(_BLOCK, np.uint32), np.empty(_BLOCK, np.uint32)
     outside, first = 0, 0
@@ -78,8 +79,7 @@ def _count(
             xs, ys, ps = x[i : i + m], y[i : i + m], p[i : i + m]
             if width:
                 for j in range(m):
-                    row, column = np.uint32(ys[j]) * by_row >> shift, np.uint32(xs[j]) * by_column >> shift
-                    found[j] = row * width + column + on * np.uint32(ps[j] != 0)
+                    found[j] = scaled_cell(ys[j], xs[j], ps[j], by_row, by_column, width, on)
                 add_events(found, m, pair)
                 continue
             for j in range(m):

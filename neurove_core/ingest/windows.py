@@ -93,18 +93,26 @@ def push(
     open_window = _Open(start_us, state, config, canonical, sampled)
     while newest_us >= open_window.start_us + duration:
         end_us = open_window.start_us + duration
-        inside = events.before(end_us)
-        open_window.add(events.span(0, inside), lut)
-        events = events.span(inside, events.n)
+        inside, events = _split(events, end_us)
+        open_window.add(inside, lut)
         windows.append(open_window.close())
         next_us = (events.first_us if events.n else newest_us) // duration * duration
         gap = (next_us - end_us) // duration
         if gap > config.max_hole_windows:
             skipped += gap
             end_us = next_us
+        if not events.n and newest_us < end_us + duration:
+            return Pushed(windows, WindowsState(end_us, newest_us), late, skipped)
         open_window = _Open(end_us, WindowsState(), config, canonical, sampled)
     open_window.add(events, lut)
     return Pushed(windows, open_window.state(newest_us), late, skipped)
+
+
+def _split(events: Events | WireEvents, t_us: int) -> tuple[Events | WireEvents, Events | WireEvents]:
+    """The events before a time and the others; without a search where they are all before it."""
+    n = events.n
+    inside = n if n and events.last_us < t_us else events.before(t_us)
+    return (events if inside == n else events.span(0, inside)), events.span(inside, n)
 
 
 def _inside(

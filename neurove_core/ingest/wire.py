@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from neurove_core.compiled import compiled
 from neurove_core.ingest.counting import add_events
-from neurove_core.ingest.scaling import SHIFT, Scale, scale_of
+from neurove_core.ingest.products import scaled_cell
+from neurove_core.ingest.scaling import Scale, scale_of
 from neurove_protocol.events import (
     DEFAULT_LIMITS,
     PacketLimits,
@@ -234,7 +235,7 @@ def _count_columns(
     """As counting._count, on columns of the packet's types."""
     pixels, columns, flat = lut.reshape(-1), np.uint32(lut.shape[1]), counts.reshape(-1)
     cells = counts.shape[1] * counts.shape[2]
-    on, rows, shift = np.uint32(cells), np.uint16(0x7FFF), np.uint32(SHIFT)
+    on, rows = np.uint32(cells), np.uint16(0x7FFF)
     by_row, by_column, width = np.uint32(scale.rows), np.uint32(scale.columns), np.uint32(scale.width)
     found, plane = np.empty(_BLOCK, np.uint32), np.empty(_BLOCK, np.uint32)
     outside, first = 0, 0
@@ -253,8 +254,8 @@ def _count_columns(
             xs, ys = x[i : i + m], y_and_p[i : i + m]
             if width:
                 for j in range(m):
-                    row, column = np.uint32(ys[j] & rows) * by_row >> shift, np.uint32(xs[j]) * by_column >> shift
-                    found[j] = row * width + column + on * np.uint32(ys[j] >> np.uint16(15))
+                    y, p = np.uint16(ys[j] & rows), np.uint16(ys[j] >> np.uint16(15))
+                    found[j] = scaled_cell(y, xs[j], p, by_row, by_column, width, on)
                 add_events(found, m, pair)
                 continue
             for j in range(m):

@@ -66,6 +66,11 @@ class State(NamedTuple):
         """Whether the outcomes over the ground show no vehicle; its motion over the ground then has no angular part."""
         return self.odds < 0
 
+    @property
+    def on_vehicle(self) -> bool:
+        """Whether the outcomes over the ground show a vehicle, more than a known height alone does."""
+        return self.odds >= vehicle.START + errors.SURE
+
     def after_ground(self, outcome: Outcome) -> "State":
         """The state after the outcome over the ground of the same window."""
         return self._replace(odds=vehicle.judged(self.odds, outcome))

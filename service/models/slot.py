@@ -62,8 +62,8 @@ class ModelSlot:
         library = Library(models_dir, pushed)
         active, previous = (restart.kept(library, digest, trained_only) if digest else None for digest in kept)
         first = restart.first(library, model, active, trained_only)
-        takes = "up to 30 s at the first start on a machine"
-        log.info("compiling the kernels of the model; `ready` follows", model=first.name, takes=takes)
+        takes = "a second; up to 30 s where kernels have to be compiled, as at the first start on a machine"
+        log.info("loading the kernels of the model; `ready` follows", model=first.name, takes=takes)
         precompile.at_start(first.config, free_bytes)
         estimator = Estimator(first, bounds=rules.bounds, refine=rules.refine)
         estimator.warm_up()

@@ -93,6 +93,9 @@ class Asking:
     def is_answered(self, window_ns: int, *, patient: bool) -> bool:
         """Whether another node answers the stream, though its estimates are late; then this node follows it.
 
+        The first time that a node asks since it listens, a node that does not reply counts as one that answers, and so
+        does one whose state is equal: it takes over in a moment.
+
         Args:
             window_ns: duration of a window.
             patient: whether to wait longer for replies, because nothing is lost by it.
@@ -108,6 +111,9 @@ class Asking:
         if found and max(found) != (tenure.term, leader):
             self._followed_ns = self._now_ns()
             tenure.follow(max(found)[1], max(found)[0])
+        if tenure.unasked and (any(one.equal for one in replies) or not names <= {one.node for one in replies}):
+            tenure.unasked = False
+            return True
         return bool(found)
 
     def _ask(self, names: set[str], timeout_ns: int) -> list[DutyReply]:

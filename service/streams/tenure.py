@@ -65,6 +65,7 @@ class Tenure:
         self.draining = False
         self.heard_ns = 0  # when the newest estimate of the other node was heard
         self._wary = False  # another node may answer, though it is not known now
+        self.unasked = True  # the other nodes were not asked yet whether one of them answers, since this node listens
         self._patience = 1.0
         self._slack, self._slack_ns = 1, 0  # times the patience, because of slow links, and since when
         self._window_ns, self._took_ns = 50_000_000, 0
@@ -76,8 +77,12 @@ class Tenure:
         return self.role == "answers"
 
     def patience_ns(self, window_ns: int, *, equal: bool) -> float:
-        """How long the estimates of another node may be missing [ns]; longer unless the state is that of the others."""
-        cold = self._wary or (not equal and bool(self._peers.names(self.stream)))
+        """How long the estimates of another node may be missing [ns]; longer unless the state is that of the others.
+
+        A node that listens does not wait longer before it has asked the others: perhaps none of them answers.
+        """
+        unknown = not equal and not self.unasked
+        cold = self._wary or (unknown and bool(self._peers.names(self.stream)))
         self._window_ns = window_ns
         return self._patience * LATE_WINDOWS * window_ns * (_COLD if cold else self._slack)
 
@@ -100,6 +105,7 @@ class Tenure:
         """Another node answers."""
         log.info("follows", stream=self.stream, leader=leader, term=term)
         self.role, self.leader, self.term, self._wary = "follows", leader, term, False
+        self.unasked = False
         self.set_patience()
 
     def listen(self, why: str, *, at_once: bool = False, wary: bool = False) -> None:
@@ -111,7 +117,7 @@ class Tenure:
             wary: whether another node is likely to answer: wait as long as with another state.
         """
         log.info("listens", stream=self.stream, why=why)
-        self.role, self.leader, self._wary = "listens", "", wary
+        self.role, self.leader, self._wary, self.unasked = "listens", "", wary, not wary
         self.set_patience()
         if at_once:
             self._patience = 0.0

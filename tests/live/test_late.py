@@ -1,9 +1,11 @@
 """Two nodes that cannot keep up: one goes on to answer, late and with flags, and the other one follows no more."""
 
+import dataclasses
 import itertools
 
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
 from neurove_core.models import bundle
+from neurove_core.networks import kinds
 from neurove_service.clients import ask
 from neurove_service.config import ClientConfig
 from tests.live.conftest import client, wait_until
@@ -14,14 +16,19 @@ BOTH = {"a", "b"}
 
 
 def costly_model(folder):
-    """A bundle with several times more windows in a second than one core computes."""
+    """A bundle with several times more windows in a second than one core computes.
+
+    Its norms are not set with random windows of this size, which would take half a minute.
+    """
     config = ModelConfig(
         window=WindowConfig(duration_us=WINDOW_US, bins=64),
-        canonical=CanonicalConfig(width=320, height=240),
+        canonical=CanonicalConfig(width=40, height=30),
         network=NetworkConfig(channels=(32, 32), features=32, hidden=32),
     )
+    small = bundle.untrained(3, config, "costly")
+    large = config.model_copy(update={"canonical": CanonicalConfig(width=320, height=240)})
     path = folder / "costly.safetensors"
-    bundle.save(bundle.untrained(3, config, "costly"), path)
+    bundle.save(dataclasses.replace(small, config=large, network=kinds.make(large).eval()).with_digest(), path)
     return path
 
 

@@ -20,9 +20,11 @@ import statistics
 import sys
 import tempfile
 import time
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import NamedTuple
 
+from neurove_protocol.duty import DutyReply, DutyRequest
 from neurove_service.node.sharing import drawn
 from tests.live.conftest import client, free_endpoint, start_router, wait_until
 from tests.live.fellows import KEYS, Consumer, Driver, Fellow, compared, duty, small_model, windows_late
@@ -32,6 +34,8 @@ START_S = 300
 END_US = 1 << 62
 LAST_S = 3
 """Windows of this time before the next change show what remains of the last one."""
+
+NO_SILENCE = (0.0, "")
 
 
 class Change(NamedTuple):
@@ -62,19 +66,19 @@ def main() -> int:
             nodes = {name: Fellow(name, endpoint, model, *share, logs=args.logs) for name in ("n1", "n2", "n3")}
             consumer, driver = Consumer(transport), Driver(transport, streams, args.events, 100, WINDOW_US // 2)
             try:
-                changes = run(transport, nodes, consumer, driver, streams, args)
+                changes, lossy = run(transport, nodes, consumer, driver, streams, args)
             finally:
                 for node in nodes.values():
                     if node.process is not None and node.process.child.poll() is None:
                         node.end()
-            return report(consumer, driver, streams, model, changes, args.copies)
+            return report(consumer, driver, streams, model, changes, lossy, args.copies)
     finally:
         router.kill()
         router.wait()
 
 
 def run(transport, nodes, consumer, driver, streams, args):
-    """Let nodes join, die and come back; the time, the kind and the streams of each change."""
+    """Let nodes join, die and come back; each change, and the streams that had lost packets before the first one."""
     changes, alone = [], set()
 
     def join(*names):
@@ -108,6 +112,11 @@ def run(transport, nodes, consumer, driver, streams, args):
 
     def change(kind, of, act, *alive):
         of = {one for one in streams if of is None or consumer.leader(one) == of}
+        for one in of - alone if kind.endswith("killed") else ():  # followers may have ended since
+            replies = transport.ask(KEYS.duty(), DutyRequest(stream=one).encode(), 1.0)
+            found = [DutyReply.decode(reply.payload) for reply in replies]
+            if not any(reply.role == "follows" and reply.equal for reply in found):
+                alone.add(one)
         changes.append(Change(time.monotonic_ns(), kind, of, of & alone))
         print(kind, flush=True)
         act()
@@ -118,13 +127,14 @@ def run(transport, nodes, consumer, driver, streams, args):
     driver.start()
     settle("n1", "n2")
     time.sleep(2)
+    lossy = {one for one in streams if any(is_lossy(got.estimate) for got in list(consumer.taken[one]))}
     consumer.forget()
     change("n3 joins", None, lambda: join("n3"), "n1", "n2", "n3")
     change("n2 is killed", "n2", nodes["n2"].kill, "n1", "n3")
     change("n2 joins again", None, lambda: join("n2"), "n1", "n2", "n3")
     driver.stop()
     changes.append(Change(time.monotonic_ns(), "end", set(), set()))
-    return changes
+    return changes, lossy
 
 
 def overlaps(got):
@@ -144,8 +154,18 @@ def is_lossy(estimate):
     return bool({"gap", "overload"} & set(estimate.flags))
 
 
-def report(consumer, driver, streams, model, changes, copies):
-    """Print the figures; return 0 if no window is doubled, missing, out of order or wrong."""
+def told(got):
+    """Who published an estimate, and when it arrived."""
+    one = got.estimate
+    at = datetime.fromtimestamp(time.time() - (time.monotonic_ns() - got.at_ns) / 1e9, UTC)
+    return f"{one.node} term {one.term} window {one.start_us // WINDOW_US} at {at:%H:%M:%S.%f}"
+
+
+def report(consumer, driver, streams, model, changes, lossy, copies):
+    """Print the figures; return 0 if no window is doubled, missing, out of order or wrong.
+
+    The streams in `lossy` had lost packets before the first change.
+    """
     bad, anew, losses, excused = 0, 0, 0, 0
     late, remains, silent, twice, usual = {}, {}, {}, {}, []
     ends = [one.at_ns for one in changes]
@@ -161,7 +181,11 @@ def report(consumer, driver, streams, model, changes, copies):
             anew += len(found.broken) + len(found.unequal)
             bad += found.doubled
         else:
-            lossy_us = min((one.estimate.start_us for one in found.taken if is_lossy(one.estimate)), default=END_US)
+            lossy_us = (
+                -1
+                if stream in lossy
+                else min((one.estimate.start_us for one in found.taken if is_lossy(one.estimate)), default=END_US)
+            )
             losses += lossy_us < END_US
             excused += sum(one.start_us >= lossy_us for one in found.unequal)
             wrong = [one for one in found.unequal if one.start_us < lossy_us]
@@ -190,7 +214,8 @@ def report(consumer, driver, streams, model, changes, copies):
                     remains.setdefault(kind_at(one.at_ns), []).append(delay)
         for before, after in itertools.pairwise(found.taken):
             pause = (after.at_ns - before.at_ns) / 1e3 / WINDOW_US
-            silent[kind_at(after.at_ns)] = max(pause, silent.get(kind_at(after.at_ns), 0.0))
+            kind = kind_at(after.at_ns)
+            silent[kind] = max(silent.get(kind, NO_SILENCE), (pause, stream, before, after), key=lambda one: one[0])
         everything = sorted(found.taken + consumer.dropped.get(stream, []), key=lambda one: one.at_ns)
         for at_ns, length in overlaps(everything):
             twice.setdefault(kind_at(at_ns), []).append(length)
@@ -218,8 +243,10 @@ def report(consumer, driver, streams, model, changes, copies):
             f"{kind}: latest window {max(values):.2f}, {over} of {len(values)} above 2 windows; "
             f"in the last {LAST_S} s median {statistics.median(rest):.2f}, 99 % {rest[int(0.99 * len(rest))]:.2f}"
         )
+        pause, stream, *ends = silent.get(kind, NO_SILENCE)
+        who = f" ({stream}, {' and then '.join(map(told, ends))})" if ends else ""
         print(
-            f"  longest time without a window of a stream {silent.get(kind, 0.0):.1f} windows; "
+            f"  longest time without a window of a stream {pause:.1f} windows{who}; "
             f"{len(twice.get(kind, []))} changes, two nodes answered for at most {max(lengths):.2f} windows"
         )
     return 1 if bad else 0

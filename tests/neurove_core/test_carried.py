@@ -102,6 +102,8 @@ def test_an_inertial_part_of_other_shapes_is_refused():
         learned._replace(track=learned.track._replace(angle_rad=np.zeros((4, 3)))),
         learned._replace(track=learned.bias),
         learned._replace(tilt=None),
+        learned._replace(tilt=learned.tilt._replace(covariance=np.eye(6))),
+        learned._replace(tilt=learned.tilt._replace(average_m_s2=np.zeros(2))),
     ):
         with pytest.raises(NeuroVEError, match="inertial"):
             carried.decode(carried.encode(state, wrong), state)

@@ -72,6 +72,68 @@ def test_gravity_alone_shows_the_bias_of_the_level_axes_and_not_that_of_the_vert
     np.testing.assert_allclose(tilt.force_m_s2, [0.0, -9.81, 0.0], atol=0.5)
 
 
+def driven(seconds, tilt_rad, vehicle, braking_m_s2=0.0, bias=(0.02, 0.0, -0.015), state=None):
+    """The bias and the tilt after a straight drive of a camera that no event shows to turn.
+
+    Args:
+        seconds: of the drive.
+        tilt_rad: its angle of pitch by time [s].
+        vehicle: whether the camera is on a vehicle, by time [s].
+        braking_m_s2: change of the speed, now faster, now slower, that its velocities do not show.
+        bias: of the gyroscope [rad/s].
+        state: bias and tilt at the start.
+    """
+    found, tilt = state or (Bias(), Tilt())
+    for number in range(round(seconds * 20)):
+        t_s = (number + 0.5) * 0.05
+        angle = tilt_rad(t_s)
+        turn = np.array([(tilt_rad(t_s + 0.025) - tilt_rad(t_s - 0.025)) / 0.05, 0.0, 0.0])
+        force = np.array([0.0, -9.81 * np.cos(angle), 9.81 * np.sin(angle) + braking_m_s2 * np.sin(1.2 * t_s)])
+        at_us = tilt.end_us + WINDOW_US
+        velocity = np.array([0.0, 0.0, 8.0])
+        seen = Seen(at_us, WINDOW_US, turn + bias, force, velocity, None, np.full(3, 1e-3), vehicle(t_s))
+        found, tilt = moving.learned(found, tilt, seen)
+    return found, tilt
+
+
+def test_the_bounded_tilt_of_a_vehicle_shows_the_bias_of_the_level_axes_while_it_brakes():
+    def swaying(t_s):
+        return 0.01 * np.sin(2 * np.pi * t_s)
+
+    true = np.array([0.02, 0.0, -0.015])
+    off = {}
+    for vehicle in (False, True):
+        bias, _ = driven(4, swaying, lambda _, on=vehicle: on, braking_m_s2=1.0)
+        off[vehicle] = np.abs(bias.mean_rad_s - true)
+        assert (off[vehicle] < 3 * np.sqrt(bias.variance)).all()
+    assert (off[True][[0, 2]] < 0.004).all()
+    assert (off[True][[0, 2]] < 0.5 * off[False][[0, 2]]).all()
+    assert off[True][1] < 1e-3  # the vertical axis has no bias, and nothing says that it has
+
+
+def test_a_ramp_is_a_new_slope_and_no_bias():
+    def ramp(t_s):
+        return 0.1 * np.clip(t_s - 10, 0, 1)
+
+    before, _ = driven(10, ramp, lambda _: True)
+    after, tilt = driven(14, ramp, lambda _: True)
+    assert np.abs(after.mean_rad_s - before.mean_rad_s).max() < 0.003
+    np.testing.assert_allclose(tilt.average_m_s2, tilt.force_m_s2, atol=0.3)
+    assert abs(tilt.force_m_s2[2]) > 0.8
+
+
+def test_a_camera_that_is_taken_from_its_vehicle_tilts_as_it_likes():
+    def leaning(t_s):
+        return 0.05 * max(0.0, t_s - 5)
+
+    on_vehicle = driven(5, leaning, lambda _: True)
+    bias, tilt = driven(10, leaning, lambda t_s: t_s < 5)
+    assert on_vehicle[1].average_m_s2 is not None
+    assert tilt.average_m_s2 is None
+    assert np.abs(bias.mean_rad_s - on_vehicle[0].mean_rad_s).max() < 0.003
+    assert np.linalg.eigvalsh(tilt.covariance).min() > -1e-12
+
+
 @pytest.mark.parametrize("gap_us", [200_000, 5_000_000, -1_000_000])
 def test_a_gap_does_not_turn_what_is_known_into_something_wrong(gap_us):
     bias, tilt, rng = Bias(), Tilt(), np.random.default_rng(20160)

@@ -54,6 +54,22 @@ def test_counts_by_factors_equal_those_of_the_reference(n, fill):
     np.testing.assert_array_equal(counts, expected)
 
 
+@pytest.mark.parametrize(
+    ("sensor", "grid"),
+    [((346, 260), (346, 260)), ((346, 260), (86, 65)), ((1280, 720), (320, 180)), ((2048, 1536), (1000, 700))],
+)
+def test_counts_at_the_far_corner_of_a_large_sensor_equal_those_of_the_reference(sensor, grid):
+    width, height = sensor
+    at = np.arange(600)
+    corner = Events.from_columns(at, width - 1 - at % 40, height - 1 - at % 30, at % 3)  # 2 is ON too
+    table = lookup_table(CanonicalConfig(width=grid[0], height=grid[1]), Sensor(*sensor), None)
+    assert scale_of(table, grid[0]) != NO_SCALE
+    counts, expected = (np.zeros((2, grid[1], grid[0]), np.uint8) for _ in range(2))
+    assert count_events(corner, 0, 600, table, counts) == 0
+    count_events_reference(corner, 0, 600, table, expected)
+    np.testing.assert_array_equal(counts, expected)
+
+
 def test_counts_of_a_packet_by_factors_equal_those_of_its_columns():
     packet = make_packet(n=3_000)
     table = lookup_table(CanonicalConfig(width=16, height=12), packet.sensor, None)

@@ -50,6 +50,10 @@ def test_the_ground_gives_a_free_camera_its_velocity_but_no_turning_and_proves_a
     turning, _ = followed(simulation, 3.0, None)  # without a height there is no ground
     driving, _ = followed(simulation, 3.0, 1.0)
     assert -8 < odds < 0
+    assert not any(one.vehicle for one in free + turning)
+    assert [one.vehicle for one in driving] == sorted(one.vehicle for one in driving)  # not before the events show it
+    assert not driving[0].vehicle
+    assert driving[-1].vehicle
     for one, other, third in zip(free[-4:], turning[-4:], driving[-4:], strict=True):
         np.testing.assert_array_equal(one.twists[:, 3:], other.twists[:, 3:])
         assert not np.array_equal(one.twists[:, 3:], third.twists[:, 3:])

@@ -8,7 +8,7 @@ from neurove_protocol import Trace, Twist, TwistEstimate
 from neurove_protocol.velocity import HostTime
 from neurove_service.streams.pair import Pair
 from neurove_service.streams.stream import Stream
-from neurove_service.streams.tenure import Tenure
+from neurove_service.streams.tenure import Tenure, ranked
 
 STREAM, WINDOW_US = "cam0", 20_000
 NOT_EQUAL = 9.0
@@ -132,6 +132,48 @@ def nodes(slot):
     nodes.both(range(60))
     assert nodes.ready(nodes.follower)
     return nodes
+
+
+def windows_until_published(nodes, hangs=""):
+    """How many windows two nodes compute that begin a stream, or one while the other hangs, before one publishes."""
+    nodes.hangs = hangs
+    for number in range(200):
+        nodes.wait(1)
+        for name in sorted({*"ab"} - {hangs}):
+            nodes.compute(name, number)
+        if nodes.published:
+            return number
+    return None
+
+
+def test_nodes_that_begin_a_stream_ask_each_other_and_do_not_wait_for_one_that_answers(slot):
+    nodes = Nodes(Stream(STREAM, slot))
+    assert windows_until_published(nodes) < 8
+    assert nodes.asked
+
+
+def test_a_node_that_begins_a_stream_waits_longer_for_a_node_that_does_not_reply(slot):
+    nodes = Nodes(Stream(STREAM, slot))
+    assert 20 < windows_until_published(nodes, hangs="b") < 100
+
+
+def test_a_node_without_the_state_lets_a_ready_node_go_first_when_the_leader_leaves(slot):
+    nodes = Nodes(Stream(STREAM, slot))
+    for one in nodes.pairs.values():
+        one.heard(estimate("c", 0, 0.0, (), 0).model_copy(update={"term": 5}))
+    first, *_ = ranked(STREAM, set(nodes.pairs))
+    (ready,) = set(nodes.pairs) - {first}
+    nodes.compute(ready, 0)
+    nodes.compute(first, 0, NOT_EQUAL)
+    assert nodes.ready(ready)
+    assert not nodes.ready(first)
+    for one in nodes.pairs.values():
+        one.gone("c")
+    for number in range(1, 20):
+        nodes.wait(1)
+        for name in (first, ready):
+            nodes.compute(name, number, NOT_EQUAL if name == first else 0.0)
+    assert nodes.leader == ready
 
 
 def test_a_follower_that_missed_packets_is_not_ready_until_its_estimates_are_equal_again(nodes):
