@@ -173,10 +173,12 @@ class _Work(Generic[T]):
                 self._error, self.failed = error, str(error) or type(error).__name__
             self.ended.set()
 
-        threading.Thread(target=run, name="work of the rank", daemon=True).start()
+        self._thread = threading.Thread(target=run, name="work of the rank", daemon=True)
+        self._thread.start()
 
     def result(self) -> T:
-        """The result of the work, or its exception."""
+        """The result of the work, or its exception, once it has ended."""
+        self._thread.join()  # a thread that ends while the process ends may abort it inside torch
         if self._error is not None:
             raise self._error
         return self._result

@@ -11,7 +11,7 @@ def test_bench_as_json_is_a_list_of_rows_and_names_the_machine(capsys):
     assert main(["bench", "ingest", "decode", "--quick", "--json"]) == 0
     out, err = capsys.readouterr()
     found = json.loads(out)
-    assert set(found[0]) == {"name", "ours_ms", "peer", "peer_ms", "ratio", "share_of_limit", "equal"}
+    assert set(found[0]) == {"name", "ours_ms", "peer", "peer_ms", "ratio", "share_of_limit", "equal", "deviation"}
     assert all(row["equal"] for row in found)
     assert "commit" in err
 

@@ -155,7 +155,9 @@ def test_a_file_that_exists_is_replaced_only_with_force(run, model, log, tmp_pat
     out.write_text("mine")
     arguments = ("estimate", log, "--out", out, "--model", model)
     code, _, err = run(*arguments)
-    assert (code, err) == (2, f"neurove: estimate: --out='{out}': the file exists; --force replaces it\n")
+    assert code == 2
+    assert err.startswith("neurove: estimate: --out='")  # a long path is shortened
+    assert err.endswith("a.csv': the file exists; --force replaces it\n")
     assert out.read_text() == "mine"
     assert run(*arguments, "--force")[0] == 0
     assert out.read_text().startswith("seq,")
