@@ -51,8 +51,7 @@ class Fellows:
         self._serving: defaultdict[str, set[str]] = defaultdict(set)  # stream -> the other nodes that serve it
         self._heard_ns: dict[str, int] = {}  # other node -> when anything was heard of it last
         self._fetches, self._pulse = threading.BoundedSemaphore(_FETCHES_AT_ONCE), Pulse()
-        self._lock = threading.Lock()
-        self._draining = False
+        self._lock, self._draining = threading.Lock(), False
 
     def join(self, stop: threading.Event) -> None:
         """Hear the other nodes and answer their questions, until the event is set; before the first packet."""
@@ -135,15 +134,18 @@ class Fellows:
         log.info("drained" if not resume else "draining ended", handed=len(handed), kept=len(kept))
         return DrainReply(node=self._node, handed=handed, kept=kept)
 
-    def leaves(self, stream: str) -> bool:
-        """Hand over a stream if this node answers it; whether another node answers it now."""
+    def retire(self, stream: str) -> bool:
+        """Let the worker of a stream that this node follows end; False if this node does not follow it any more."""
         pair = self._pairs.get(stream)
-        if pair is None:
-            return False
-        if pair.reply().role == "answers":
-            node, _ = self._hand_over(stream, pair, _TAKE_S)
-            return bool(node)
-        return pair.reply().role == "follows"
+        return pair is not None and pair.retire("follows")
+
+    def leaves(self, stream: str) -> bool:
+        """Hand over a stream if this node answers it, and let its worker end; whether another node answers it now."""
+        pair = self._pairs.get(stream)
+        if pair is None or pair.reply().role != "answers":
+            return self.retire(stream)
+        node, _ = self._hand_over(stream, pair, _TAKE_S)
+        return bool(node) and pair.retire("follows", "listens")
 
     def _hand_over(self, stream: str, pair: Pair, patience_s: float) -> tuple[str, str]:
         """Hand over one stream; the node that answers it now, or why there is none."""

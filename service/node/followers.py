@@ -5,6 +5,7 @@ time. While it keeps up, it follows more streams again, a few at a time. A node 
 follower takes the state of its stream from another node, and a few such transfers disturb nobody.
 """
 
+import itertools
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -39,6 +40,9 @@ class _Others(Protocol):
 
     def duties(self) -> list[DutyReply]:
         """What this node does on each of its streams."""
+
+    def retire(self, stream: str, /) -> bool:
+        """Let the worker of a stream that this node follows end; False if it does not follow the stream any more."""
 
 
 class Followers:
@@ -91,7 +95,8 @@ class Followers:
             streams: those that this node serves.
 
         Returns:
-            the streams that this node must follow no more.
+            the streams that this node follows no more: their workers have retired. One that has taken over meanwhile
+            is not among them.
         """
         now_s, duties = self._now_s(), self._others.duties()
         follows = [one for one in duties if one.role == "follows" and one.leader in self._others.names(one.stream)]
@@ -115,7 +120,8 @@ class Followers:
             self._pause_s = _PAUSE_S
         self._grow_s, self._pause_s = now_s + self._pause_s, min(_MAX_PAUSE_S, 2 * self._pause_s)
         order = sorted(follows, key=lambda one: (self._owns(one.stream), one.equal, one.stream))
-        ended = [one.stream for one in order[: (len(order) + 1) // 2]]
+        candidates = (one.stream for one in order)
+        ended = list(itertools.islice(filter(self._others.retire, candidates), (len(order) + 1) // 2))
         self._most = len(order) - len(ended)
         self._left_out_s |= dict.fromkeys(filter(self._owns, ended), now_s)
         if ended:

@@ -115,7 +115,8 @@ class Moving:
     def _run(self, stop: threading.Event) -> None:
         while not stop.wait(_TURN_S):
             with self._guard.at("sharing"):
-                self._registry.release(*self._followers.turn(self._registry.streams()))
+                self._followers.turn(self._registry.streams())
+                self._registry.release()
             for stream in self._registry.streams():
                 if not self._sharing.takes(stream.name):
                     with self._guard.at("sharing", stream=stream.name):
@@ -127,7 +128,7 @@ class Moving:
             return
         if self._fellows.leaves(stream):
             self._next_s.pop(stream, None)
-            self._registry.release(stream)
+            self._registry.release()
             log.info("stream given away", stream=stream)
         else:
             self._next_s[stream] = time.monotonic() + _RETRY_S

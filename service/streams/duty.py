@@ -15,6 +15,10 @@ class Duty(Protocol):
     def can_wait(self) -> bool:
         """Whether workers of other streams go first."""
 
+    @property
+    def retired(self) -> bool:
+        """Whether the worker shall end, because other nodes answer the stream; any thread may ask."""
+
     def answer(self, estimate: TwistEstimate, /) -> list[TwistEstimate]:
         """The estimates to publish now that this one is there."""
 
@@ -36,6 +40,11 @@ class Alone:
 
     @property
     def can_wait(self) -> bool:
+        """False."""
+        return False
+
+    @property
+    def retired(self) -> bool:
         """False."""
         return False
 

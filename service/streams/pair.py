@@ -22,7 +22,7 @@ from typing import Final, NamedTuple
 
 from neurove_protocol import TwistEstimate
 from neurove_protocol.control import StandbyStatus
-from neurove_protocol.duty import DutyReply, StateReply
+from neurove_protocol.duty import DutyReply, Role, StateReply
 from neurove_service import logs
 from neurove_service.streams.asking import Asking, is_long
 from neurove_service.streams.following import Following, Sync
@@ -76,6 +76,15 @@ class Pair:
         """Whether other workers go first: no consumer waits for a node that follows."""
         return self._tenure.role == "follows"
 
+    @property
+    def retired(self) -> bool:
+        """Whether the worker shall end, and never takes over again."""
+        return self._tenure.retired
+
+    def retire(self, *roles: Role) -> bool:
+        """Let the worker end, unless this node has another role than these; see `Tenure.retire`."""
+        return self._tenure.retire(*roles)
+
     def heard(self, estimate: TwistEstimate) -> None:
         """Another node has published an estimate."""
         self._call(lambda: self._hear(estimate))
@@ -109,18 +118,7 @@ class Pair:
 
     def reply(self) -> DutyReply:
         """What this node does on the stream."""
-        tenure, following = self._tenure, self._following
-        return DutyReply(
-            node=tenure.node,
-            stream=self._stream,
-            role=tenure.role,
-            term=tenure.term,
-            leader=tenure.leader or None,
-            equal=tenure.answers or following.equal,
-            missed_us=following.missed_us,
-            draining=tenure.draining,
-            digest=following.digest,
-        )
+        return _reply_of(self._tenure, self._following)
 
     def state(self, digest: str, after_us: int | None, timeout_s: float) -> StateReply | None:
         """The state of the stream for a follower; None if this node has no such state in time."""
@@ -128,16 +126,8 @@ class Pair:
 
     def status(self) -> StandbyStatus:
         """For the status of the stream."""
-        tenure, following = self._tenure, self._following
-        return StandbyStatus(
-            role=tenure.role,
-            leader=tenure.leader or None,
-            term=tenure.term,
-            equal=following.equal and not tenure.answers,
-            other_model=following.other_model,
-            draining=tenure.draining,
-            followers=len(self._peers.names(self._stream)) if tenure.answers else 0,
-        )
+        followers = len(self._peers.names(self._stream)) if self._tenure.answers else 0
+        return _status_of(self._tenure, self._following, followers)
 
     def answer(self, estimate: TwistEstimate) -> list[TwistEstimate]:
         """The estimates to publish now that this one is there."""
@@ -169,7 +159,8 @@ class Pair:
 
     def wait_s(self, most_s: float) -> float:
         """Until the oldest estimate that is kept is late."""
-        return most_s if self._tenure.answers else min(most_s, max(0.0, self._due_in_s))
+        fixed = self._tenure.answers or self._tenure.retired
+        return most_s if fixed else min(most_s, max(0.0, self._due_in_s))
 
     def close(self) -> None:
         """The worker has ended."""
@@ -211,7 +202,9 @@ class Pair:
                 self._following.renew(self._now_ns(), doubt=False)
             if self._due_in_s > 0:
                 return []
-        tenure.take_over(f"{tenure.leader} is late" if tenure.leader else "no other node answers", self._now_ns())
+        why = f"{tenure.leader} is late" if tenure.leader else "no other node answers"
+        if not tenure.take_over(why, self._now_ns()):
+            return []
         if self._following.other_model:
             log.warning("another model than before answers", stream=self._stream, before=self._following.other_model)
         return [self._stamped(estimate) for estimate in self._following.release()]
@@ -243,3 +236,29 @@ class Pair:
             self._tenure.term = term
             self._following.leave_out(start_us)
             self._tenure.listen(f"{node} hands over", at_once=True)
+
+
+def _reply_of(tenure: Tenure, following: Following) -> DutyReply:
+    return DutyReply(
+        node=tenure.node,
+        stream=tenure.stream,
+        role=tenure.role,
+        term=tenure.term,
+        leader=tenure.leader or None,
+        equal=tenure.answers or following.equal,
+        missed_us=following.missed_us,
+        draining=tenure.draining or tenure.retired,  # no node hands over to it
+        digest=following.digest,
+    )
+
+
+def _status_of(tenure: Tenure, following: Following, followers: int) -> StandbyStatus:
+    return StandbyStatus(
+        role=tenure.role,
+        leader=tenure.leader or None,
+        term=tenure.term,
+        equal=following.equal and not tenure.answers,
+        other_model=following.other_model,
+        draining=tenure.draining,
+        followers=followers,
+    )

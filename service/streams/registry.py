@@ -130,9 +130,11 @@ class StreamRegistry:
             log.info("stream evicted", stream=name, idle_s=self._settings.idle_evict_s)
         return idle
 
-    def release(self, *names: str) -> None:
-        """End the workers of streams that other nodes serve."""
-        self._end(names)
+    def release(self) -> None:
+        """End the workers that have retired, because other nodes answer their streams."""
+        with self._lock:
+            retired = [name for name, worker in self._workers.items() if worker.duty.retired]
+        self._end(retired)
 
     def close(self) -> None:
         """End all workers and start no new ones."""

@@ -1,6 +1,7 @@
 """Tenure: which node answers a stream, in which term, as far as this node knows; and when this node takes over."""
 
 import hashlib
+import threading
 import time
 import zlib
 from collections.abc import Callable, Sequence
@@ -45,7 +46,7 @@ class Peers(Protocol):
 
 
 class Tenure:
-    """The role of one node on one stream; only the worker of the stream changes it.
+    """The role of one node on one stream; only the worker of the stream changes it, and any thread may let it retire.
 
     A term is the time of taking over in microseconds since 1970, with the last three digits drawn from the name of the
     node, or one more than the newest term if that is later. So it rises when all nodes restart, too, and two nodes that
@@ -63,6 +64,8 @@ class Tenure:
         self.role: Role = "listens"
         self.term, self.leader = 0, ""
         self.draining = False
+        self.retired = False  # the worker ends, so this node does not take over any more
+        self._deciding = threading.Lock()  # between taking over and retiring
         self.heard_ns = 0  # when the newest estimate of the other node was heard
         self._wary = False  # another node may answer, though it is not known now
         self.unasked = True  # the other nodes were not asked yet whether one of them answers, since this node listens
@@ -124,12 +127,27 @@ class Tenure:
 
     def take_over(
         self, why: str, now_ns: int = 0, *, unix_ms: Callable[[], int] = lambda: time.time_ns() // 1_000_000
-    ) -> None:
-        """This node answers from now on, in a new term."""
-        self._took_ns = now_ns
-        self.term = max(self.term + 1, 1000 * unix_ms() + zlib.crc32(self.node.encode()) % 1000)
-        self.role, self.leader, self._wary = "answers", self.node, False
+    ) -> bool:
+        """This node answers from now on, in a new term; False if it has retired."""
+        with self._deciding:
+            if self.retired:
+                return False
+            self._took_ns = now_ns
+            self.term = max(self.term + 1, 1000 * unix_ms() + zlib.crc32(self.node.encode()) % 1000)
+            self.role, self.leader, self._wary = "answers", self.node, False
         log.warning("answers the stream", stream=self.stream, term=self.term, why=why)
+        return True
+
+    def retire(self, *roles: Role) -> bool:
+        """Never take over from now on, so that the worker can end; any thread may call this.
+
+        Returns:
+            False if the role is none of these, or if the node that this one follows has left: then nothing changes.
+        """
+        with self._deciding:
+            alone = self.role == "follows" and self.leader not in self._peers.names(self.stream)
+            self.retired = self.retired or (self.role in roles and not alone)
+            return self.retired
 
     @property
     def at_once(self) -> bool:

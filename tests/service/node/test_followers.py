@@ -34,6 +34,9 @@ class Network:
             for one, equal in self.roles.items()
         ]
 
+    def retire(self, stream):
+        return stream in self.roles and stream in self.leaders
+
     def packets(self):
         """A packet of each stream arrives; the streams that b begins to serve now."""
         begun = [one for one in STREAMS if one not in self.roles and self.followers.takes(one)]
