@@ -56,6 +56,19 @@ _LENSES: Final[dict[str, Literal["pinhole", "equidistant"]]] = {
 }
 
 
+def check_calibration(file: str) -> None:
+    """Refuse a calibration file that no sensor can use.
+
+    Args:
+        file: as of `read_calibration`.
+
+    Raises:
+        InvalidField: the file cannot be read, or it has no such camera.
+        MissingExtra: as `read_calibration`.
+    """
+    _named(*_place(file))
+
+
 def read_calibration(file: str, sensor: Sensor) -> CameraInfo:
     """The lens in a calibration file.
 
@@ -72,14 +85,8 @@ def read_calibration(file: str, sensor: Sensor) -> CameraInfo:
         MissingExtra: the library that reads YAML is not installed.
     """
     path, name = _place(file)
-    cameras = dict(_cameras(_tree(path)))
-    if not cameras:
-        raise InvalidField(
-            str(path), "camera_matrix", None, "it has no camera_matrix (ROS, OpenCV), intrinsics (Kalibr)"
-        )
+    cameras = _named(path, name)
     if name is not None:
-        if name not in cameras:
-            raise InvalidField(str(path), "camera", name, f"its cameras are {', '.join(cameras)}")
         return _fitting(path, _lens(path, cameras[name]), sensor)
     if len(cameras) == 1:
         return _fitting(path, _lens(path, next(iter(cameras.values()))), sensor)
@@ -187,6 +194,17 @@ class _WithLens:
 
     def twists(self) -> Twists | None:
         return self.recording.twists()
+
+
+def _named(path: Path, name: str | None) -> dict[str, Mapping[str, Any]]:
+    """The cameras of a file, by name; one of them has this name, if it is given."""
+    cameras = dict(_cameras(_tree(path)))
+    if not cameras:
+        why = "it has no camera_matrix (ROS, OpenCV), intrinsics (Kalibr)"
+        raise InvalidField(str(path), "camera_matrix", None, why)
+    if name is not None and name not in cameras:
+        raise InvalidField(str(path), "camera", name, f"its cameras are {', '.join(cameras)}")
+    return cameras
 
 
 def _place(file: str) -> tuple[Path, str | None]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from neurove_protocol import Sensor
 from neurove_protocol.errors import InvalidField, NeuroVEError
+from neurove_protocol.keys import NAME_RULE, is_name
 from neurove_service import logs
 from neurove_service.config import ClientConfig, ServiceConfig, load
 from neurove_service.endpoints import check_address
@@ -131,6 +132,27 @@ def address(text: str) -> str:
         return check_address(text)
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def stream_name(text: str) -> str:
+    """A name that a stream can have."""
+    return _name(text)
+
+
+def stream_names(text: str) -> tuple[str, ...]:
+    """Names of streams with commas between."""
+    return tuple(_name(part) for part in text.split(",") if part)
+
+
+def node_name(text: str) -> str:
+    """A name that a node can have."""
+    return _name(text)
+
+
+def _name(text: str) -> str:
+    if not is_name(text):
+        raise argparse.ArgumentTypeError(f"{text!r}: give {NAME_RULE}")
+    return text
 
 
 def count(text: str) -> int:

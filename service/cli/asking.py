@@ -14,7 +14,7 @@ from neurove_protocol import TwistEstimate
 from neurove_protocol.control import HealthReply, ModelsReply, StreamStatus
 from neurove_protocol.errors import EXIT_FAILURE, InvalidField
 from neurove_service.cli import lines
-from neurove_service.cli.arguments import add_client_flags, address, client_config, command, count
+from neurove_service.cli.arguments import add_client_flags, address, client_config, command, count, node_name
 from neurove_service.cli.waiting import Wait, add_wait
 from neurove_service.config import ClientConfig
 from neurove_service.lifecycle import stop_on_signals
@@ -206,7 +206,12 @@ def add_models(parser: argparse.ArgumentParser) -> None:
     _add_query(command(parser, models))
 
 
+def _node(text: str) -> str:
+    """The name of a node, or * for all nodes."""
+    return text if text == "*" else node_name(text)
+
+
 def _add_query(parser: argparse.ArgumentParser) -> None:
     add_client_flags(parser)
     add_wait(parser)
-    parser.add_argument("--node", default="*", help="name of one node; default: all nodes")
+    parser.add_argument("--node", type=_node, default="*", help="name of one node; default: all nodes")

@@ -9,13 +9,16 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 from neurove_protocol.control import CHUNK_SCHEMA, ActivateReply, ModelInfo, ProgressReply, PushReply
 from neurove_protocol.errors import EXIT_FAILURE, EXIT_PARTIAL, InvalidField, NeuroVEError
-from neurove_service.cli.arguments import add_client_flags, client_config, command, seconds
+from neurove_service.cli.arguments import add_client_flags, client_config, command, node_name, seconds, stream_names
 from neurove_service.cli.waiting import Wait, add_wait
 from neurove_service.config import ClientConfig
+
+MAX_SHADOW_S: Final = 3600.0
+"""Longest time that a model runs in shadow [s]."""
 
 
 class Outcome(NamedTuple):
@@ -168,8 +171,17 @@ def _reason(text: str) -> str:
     return text.strip()
 
 
-def _streams(text: str) -> tuple[str, ...]:
-    return tuple(part for part in text.split(",") if part)
+def _model(text: str) -> str:
+    if not 1 <= len(text) <= 128:
+        raise argparse.ArgumentTypeError(f"{text!r}: give a name or a digest of 1 to 128 characters")
+    return text
+
+
+def _shadow(text: str) -> float:
+    value = seconds(text)
+    if value > MAX_SHADOW_S:
+        raise argparse.ArgumentTypeError(f"{text!r}: give at most {MAX_SHADOW_S:g} s")
+    return value
 
 
 def add_push(parser: argparse.ArgumentParser) -> None:
@@ -184,11 +196,13 @@ def add_activate(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `neurove activate`."""
     _add_nodes(command(parser, activate))
     _add_expect(parser)
-    parser.add_argument("model", metavar="MODEL", help="name of the model, or the first 8 digits of its digest")
+    parser.add_argument(
+        "model", type=_model, metavar="MODEL", help="name of the model, or the first 8 digits of its digest"
+    )
     about = "seconds that it runs in shadow before it becomes active; default: none"
-    parser.add_argument("--shadow", type=seconds, default=0.0, metavar="S", help=about)
+    parser.add_argument("--shadow", type=_shadow, default=0.0, metavar="S", help=about)
     about = "change these streams only; default: all streams"
-    parser.add_argument("--canary", type=_streams, default=(), metavar="STREAM,...", help=about)
+    parser.add_argument("--canary", type=stream_names, default=(), metavar="STREAM,...", help=about)
     _add_force(parser)
 
 
@@ -202,7 +216,7 @@ def _add_nodes(parser: argparse.ArgumentParser) -> None:
     add_client_flags(parser)
     add_wait(parser)
     where = parser.add_mutually_exclusive_group()
-    where.add_argument("--node", help="name of one node; default: the only node that is alive")
+    where.add_argument("--node", type=node_name, help="name of one node; default: the only node that is alive")
     where.add_argument("--all", action="store_true", help="change every node, one after the other")
 
 

@@ -5,7 +5,7 @@ import sys
 
 from neurove_protocol.duty import DrainReply
 from neurove_protocol.errors import EXIT_FAILURE
-from neurove_service.cli.arguments import add_client_flags, client_config, command
+from neurove_service.cli.arguments import add_client_flags, client_config, command, node_name
 from neurove_service.cli.waiting import Wait, add_wait
 
 
@@ -42,5 +42,5 @@ def add_drain(parser: argparse.ArgumentParser) -> None:
     parser = command(parser, drain)
     add_client_flags(parser)
     add_wait(parser)
-    parser.add_argument("--node", help="name of the node; default: the only node that is alive")
+    parser.add_argument("--node", type=node_name, help="name of the node; default: the only node that is alive")
     parser.add_argument("--resume", action="store_true", help="end the draining: the node may answer streams again")

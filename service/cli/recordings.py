@@ -59,7 +59,7 @@ def record(args: argparse.Namespace) -> int:
     if path.exists():
         raise InvalidField("record", "--out", str(path), "the file exists, and a recording is never overwritten")
     began = time.time()
-    with Wait(config, args.wait, stop).connect(config) as transport, PacketWriter(path) as writer:
+    with PacketWriter(path) as writer, Wait(config, args.wait, stop).connect(config) as transport:
         recorder = Recorder(writer, transport, config.keys, streams)
         with _status_line(path) as show:
             duration_s = math.inf if args.seconds is None else args.seconds

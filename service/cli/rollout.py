@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from neurove_protocol.errors import InvalidField
 from neurove_service.cli.arguments import MAX_SECONDS, add_client_flags, client_config, command, count
-from neurove_service.cli.changing import digest_prefix
+from neurove_service.cli.changing import MAX_SHADOW_S, digest_prefix
 from neurove_service.cli.fleet import add_selection, expected_nodes
 from neurove_service.cli.waiting import Wait, add_wait
 from neurove_service.config import ClientConfig
@@ -44,7 +44,7 @@ def _new(args: argparse.Namespace) -> int:
     from neurove_service.clients import ask
     from neurove_service.clients.push_source import PushSource
     from neurove_service.fleet import roster, where
-    from neurove_service.fleet.journal import Journal
+    from neurove_service.fleet.journal import Journal, check_new
     from neurove_service.fleet.ledger import start_fields
     from neurove_service.fleet.selection import select
 
@@ -53,6 +53,9 @@ def _new(args: argparse.Namespace) -> int:
     conditions = [where.Condition.parse(text) for text in args.where]
     expected = expected_nodes(args.expect_nodes)
     config = client_config(args)
+    path = args.journal or Path(f"rollout-{args.bundle.stem}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.jsonl")
+    if not args.dry_run:
+        check_new(path)
     with PushSource(args.bundle) as source:
         terms = _terms(args, source)
         wait = Wait(config, args.wait)
@@ -65,7 +68,6 @@ def _new(args: argparse.Namespace) -> int:
             if args.dry_run:
                 print(json.dumps(_plan_json(terms, chosen)) if args.json else _plan_text(terms, chosen), flush=True)
                 return 0
-            path = args.journal or Path(f"rollout-{args.bundle.stem}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.jsonl")
             with Journal(path, new=True) as journal:
                 start = journal.append("start", start_fields(terms, chosen))
                 journal.events.append(start)
@@ -256,7 +258,7 @@ def span(text: str) -> float:
 
 def _shadow(text: str) -> float:
     value = span(text)
-    if value > _UNITS["h"]:
+    if value > MAX_SHADOW_S:
         raise argparse.ArgumentTypeError(f"{text!r}: give at most 1h")
     return value
 

@@ -37,9 +37,11 @@ def ros2(args: argparse.Namespace) -> int:
     import gc
 
     from neurove_core.io.axes import parse_axes
+    from neurove_core.io.calibration import check_calibration
     from neurove_service.guard import Guard
     from neurove_service.ros2.bridge import Bridge
     from neurove_service.ros2.feed import Feed, warm_up
+    from neurove_service.ros2.rclpy_link import check_program
     from neurove_service.ros2.velocity import Velocity
 
     stop = stop_on_signals(with_parent=args.with_parent)
@@ -47,6 +49,10 @@ def ros2(args: argparse.Namespace) -> int:
     cameras, frame = _cameras(args), _frame(args)
     axes = None if args.imu_axes is None else parse_axes(args.imu_axes)
     endpoints = config.connect if args.ros_connect is None else (_endpoint(args.ros_connect),)
+    if args.calibration is not None:
+        check_calibration(args.calibration)
+    if args.via == "rclpy":
+        check_program(args.ros_python)
     guard = Guard()
     warm_up()
     wait = Wait(config, args.wait, stop)

@@ -26,6 +26,7 @@ from neurove_service.cli.arguments import (
     command,
     flags,
     refuse_existing,
+    stream_name,
     subcommand,
     tell_faults,
 )
@@ -350,7 +351,7 @@ def add_drive(parser: argparse.ArgumentParser) -> None:
     add_axes_flag(parser)
     add_client_flags(parser)
     about = f"name of the stream, one key chunk; default {_STREAM}, and for a packet log the names in it"
-    parser.add_argument("--stream", metavar="NAME", help=about)
+    parser.add_argument("--stream", type=stream_name, metavar="NAME", help=about)
     add_playback_flags(parser, "seconds of the source to play; default: until its end")
     add_wait(parser)
     _add_with_parent(parser)

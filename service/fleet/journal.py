@@ -21,6 +21,22 @@ Event = Mapping[str, Any]
 """One line: `event` names its kind, `at` is its time (UTC, ISO 8601); the other fields depend on the kind."""
 
 
+def check_new(path: Path) -> None:
+    """Refuse a file that cannot become a new journal, before there is something to write.
+
+    Raises:
+        InvalidField: it exists, or its folder does not.
+    """
+    if path.exists():
+        raise _exists(path)
+    if not path.parent.is_dir():
+        raise InvalidField("rollout", "--journal", str(path), "its folder does not exist")
+
+
+def _exists(path: Path) -> InvalidField:
+    return InvalidField("rollout", "--journal", str(path), "the file exists; --resume goes on with a journal")
+
+
 class Journal:
     """An open journal; one process at a time has it.
 
@@ -41,9 +57,7 @@ class Journal:
         try:
             self._file = os.open(path, flags, 0o644)
         except FileExistsError:
-            raise InvalidField(
-                "rollout", "--journal", str(path), "the file exists; --resume goes on with a journal"
-            ) from None
+            raise _exists(path) from None
         try:
             self._lock()
             self.events = _read(path)

@@ -33,6 +33,16 @@ class NoRos(NeuroVEError):
     exit_code = EXIT_FAILURE
 
 
+def check_program(python: str) -> None:
+    """Refuse a Python that is not there.
+
+    Raises:
+        NoRos: there is no such program.
+    """
+    if shutil.which(python) is None:
+        raise NoRos(f"--ros-python={python!r}: no such program")
+
+
 class RclpyLink:
     """One node of rclpy.
 
@@ -48,8 +58,7 @@ class RclpyLink:
     """
 
     def __init__(self, python: str, domain: int, namespace: str, name: str, stop: threading.Event) -> None:
-        if shutil.which(python) is None:
-            raise NoRos(f"--ros-python={python!r}: no such program")
+        check_program(python)
         self._python, self._stop, self._fault, self._closing = python, stop, "", False
         self._answers: queue.Queue[tuple[bytes, bytes]] = queue.Queue()
         self._subscribers: dict[int, tuple[Topic, OnMessage]] = {}
