@@ -28,6 +28,7 @@ from neurove_core.training import config as configs
 from neurove_core.training.config import DataConfig, TrainingConfig
 from neurove_core.training.data import Cache, Span, save
 from neurove_core.training.pipeline import OnProgress
+from neurove_core.training.ranks import alone
 from neurove_core.training.recorded import split_recording
 from neurove_core.training.validation import Held
 from neurove_protocol.velocity import AXES
@@ -50,6 +51,7 @@ class Recipe:
     calibration_sequences: int = calibration.SEQUENCES
     workers: int = 1
     seed: int = 0
+    device: torch.device | None = None  # that learns and calibrates; None: the CPU learns, the engine calibrates
     config: str = "wider"  # training configuration that gives the augmentations and the simulated scenes
 
 
@@ -175,11 +177,20 @@ def _learned(
         on_progress("learned", progress.step, progress.steps, errors)
 
     spans = _spans(learned, config, recipe.simulated)
-    path = loop.train(config, folder, data, more=spans, held=held, start=start, on_progress=trained)
+    path = loop.train(
+        config, folder, data, more=spans, held=held, start=start, ranks=alone(recipe.device), on_progress=trained
+    )
     if recipe.calibration_sequences and config.model.kind == "neurove":
         plain = bundles.load(path)
         pipeline.calibrate(
-            plain, config, data, path, recipe.calibration_sequences, tasks.local(recipe.workers), on_progress
+            plain,
+            config,
+            data,
+            path,
+            recipe.calibration_sequences,
+            tasks.local(recipe.workers),
+            on_progress,
+            device=recipe.device,
         )
     return bundles.load(path)
 

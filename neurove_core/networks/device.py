@@ -8,12 +8,12 @@ import contextlib
 import copy
 import re
 from collections.abc import Iterator, Sequence
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from neurove_core.networks.encoding import to_spikes
 from neurove_core.networks.kinds import Network, State
@@ -23,6 +23,8 @@ from neurove_protocol.errors import InvalidField
 
 TOLERANCE: Final = 1e-3
 """Largest accepted difference of the twists of two devices, as a share of the largest twist; see `difference`."""
+
+NetworkT = TypeVar("NetworkT", bound=nn.Module)
 
 _NAME: Final = re.compile(r"cpu|cuda(?::(\d{1,3}))?")
 
@@ -51,6 +53,11 @@ def device_of(name: str, what: str) -> torch.device:
     return torch.device(name)
 
 
+def on_device(network: NetworkT, device: torch.device) -> NetworkT:
+    """A copy of a network on a device, which computes no gradients; later changes of the network do not change it."""
+    return copy.deepcopy(network).to(device).eval().requires_grad_(requires_grad=False)
+
+
 class DeviceRunner:
     """Runs the network itself on a device, the windows of all streams in one batch; see `Runner`.
 
@@ -62,7 +69,7 @@ class DeviceRunner:
     """
 
     def __init__(self, network: Network, device: torch.device) -> None:
-        self._network = copy.deepcopy(network).to(device).eval().requires_grad_(requires_grad=False)
+        self._network = on_device(network, device)
         self._device, self._encoding = device, network.config.network.encoding
         self.choice = f"torch on {device} (--device)"
 

@@ -13,7 +13,7 @@ starts from the zero state.
 """
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
@@ -21,7 +21,7 @@ from typing import Any, Final, NamedTuple, cast
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import nn
+from torch import Tensor, nn
 
 from neurove_core import self_test
 from neurove_core.engine.engine import Engine
@@ -30,6 +30,7 @@ from neurove_core.ingest.channels import network_input
 from neurove_core.models.bounds import UNSET, Bounds
 from neurove_core.models.bundle import PER_HEIGHT, Bundle
 from neurove_core.models.uncertainty import LEVEL, LEVELS, Uncertainty, half_width
+from neurove_core.networks.device import full_precision, on_device
 from neurove_core.networks.encoding import to_spikes
 from neurove_core.networks.neurove import NetworkState, NeuroVE
 from neurove_core.tasks import HERE, Pool
@@ -114,7 +115,12 @@ def fill(config: TrainingConfig, folder: Path, sequences: int, pool: Pool = HERE
 
 
 def calibrate(
-    bundle: Bundle, config: TrainingConfig, folder: Path, sequences: int = SEQUENCES, bounds: Bounds = UNSET
+    bundle: Bundle,
+    config: TrainingConfig,
+    folder: Path,
+    sequences: int = SEQUENCES,
+    bounds: Bounds = UNSET,
+    device: torch.device | None = None,
 ) -> Calibration:
     """Fit the uncertainty of a model; an existing one is replaced.
 
@@ -124,6 +130,7 @@ def calibrate(
         folder: of the sequences, filled by `fill`.
         sequences: number of sequences.
         bounds: absolute bounds for the flag `uncertain`; by default those that the bundle has.
+        device: where the network runs in torch; by default the engine runs it.
 
     Raises:
         BadModel: the kind of the network is not `neurove`, the model does not fit the configuration, or its linear part
@@ -137,7 +144,7 @@ def calibrate(
         f"neurove calibrate: {sequences} simulated sequences of {first.seconds:g} s from seed {first.seed}, each seen "
         f"{len(VARIANTS)} times, {_FOLDS} folds, commit {commit() or 'unknown'}"
     )
-    return with_uncertainty(bundle, list(collect_errors(bundle, parts)), provenance, bounds)
+    return with_uncertainty(bundle, list(collect_errors(bundle, parts, device)), provenance, bounds)
 
 
 def check(bundle: Bundle, config: TrainingConfig, sequences: int) -> None:
@@ -214,15 +221,23 @@ def with_wider_sigma(bundle: Bundle, factor: Array, provenance: str) -> Bundle:
     return replace(bundle, network=network.eval(), uncertainty=changed).with_digest()
 
 
-def collect_errors(bundle: Bundle, parts: list[tuple[Sequences, bool]]) -> Iterator[SequenceErrors]:
-    """Run a model on every variant of all sequences, and yield its errors; the bool marks the hard sets."""
+def collect_errors(
+    bundle: Bundle, parts: list[tuple[Sequences, bool]], device: torch.device | None = None
+) -> Iterator[SequenceErrors]:
+    """Run a model on every variant of all sequences, and yield its errors; the bool marks the hard sets.
+
+    Args:
+        bundle: the model.
+        parts: sets of sequences.
+        device: see `calibrate`.
+    """
     probe = _copy(bundle)
     width = probe.readout.in_features
     layer: nn.Linear = probe.add_spread(width + 1)
     with torch.no_grad():
         layer.weight[:width] = torch.eye(width)
         layer.bias[width] = 1
-    engine = Engine(probe.eval())
+    step = _Step(probe.eval(), device)
     number = 0
     for found, hard in parts:
         for index in range(len(found)):
@@ -231,26 +246,43 @@ def collect_errors(bundle: Bundle, parts: list[tuple[Sequences, bool]]) -> Itera
             variants = variants_of(rng, counts, twists)
             counted = np.stack([network_input(seen, bundle.config) for seen, _ in variants], 1)
             spikes = to_spikes(torch.from_numpy(counted), bundle.config.network.encoding)
-            state, inputs, outputs = probe.initial_state(len(variants)), [], []
-            for step in range(len(counts)):
-                output, state = engine(spikes[step : step + 1], state)
-                potential = probe.log_sigma(state)
-                assert potential is not None  # it was added above
-                inputs.append(potential.double().numpy())
-                outputs.append(output[0].double().numpy())
+            state, inputs, outputs = step.network.initial_state(len(variants)), [], []
+            for window in spikes.split(1):
+                output, potential, state = step(window, state)
+                inputs.append(potential)
+                outputs.append(output)
             truth = np.stack([true for _, true in variants], 1)
             error = np.stack(outputs) - (truth - bundle.offset.double().numpy()) / bundle.scale.double().numpy()
             for stream, (variant, (windows, true)) in enumerate(zip(VARIANTS, variants, strict=True)):
                 seen, off = np.stack(inputs)[:, stream], error[:, stream]
                 if bundle.config.scales:
-                    seen, off = _served(bundle, probe, engine, windows, true)
+                    seen, off = _served(bundle, step, windows, true)
                 yield SequenceErrors(seen, off, number, variant, hard)
             number += 1
 
 
-def _served(
-    bundle: Bundle, probe: NeuroVE, engine: Engine, stored: NDArray[np.uint8], truth: NDArray[np.float32]
-) -> tuple[Array, Array]:
+class _Step:
+    """One window of all streams: (1, B, 2n, H, W) spikes -> answers (B, n, 6), potentials of the spread, and the state.
+
+    Args:
+        probe: with a spread.
+        device: see `calibrate`.
+    """
+
+    def __init__(self, probe: NeuroVE, device: torch.device | None) -> None:
+        self._device = device or torch.device("cpu")
+        self.network = probe if device is None else on_device(probe, device)
+        self._run: Callable[..., tuple[Tensor, NetworkState]] = Engine(probe) if device is None else self.network
+
+    def __call__(self, spikes: Tensor, state: NetworkState) -> tuple[Array, Array, NetworkState]:
+        with full_precision():
+            output, after = self._run(spikes.to(self._device), state)
+        potential = self.network.log_sigma(after)
+        assert potential is not None  # the probe has a spread
+        return output[0].double().cpu().numpy(), potential.double().cpu().numpy(), after
+
+
+def _served(bundle: Bundle, step: _Step, stored: NDArray[np.uint8], truth: NDArray[np.float32]) -> tuple[Array, Array]:
     """Inputs of the spread and errors of a model with longer windows, of the answers that it would serve.
 
     The error of an answer counts times its scale, because its sigma is divided by the scale.
@@ -258,21 +290,22 @@ def _served(
     config, offset, scale = bundle.config, bundle.offset.double().numpy(), bundle.scale.double().numpy()
 
     def run(counts: NDArray[np.uint8], state: NetworkState) -> tuple[Array, NetworkState]:
-        output, after = engine(to_spikes(torch.from_numpy(counts)[None, None], config.network.encoding), state)
-        return output[0, 0].double().numpy() * scale + offset, after
+        spikes = to_spikes(torch.from_numpy(counts)[None, None], config.network.encoding)
+        output, _, after = step(spikes, state)
+        return output[0] * scale + offset, after
 
-    state = probe.initial_state()
+    state = step.network.initial_state()
     longer, inputs, errors = Longer(), [], []
     for window, true in zip(network_input(stored, config), truth, strict=True):
         twists, state = run(window, state)
-        wanted, longer = jobs(window, longer, probe, config)
+        wanted, longer = jobs(window, longer, step.network, config)
         done = [(job, *run(job.counts, cast("NetworkState", job.state))) for job in wanted]
         longer = watched(followed(longer, [(job, after) for job, _, after in done], config), twists, config)
         answers = [Answer(twists, state), *(Answer(slowed(t, job.scale), s, job.scale) for job, t, s in done)]
         best = chosen(answers, longer, config.scale_bounds)
-        potential = probe.log_sigma(cast("NetworkState", best.network))
+        potential = step.network.log_sigma(cast("NetworkState", best.network))
         assert potential is not None  # the probe has a spread
-        inputs.append(potential[0].double().numpy())
+        inputs.append(potential[0].double().cpu().numpy())
         errors.append((best.twists - true) * best.scale / scale)
     return np.stack(inputs), np.stack(errors)
 

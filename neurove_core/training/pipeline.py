@@ -21,6 +21,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from neurove_core.files import make_writable
 from neurove_core.models import bundle
 from neurove_core.models.bounds import UNSET, Bounds
@@ -144,6 +146,7 @@ def calibrate(
     pool: Pool = HERE,
     on_progress: OnProgress = lambda *_: None,
     bounds: Bounds = UNSET,
+    device: torch.device | None = None,
 ) -> dict[str, Any]:
     """Simulate the missing calibration sequences, fit a model's uncertainty on them, and write the bundle.
 
@@ -156,6 +159,7 @@ def calibrate(
         pool: where the sequences are simulated.
         on_progress: called after each sequence.
         bounds: absolute bounds for the flag `uncertain`; by default those that the model has.
+        device: where the network runs in torch; by default the engine runs it.
 
     Returns:
         the coverage of the fitted intervals; see `calibration.Calibration.report`.
@@ -167,7 +171,7 @@ def calibrate(
     _check_writable("out", out.parent)
     for done, name in enumerate(calibration.fill(config, data, sequences, pool), 1):
         on_progress("simulated to calibrate", done, sequences, name)
-    made = calibration.calibrate(model, config, data, sequences, bounds)
+    made = calibration.calibrate(model, config, data, sequences, bounds, device)
     bundle.save(made.bundle, out)
     return made.report
 

@@ -158,6 +158,11 @@ ALONE: Final = Ranks()
 """A run of one process on the CPU."""
 
 
+def alone(device: torch.device | None) -> Ranks:
+    """A run of one process on a device; None: the CPU."""
+    return ALONE if device is None else Ranks(device=device)
+
+
 class _Work(Generic[T]):
     """Work on a thread of its own. The thread does not keep the process alive."""
 

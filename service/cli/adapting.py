@@ -20,6 +20,7 @@ from neurove_service.cli.arguments import (
     sensor_size,
 )
 from neurove_service.cli.bars import event_count, progress
+from neurove_service.cli.devices import TRAINS, add_device_flag, device_from
 
 if TYPE_CHECKING:
     from neurove_core.geometry.mounting import Mounting
@@ -48,6 +49,7 @@ def adapt(args: argparse.Namespace) -> int:
         raise InvalidField(
             "adapt", "--truth", str(args.truth), "belongs to one recording; use --topic for several bags"
         )
+    device = device_from(args, "adapt")
     given = prepare.Input(
         args.sensor, args.events_topic, args.time_unit, args.calibration, args.height, args.offset, args.held_out
     )
@@ -62,6 +64,7 @@ def adapt(args: argparse.Namespace) -> int:
         calibration_sequences=args.calibration_sequences,
         workers=args.workers,
         seed=args.seed,
+        device=device,
         config=args.config,
     )
     config = configuration(start, recipe, args.out.stem)
@@ -215,6 +218,7 @@ def add_adapt(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--calibration-sequences", type=_whole, default=96, metavar="N", help=about)
     parser.add_argument("--seed", type=_whole, default=0, metavar="N", help="seed of all random draws; default 0")
     parser.add_argument("--workers", type=count, default=1, metavar="N", help="processes that simulate; default 1")
+    add_device_flag(parser, TRAINS)
     parser.add_argument(
         "--work", type=Path, metavar="DIR", help="folder for sequences and checkpoint; default runs/adapt-NAME"
     )

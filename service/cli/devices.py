@@ -1,23 +1,59 @@
 """The device on which offline commands run the network."""
 
 import argparse
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from neurove_core.extras import installed
 from neurove_protocol.errors import InvalidField
 
 if TYPE_CHECKING:
+    import torch
+
     from neurove_core.models.bundle import Bundle
     from neurove_core.networks.device import DeviceRunner
 
 
-def add_device_flag(parser: argparse.ArgumentParser) -> None:
+EVALUATES: Final = (
+    "run the network with torch on cpu, cuda or cuda:N, the windows of up to 64 recordings in one batch; "
+    "default: the compiled code of the service"
+)
+"""What --device does in a command that evaluates."""
+
+TRAINS: Final = (
+    "train on cpu, cuda or cuda:N; default cpu; the estimates are compared by the compiled code of the service"
+)
+"""What --device does in a command that trains and then compares estimates."""
+
+CALIBRATES: Final = (
+    "run the network with torch on cpu, cuda or cuda:N, one sequence at a time; "
+    "default: the compiled code of the service"
+)
+"""What --device does in a command that calibrates."""
+
+
+def add_device_flag(parser: argparse.ArgumentParser, about: str = EVALUATES) -> None:
     """Add the device of the network."""
-    about = (
-        "run the network with torch on cpu, cuda or cuda:N, the windows of up to 64 recordings in one batch; "
-        "default: the compiled code of the service"
-    )
     parser.add_argument("--device", metavar="KIND", help=about)
+
+
+def device_from(args: argparse.Namespace, what: str) -> "torch.device | None":
+    """The device that --device names; None without the flag.
+
+    Args:
+        args: of the command.
+        what: the command, for the error.
+
+    Raises:
+        InvalidField: there is no such device, or torch is not installed.
+    """
+    if args.device is None:
+        return None
+    if not installed("torch"):
+        why = "torch is needed and not installed: pip install 'neurove[train]'"
+        raise InvalidField(what, "--device", args.device, why)
+    from neurove_core.networks.device import device_of
+
+    return device_of(args.device, what)
 
 
 def runner_on(args: argparse.Namespace, bundle: "Bundle", what: str) -> "DeviceRunner | None":
@@ -29,16 +65,13 @@ def runner_on(args: argparse.Namespace, bundle: "Bundle", what: str) -> "DeviceR
         what: the command, for the error.
 
     Raises:
-        InvalidField: there is no such device, or torch is not installed.
+        InvalidField: as `device_from`.
     """
-    if args.device is None:
+    device = device_from(args, what)
+    if device is None:
         return None
-    if not installed("torch"):
-        why = "torch is needed and not installed: pip install 'neurove[train]'"
-        raise InvalidField(what, "--device", args.device, why)
-    from neurove_core.networks.device import DeviceRunner, device_of
+    from neurove_core.networks.device import DeviceRunner
 
-    device = device_of(args.device, what)
     return DeviceRunner(bundle.network, device)
 
 

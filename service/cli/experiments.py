@@ -10,7 +10,7 @@ from typing import Any
 from neurove_protocol.errors import EXIT_FAILURE, InvalidField
 from neurove_service.cli.arguments import add_refine_flag, check_folder, commit, count, seed, subcommand
 from neurove_service.cli.bars import progress
-from neurove_service.cli.devices import add_device_flag, runner_on
+from neurove_service.cli.devices import TRAINS, add_device_flag, device_from, runner_on
 from neurove_service.cli.parser import Parser
 from neurove_service.cli.pools import add_pool_flags, pool_of
 
@@ -195,7 +195,8 @@ def reproduce_velocity(args: argparse.Namespace) -> int:
     torch.set_num_threads(args.threads)
     config = run.base_config(args.config, args.steps, quick=args.quick)
     seeds = range(args.seed, args.seed + args.seeds)
-    experiment = run.Experiment(config, tuple(args.methods.split(",")), seeds, args.recordings, args.quick)
+    device, methods = device_from(args, "reproduce velocity"), tuple(args.methods.split(","))
+    experiment = run.Experiment(config, methods, seeds, args.recordings, args.quick, device)
     out: Path = args.out or Path("runs") / config.name
     folder: Path = args.data or out / "data"
     for path in (out, folder):
@@ -335,6 +336,7 @@ def _add_velocity(parser: argparse.ArgumentParser) -> None:
     _add_out(parser, "folder for methods, tables and figures; default runs/velocity")
     add_pool_flags(parser, "simulate")
     parser.add_argument("--threads", type=count, default=1, metavar="N", help="threads that train; default 1")
+    add_device_flag(parser, TRAINS)
     about = "tiny networks and sequences, to check that the command works; its figures mean nothing"
     parser.add_argument("--quick", action="store_true", help=about)
 

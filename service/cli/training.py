@@ -21,7 +21,7 @@ from neurove_service.cli.arguments import (
     tell_faults,
 )
 from neurove_service.cli.bars import event_count, progress
-from neurove_service.cli.devices import add_device_flag, refuse_pool, runner_on
+from neurove_service.cli.devices import CALIBRATES, add_device_flag, device_from, refuse_pool, runner_on
 from neurove_service.cli.extras import one_thread
 from neurove_service.cli.pools import add_pool_flags, pool_of
 from neurove_service.lifecycle import end_with_parent
@@ -124,9 +124,10 @@ def calibrate(args: argparse.Namespace) -> int:
     bounds = Bounds(args.uncertain_m_s, args.uncertain_rad_s)
     out: Path = args.out or Path(f"{model.name}{bundle.SUFFIX}")
     refuse_existing("calibrate", "--out", out, None, force=args.force)
+    device = device_from(args, "calibrate")
     data: Path = args.data or Path("runs") / config.name / "data"
     with pool_of(args) as pool, progress() as show:
-        report = pipeline.calibrate(model, config, data, out, args.calibration_sequences, pool, show, bounds)
+        report = pipeline.calibrate(model, config, data, out, args.calibration_sequences, pool, show, bounds, device)
     if args.json:
         print(json.dumps({"bundle": str(out), **report}))
         return 0
@@ -306,6 +307,7 @@ def add_calibrate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data", type=Path, metavar="DIR", help="folder for the sequences; default runs/CONFIG/data")
     _add_calibration(parser, "")
     add_pool_flags(parser, "simulate")
+    add_device_flag(parser, CALIBRATES)
     parser.add_argument("--out", type=Path, metavar="FILE", help="bundle to write; default NAME.safetensors")
     add_force(parser, "FILE")
     about = "estimates with a smaller linear sigma are never `uncertain` [m/s]; default: the node decides"

@@ -5,6 +5,7 @@ from typing import cast
 
 import numpy as np
 import pytest
+import torch
 from pydantic import ValidationError
 
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
@@ -163,6 +164,8 @@ def test_a_calibration_fits_the_answers_that_the_service_gives():
             return stored[first:stop]
 
     errors = next(collect_errors(made, [(cast("Sequences", Drawn()), False)]))
+    in_torch = next(collect_errors(made, [(cast("Sequences", Drawn()), False)], torch.device("cpu")))
+    np.testing.assert_allclose(in_torch.error, errors.error, atol=1e-4)
     estimator = Estimator(made)
     served, _ = estimator.follow(windows_of(events_of(0.2), PLAIN), estimator.initial_state(SENSOR))
     off = np.stack([one.twists for one in served]) - truth

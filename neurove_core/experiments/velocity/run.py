@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+import torch
 
 from neurove_core import models
 from neurove_core.experiments.velocity.held_out import (
@@ -28,6 +29,7 @@ from neurove_core.training import config as configs
 from neurove_core.training import data
 from neurove_core.training.config import TrainingConfig
 from neurove_core.training.loop import RUN_JSON, train
+from neurove_core.training.ranks import alone
 from neurove_protocol.errors import InvalidField
 
 METHODS: Final[dict[str, dict[str, Any]]] = {
@@ -50,6 +52,7 @@ class Experiment(NamedTuple):
     seeds: range
     recordings: Path | None  # folder of the recordings, with MVSEC's poses
     quick: bool = False  # few short scenarios through a tiny camera
+    device: torch.device | None = None  # that trains; None: the CPU
 
     def drives(self) -> list[Scenario]:
         """The drives along MVSEC's poses to train on, besides the sequences of the configuration."""
@@ -142,11 +145,18 @@ def reproduce(experiment: Experiment, folder: Path, out: Path, show: Show, pool:
         show("held out", done, len(drives) + len(scenarios), f"{scenario.group} {scenario.name}")
     more = [cache.path(drive) for drive in drives]
     for method, config in wanted:
-        run = ensure_trained(config, out, folder, more, show)
+        run = ensure_trained(config, out, folder, more, show, experiment.device)
         yield _evaluate(method, config, run, scenarios, cache)
 
 
-def ensure_trained(config: TrainingConfig, out: Path, folder: Path, more: Sequence[Path], show: Show) -> Path:
+def ensure_trained(
+    config: TrainingConfig,
+    out: Path,
+    folder: Path,
+    more: Sequence[Path],
+    show: Show,
+    device: torch.device | None = None,
+) -> Path:
     """Return the folder of a trained method; train it first if it is missing or unfinished.
 
     Args:
@@ -155,6 +165,7 @@ def ensure_trained(config: TrainingConfig, out: Path, folder: Path, more: Sequen
         folder: holds the simulated sequences of the configuration.
         more: sequence files to train on besides them.
         show: receives the progress.
+        device: that trains; None: the CPU.
 
     Raises:
         InvalidField: the folder holds a run of another configuration. BadModel: so does its checkpoint.
@@ -172,6 +183,7 @@ def ensure_trained(config: TrainingConfig, out: Path, folder: Path, more: Sequen
         folder,
         more=more,
         resume=True,
+        ranks=alone(device),
         on_progress=lambda at: show(
             config.name, at.step, at.steps, f"{at.linear_m_s:.3f} m/s {at.angular_rad_s:.4f} rad/s"
         ),

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from neurove_core.estimator import Estimator
 from neurove_core.evaluation.estimates import estimate_recording
@@ -139,6 +140,13 @@ def test_a_method_trained_on_real_drives_too_has_a_folder_of_its_own(finished, t
         "4 simulated sequences of 0.8 s from seed 1000000 and 2 more"
         in bundle.load(made / "nve-0.safetensors").provenance
     )
+
+
+def test_a_method_is_trained_on_the_device_of_the_experiment(finished, tmp_path):
+    folder, experiment, _, _ = finished
+    config = experiment._replace(config=run.base_config(None, 1, quick=True), device=torch.device("meta"))
+    with pytest.raises((NotImplementedError, RuntimeError), match="meta"):  # its tensors have no values
+        list(run.reproduce(config, folder / "data", tmp_path, quiet))
 
 
 def test_the_blind_predictors_are_zero_and_the_best_constant():

@@ -89,6 +89,18 @@ def test_a_model_with_parts_and_a_history_is_trained_and_serves(folder, tmp_path
     assert all(np.isfinite(one.error).all() and one.error.shape == (10, 5, 6) for one in errors)
 
 
+def test_a_calibration_on_a_device_finds_the_errors_of_the_engine(folder):
+    made = bundle.untrained(5, FINE.model, "fine")
+    parts = [(data.Cache(folder, FINE).open(), False)]
+    wanted, found = (list(collect_errors(made, parts, device)) for device in (None, torch.device("cpu")))
+    for ours, theirs in zip(found, wanted, strict=True):
+        assert ours[2:] == theirs[2:]
+        np.testing.assert_allclose(ours.error, theirs.error, atol=1e-4)
+        np.testing.assert_allclose(ours.inputs, theirs.inputs, atol=1e-4)
+    with pytest.raises(NotImplementedError, match="meta"):  # its tensors have no values, so that they cannot be read
+        next(collect_errors(made, parts, torch.device("meta")))
+
+
 def test_a_validation_sees_the_channels_of_the_network(folder):
     paths = data.Cache(folder, FINE).paths()
     held = Held.read([], paths, FINE.recipe, FINE.model)

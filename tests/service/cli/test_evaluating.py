@@ -58,7 +58,16 @@ def test_the_network_on_a_device_gives_the_figures_of_the_engine(trained, run):
     assert found["firing_rate"] == pytest.approx(wanted["firing_rate"], abs=0.01)
 
 
-@pytest.mark.parametrize("command", [("evaluate", "default", SOURCE), ("reproduce", "motion", "--quick")])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("evaluate", "default", SOURCE),
+        ("reproduce", "motion", "--quick"),
+        ("reproduce", "velocity", "--quick"),
+        ("calibrate", "default", "--out", "mine.safetensors"),
+        ("adapt", "none.bag", "--out", "mine.safetensors"),
+    ],
+)
 @pytest.mark.parametrize(
     ("words", "why"),
     [
