@@ -201,6 +201,114 @@ def test_an_operator_changes_a_model_with_a_token_that_works_once(node, tab):
     assert page.request("/session", {"token": token})[0] == 403
 
 
+def focused(tab):
+    """What has the focus, and whether a person sees that it has it."""
+    return tab.evaluate(
+        """() => {
+          const one = document.activeElement, style = getComputedStyle(one), box = one.getBoundingClientRect();
+          const name = ["id", "href", "aria-label"].map((name) => one.getAttribute(name)).find((name) => name);
+          const ring = style.outlineStyle !== "none" && parseFloat(style.outlineWidth) >= 2;
+          const inside = box.width > 0 && box.left >= 0 && box.top < innerHeight && box.bottom > 0;
+          return [name ?? one.textContent, ring && inside];
+        }"""
+    )
+
+
+def press(tab, key, times=1):
+    """Press a key so many times; what has the focus after each time, which must be visible."""
+    passed = []
+    for _ in range(times):
+        tab.keyboard.press(key)
+        name, seen = focused(tab)
+        assert seen, (name, passed)
+        passed.append(name)
+    return passed
+
+
+def tab_to(tab, name):
+    """Press Tab until an element has the focus; return those before it."""
+    passed = press(tab, "Tab")
+    while passed[-1] != name:
+        assert len(passed) < 60, passed
+        passed += press(tab, "Tab")
+    return passed[:-1]
+
+
+def shown(tab, page):
+    """Open the page, and wait for a stream and a node."""
+    tab.goto(page.url)
+    until(tab, lambda: re.search(r"\d", text_of(tab, "#stream-cam0 .linear .value")))
+    until(tab, lambda: text_of(tab, ".node .facts"))
+
+
+HISTORY = "Model changes, newest first"
+
+
+def test_the_tab_key_reaches_each_control_in_the_order_of_the_page(node, tab):
+    page, *_ = node
+    shown(tab, page)
+    assert press(tab, "Tab") == ["#streams"]
+    assert "#stream-cam0" in tab_to(tab, "operate")
+    assert press(tab, "Tab") == [HISTORY]
+    assert press(tab, "Shift+Tab") == ["operate"]
+
+
+@pytest.mark.parametrize(("link", "then"), [("#streams", HISTORY), ("#stream-cam0", "stream-cam0")])
+def test_the_links_of_the_page_work_with_enter(node, tab, link, then):
+    page, *_ = node
+    shown(tab, page)
+    tab_to(tab, link)
+    tab.keyboard.press("Enter")
+    until(tab, lambda: tab.evaluate("location.hash") == link)
+    if link == "#streams":
+        tab.keyboard.press("Tab")  # to the next control behind the links
+    assert focused(tab) == [then, True]
+
+
+def test_an_operator_works_with_the_keyboard_alone(node, tab):
+    page, transport, config = node
+    before = ask.models(transport, config)[0]
+    token = page.line("operator: ").split("token=")[1].split()[0]
+    shown(tab, page)
+    tab_to(tab, "operate")
+    assert press(tab, "Enter") == ["token"]
+    tab.keyboard.press("Escape")
+    until(tab, lambda: focused(tab)[0] == "operate")  # where it was before
+    assert press(tab, "Enter") == ["token"]
+    tab.keyboard.type("wrong")
+    tab.keyboard.press("Enter")
+    until(tab, lambda: "wrong" in text_of(tab, "#token-error"))
+    assert press(tab, "Tab", 2) == ["token-cancel", "token-ok"]
+    assert press(tab, "Shift+Tab", 2) == ["token-cancel", "token"]
+    tab.keyboard.press("Control+A")
+    tab.keyboard.type(token)
+    tab.keyboard.press("Enter")
+    until(tab, lambda: tab.evaluate("!!document.querySelector('.operator:not([hidden]) option')"))
+    tab_to(tab, "Model to activate")
+    tab.keyboard.press("End" if before.available[0].digest == before.active.digest else "Home")
+    until(tab, lambda: tab.evaluate("!document.querySelector('.operator button').disabled"))
+    assert press(tab, "Tab") == ["Activate"]
+    assert press(tab, "Enter") == ["Cancel"]  # the answer that changes nothing comes first
+    until(tab, lambda: tab.evaluate("document.querySelector('.operator button').disabled"))  # while it asks
+    tab.keyboard.press("Enter")
+    until(tab, lambda: focused(tab) == ["Activate", True])
+    after = ask.models(transport, config)[0]
+    assert (after.epoch, after.active.digest) == (before.epoch, before.active.digest)
+
+
+def test_a_browser_that_was_too_slow_for_the_images_asks_for_them_anew(node, tab):
+    page, *_ = node
+    asked = []
+    tab.on("request", lambda request: asked.append(request.url) if "/images?" in request.url else None)
+    shown(tab, page)
+    until(tab, lambda: tab.evaluate("document.querySelector('.picture')?.dataset.images > 2"))
+    before = len(asked)
+    tab.evaluate("() => { const until = performance.now() + 3000; while (performance.now() < until); }")
+    until(tab, lambda: len(asked) > before)
+    drawn = int(tab.evaluate("document.querySelector('.picture').dataset.images"))
+    until(tab, lambda: int(tab.evaluate("document.querySelector('.picture').dataset.images")) > drawn + 2)
+
+
 def test_a_request_from_elsewhere_or_without_a_token_changes_nothing(node):
     page, transport, config = node
     before = ask.models(transport, config)[0]

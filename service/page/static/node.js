@@ -60,6 +60,14 @@ export class NodeCard {
       this.busy = false;
     }
     if (this.outcome !== null) put(this.result, this.outcome);
+    this.focusAgain(this[what]);
+  }
+
+  // A button is disabled while its change runs, and loses the focus by it: who works with the keyboard gets it back.
+  focusAgain(button) {
+    this.showControls(this.node, !this.operator.hidden);
+    const now = document.activeElement; // for a moment still in the dialog that has closed
+    if (now === document.body || now.closest("dialog:not([open])")) (button.disabled ? this.select : button).focus();
   }
 
   show(node, operator) {
