@@ -1,8 +1,9 @@
 """An estimate of the events, aided by the inertial unit of the camera: the stage after network and refinement."""
 
-from neurove_core.estimator import Estimator, WindowEstimate
+from neurove_core.estimator import Estimator
 from neurove_core.inertial import state as inertial
 from neurove_core.inertial.state import InertialState, Window
+from neurove_core.stream_state import WindowEstimate
 from neurove_protocol import CameraInfo
 
 

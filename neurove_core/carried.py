@@ -11,7 +11,6 @@ import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.estimator import StreamState
 from neurove_core.inertial.agreement import Agreement, Track
 from neurove_core.inertial.bias import Bias
 from neurove_core.inertial.moving import Tilt
@@ -23,6 +22,7 @@ from neurove_core.refine.rotation import Filter
 from neurove_core.refine.scene import Scene
 from neurove_core.refine.stages import State as Stages
 from neurove_core.refine.standing import Standing
+from neurove_core.stream_state import StreamState
 from neurove_core.timescales import Longer
 from neurove_protocol.errors import InvalidField, NeuroVEError
 

@@ -11,71 +11,28 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from neurove_core import refined
 from neurove_core.geometry.tables import TABLES
 from neurove_core.ingest import windows
-from neurove_core.ingest.channels import Recent, remembered
+from neurove_core.ingest.channels import remembered
 from neurove_core.ingest.windows import Pushed, Window, WindowsState
 from neurove_core.io.packets import slices
 from neurove_core.io.recording import Recording
 from neurove_core.models.bounds import UNSET, Bounds
 from neurove_core.models.bundle import PER_HEIGHT, Bundle, LinearUnit
-from neurove_core.networks.arrays import Runner, State
-from neurove_core.refine import errors, ground, standing
-from neurove_core.refine import stages as refining
-from neurove_core.refine.ground import GroundState
-from neurove_core.refine.rotation import Given, Rate
-from neurove_core.refine.rotation import Refined as RotationFound
+from neurove_core.networks.arrays import Runner
 from neurove_core.refine.view import View
+from neurove_core.refined import Refined
 from neurove_core.running import form_of, runner_of
+from neurove_core.stream_state import StreamState, WindowEstimate
 from neurove_core.timescales import Answer, Answered, Longer, Turn, answered
 from neurove_core.warming import compile_refinement, warm_camera, warm_events
 from neurove_protocol import CameraInfo, Events, Sensor
 from neurove_protocol.errors import BadModel
 from neurove_protocol.events import WireEvents
-from neurove_protocol.velocity import Source
 
 _STREAM = "cam0"
 _METRES = np.ones(6)
-
-
-class StreamState(NamedTuple):
-    """All that one camera stream carries from packet to packet."""
-
-    sensor: Sensor
-    camera: CameraInfo | None
-    lut: NDArray[np.int32]  # sensor pixel -> canonical cell
-    windows: WindowsState
-    network: State
-    age: int  # windows since the network state began
-    end_us: int | None = None  # end of the newest window that the network has processed
-    low_activity_below: float = 0.0  # a window with fewer visible events is flagged low_activity
-    view: View | None = None  # for the refinement; None where estimates are not refined
-    stages: refining.State = refining.State()  # of the refinement
-    ground: GroundState = GroundState()  # of the refinement of the linear part
-    recent: Recent = ()  # counts of earlier windows, for models with a history
-    longer: Longer = Longer()  # for models with longer windows
-
-    def without_refinement(self) -> "StreamState":
-        """The state in which the refinement begins again."""
-        return self._replace(stages=refining.State(), ground=GroundState())
-
-
-class WindowEstimate(NamedTuple):
-    """The estimate of one window."""
-
-    start_us: int
-    end_us: int
-    twists: NDArray[np.float64]  # (n, 6): vx vy vz [m/s], wx wy wz [rad/s], optical frame, one row per bin; see push
-    events: int
-    first: bool  # the network state began in this window
-    settled: bool
-    low_activity: bool
-    saturated: bool
-    covariance: NDArray[np.float64] | None = None  # (6, 6) of each of these twists, from the bundle's calibration
-    uncertain: bool = False  # the linear or the angular sigma exceeds both its bounds, see Uncertainty.is_uncertain
-    source: Source = "network"  # of the angular part
-    gyro_disagrees: bool = False  # the events and the gyroscope of the camera disagree
-    vehicle: bool = False  # the camera is on a vehicle by the events of many windows
 
 
 class PushResult(NamedTuple):
@@ -94,10 +51,6 @@ class Push(NamedTuple):
     events: Events | WireEvents
     state: StreamState
     horizon_us: int
-
-
-Refined = tuple[WindowEstimate, StreamState]
-"""A refined estimate, and the state of the stream after it."""
 
 
 @dataclass
@@ -227,20 +180,10 @@ class Estimator:
             estimate: the network's.
             state: of the stream.
         """
-        estimate, state = _held(window, estimate, state)
-        if window.sample is None or state.view is None or estimate.covariance is None:
-            return estimate, state
-        known_m = state.camera.height_m if state.camera else None
-        about = window.start_us, self.config.window.duration_us, window.sample, state.view, estimate.twists.mean(axis=0)
-        given = Given(*about, estimate.covariance, estimate.low_activity, None, known_m or 1.0, known_m is not None)
-        found = refining.refine(given, state.stages)
-        state = state._replace(stages=found.state, ground=state.ground if found.level else GroundState())
-        estimate = _turned(estimate, found.turn, found.velocity)
-        answer, state = _over_ground(window, estimate, state, found)
+        answer, after = refined.refine(window, estimate, state, self.config.window.duration_us)
         if answer is estimate:
-            answer = _with_errors(estimate, found, given.height_m)
-        uncertain, vehicle = self.is_uncertain(answer.twists, answer.covariance), state.stages.on_vehicle
-        return answer._replace(uncertain=uncertain, vehicle=vehicle), state
+            return answer, after
+        return answer._replace(uncertain=self.is_uncertain(answer.twists, answer.covariance)), after
 
     def is_uncertain(self, twists: NDArray[np.float64], covariance: NDArray[np.float64] | None) -> bool:
         """Whether sigma exceeds the bounds, see `Uncertainty.is_uncertain`; False for a model without uncertainty."""
@@ -320,19 +263,6 @@ def _turn(stream: _Progress, window: Window) -> Turn:
     return Turn(window.counts, stream.state.recent, stream.state.network, stream.state.longer)
 
 
-def _with_rate(
-    twists: NDArray[np.float64], covariance: NDArray[np.float64], rate: Rate, change_rad_s: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Twists (n, 6) and covariance (6, 6) with another angular part, which does not correlate with the linear part.
-
-    The angular part changes by `change_rad_s` (3,) within the window.
-    """
-    twists, joint = twists.copy(), np.zeros((6, 6))
-    twists[:, 3:] = rate.w_rad_s + np.outer((np.arange(len(twists)) + 0.5) / len(twists) - 0.5, change_rad_s)
-    joint[:3, :3], joint[3:, 3:] = covariance[:3, :3], (rate.covariance + rate.covariance.T) / 2
-    return twists, joint
-
-
 def _is_finite(estimator: Estimator, state: StreamState) -> bool:
     """Whether the estimates of some events are finite; this compiles all code."""
     if state.view is not None:
@@ -344,99 +274,6 @@ def _is_finite(estimator: Estimator, state: StreamState) -> bool:
         if not (finite and state.network.finite()):  # a membrane of nan never fires, so the answer does not show it
             return False
     return True
-
-
-def _held(window: Window, estimate: WindowEstimate, state: StreamState) -> Refined:
-    """The network's estimate by what is known of a stop too, see `refine.standing`."""
-    if window.sample is None or state.view is None or state.camera is None or estimate.covariance is None:
-        return estimate, state
-    if state.camera.height_m is None:
-        return estimate, state
-    share = (window.events - window.outside) / max(state.low_activity_below, 1.0)
-    about = estimate.end_us, share, state.camera.height_m, state.ground.standing
-    found = standing.hold(estimate.twists, estimate.covariance, *about)
-    state = state._replace(ground=state.ground._replace(standing=found.standing))
-    if found.standing.sigma_m_s is None:
-        return estimate, state
-    return estimate._replace(twists=found.twists, covariance=found.covariance, source="refined"), state
-
-
-def _turned(estimate: WindowEstimate, found: RotationFound, velocity: refining.Velocity | None) -> WindowEstimate:
-    """The estimate with the angular part of the refinement, and the linear one if it has one, where it is accepted."""
-    if estimate.covariance is None or found.outcome != "accepted":
-        return estimate
-    twists, covariance = _with_rate(estimate.twists, estimate.covariance, found.rate, found.change_rad_s)
-    if velocity is not None:
-        twists[:, :3], covariance[:3, :3] = velocity
-    return estimate._replace(twists=twists, covariance=covariance, source="refined")
-
-
-def _with_errors(estimate: WindowEstimate, found: refining.Stages, height_m: float) -> WindowEstimate:
-    """An estimate without the ground, with the terms of `refine.errors`, and less of a speed that is not seen."""
-    if estimate.covariance is None:
-        return estimate
-    twists, covariance, turn = estimate.twists, estimate.covariance.copy(), found.turn
-    if turn.errors is not None:
-        covariance[3:, 3:] = (turn.errors + turn.errors.T) / 2
-    if found.velocity is None:
-        twists = standing.towards_zero(twists, estimate.covariance)
-        rate_rad_s = float(np.linalg.norm(twists.mean(axis=0)[3:]))
-        covariance = errors.of_unknown_depth(covariance, turn.shift, rate_rad_s, height_m)
-    return estimate._replace(twists=twists, covariance=covariance)
-
-
-def _over_ground(
-    window: Window,
-    estimate: WindowEstimate,
-    state: StreamState,
-    found: refining.Stages,
-) -> Refined:
-    """The estimate with the motion over level ground, where it is accepted; see `refine.ground`.
-
-    Args:
-        window: with the sample of its events.
-        estimate: so far; it stays the same object if the answer is not accepted.
-        state: of the stream.
-        found: the stages before; a camera that is on no vehicle has no ground.
-    """
-    if not found.level:
-        return estimate, state
-    if window.sample is None or state.view is None or state.camera is None or estimate.covariance is None:
-        return estimate, state
-    height_m = state.camera.height_m
-    if height_m is None:
-        return estimate, state  # nothing says that the camera looks at level ground
-    events = ground.events_of(state.view, window.sample, window.start_us)
-    sigma = found.turn.sigma_rad_s
-    sigma = np.sqrt(np.diagonal(estimate.covariance)[3:]) if sigma is None else sigma
-    known = estimate.twists.mean(axis=0), sigma, state.ground
-    turned = estimate.source == "refined" and not estimate.low_activity
-    measured = estimate.covariance[3:, 3:] if turned else None
-    answer = ground.refine(events, estimate.start_us, estimate.end_us, state.camera, *known, measured)
-    state = state._replace(ground=answer.state, stages=state.stages.after_ground(answer.outcome))
-    if answer.outcome not in ("accepted", "turning") or answer.motion is None:
-        return estimate, state
-    twist, after = answer.motion.twist, answer.state
-    seen = after.tilt, after.pitch_sigma, height_m, state.stages.odds
-    covariance = errors.of_ground(twist, answer.motion.covariance, *seen)
-    twists = np.tile(twist, (len(estimate.twists), 1))
-    if answer.outcome == "turning":
-        rate = Rate(twist[3:], covariance[3:, 3:])
-        twists, covariance = _with_rate(estimate.twists, estimate.covariance, rate, np.zeros(3))
-    if state.stages.is_free:
-        twists, covariance = _without_rate(twists, covariance, _with_errors(estimate, found, height_m))
-    return estimate._replace(twists=twists, covariance=covariance, source="refined"), state
-
-
-def _without_rate(
-    twists: NDArray[np.float64], covariance: NDArray[np.float64], before: WindowEstimate
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The linear part of a motion over the ground, with the angular part of the estimate before it."""
-    joint = covariance.copy()
-    joint[:3, 3:], joint[3:, :3] = 0.0, 0.0
-    if before.covariance is not None:
-        joint[3:, 3:] = before.covariance[3:, 3:]
-    return np.hstack([twists[:, :3], before.twists[:, 3:]]), joint
 
 
 def _to_metres(camera: CameraInfo | None, unit: LinearUnit) -> NDArray[np.float64]:

@@ -38,17 +38,23 @@ MAY_IMPORT = {
     "neurove_core.inertial": "",
     "neurove_core.running": "extras ingest networks engine models",
     "neurove_core.warming": "compiled config geometry ingest networks engine models refine running",
-    "neurove_core.estimator": "geometry ingest networks models io refine running timescales warming",
+    "neurove_core.stream_state": "ingest networks refine timescales",
+    "neurove_core.refined": "ingest refine stream_state",
+    "neurove_core.estimator": (
+        "geometry ingest networks models io refine refined running stream_state timescales warming"
+    ),
     "neurove_core.self_test": "config models estimator",
-    "neurove_core.aided": "estimator inertial",
-    "neurove_core.carried": "spiking networks refine inertial estimator timescales",
+    "neurove_core.aided": "estimator inertial stream_state",
+    "neurove_core.carried": "spiking networks refine inertial stream_state timescales",
     "neurove_core.io": "files extras figures geometry",
     "neurove_core.io.formats": "compiled files extras geometry io",
     "neurove_core.sim": "compiled config figures geometry io io.formats",
     "neurove_core.live": "extras io io.formats",
     "neurove_core.sources": "io io.formats live sim",
     "neurove_core.series": "files io.formats sources tasks",
-    "neurove_core.evaluation": "compiled figures geometry ingest networks models estimator inertial aided io sources",
+    "neurove_core.evaluation": (
+        "compiled figures geometry ingest networks models estimator stream_state inertial aided io sources"
+    ),
     "neurove_core.training": (
         "config files extras figures geometry ingest networks "
         "engine models estimator self_test io io.formats sim sources tasks timescales"
@@ -60,8 +66,8 @@ MAY_IMPORT = {
         "config compiled figures geometry spiking ingest networks engine models refine estimator sim sources"
     ),
     "neurove_core.experiments": (
-        "config files extras figures geometry spiking ingest networks engine models estimator io sim sources "
-        "evaluation training tasks"
+        "config files extras figures geometry spiking ingest networks engine models estimator stream_state io sim "
+        "sources evaluation training tasks"
     ),
     "neurove_core": "spiking models estimator sources",
     # neurove_service
@@ -80,7 +86,7 @@ MAY_IMPORT = {
     "neurove_service.transport": "logs guard desk endpoints",
     "neurove_service.streams": (
         "core:config core:geometry core:ingest core:networks core:models core:estimator "
-        "core:inertial core:aided core:carried logs guard clock_offset"
+        "core:stream_state core:inertial core:aided core:carried logs guard clock_offset"
     ),
     "neurove_service.models": (
         "core:config core:extras core:files core:ingest core:networks core:models core:estimator core:self_test"

@@ -14,9 +14,10 @@ import pytest
 from numpy.typing import NDArray
 
 from neurove_core import models
-from neurove_core.estimator import Estimator, WindowEstimate
+from neurove_core.estimator import Estimator
 from neurove_core.io.packets import slices
 from neurove_core.sources import open_source
+from neurove_core.stream_state import WindowEstimate
 from neurove_protocol import EventPacket, Events, Sensor
 from neurove_protocol.events import encode_packet
 

@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neurove_core.aided import aided
-from neurove_core.estimator import Estimator, StreamState, WindowEstimate
+from neurove_core.estimator import Estimator
 from neurove_core.inertial.state import InertialState, push
 from neurove_core.ingest.windows import Window
 from neurove_core.io.imu_feed import ImuFeed
 from neurove_core.io.packets import Slice, slices
 from neurove_core.io.recording import Recording
 from neurove_core.networks.arrays import ArrayState, State
+from neurove_core.stream_state import StreamState, WindowEstimate
 from neurove_protocol.camera import CameraInfo
 from neurove_protocol.velocity import Source
 

@@ -21,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 
 from neurove_core import models
-from neurove_core.estimator import Estimator, StreamState
+from neurove_core.estimator import Estimator
 from neurove_core.experiments import save_text
 from neurove_core.figures import blank_figure, save_figure
 from neurove_core.ingest.windows import Window, WindowsState, push
@@ -29,6 +29,7 @@ from neurove_core.models.bundle import Bundle, from_bytes
 from neurove_core.sim.simulate import Simulation
 from neurove_core.sim.source import simulation_of
 from neurove_core.spiking.layers import require
+from neurove_core.stream_state import StreamState
 from neurove_core.training.data import true_twists
 from neurove_protocol import Sensor
 

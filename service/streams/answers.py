@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 
-from neurove_core.estimator import WindowEstimate
+from neurove_core.stream_state import WindowEstimate
 from neurove_protocol import CameraInfo, HostTime, Trace, Twist, TwistEstimate
 from neurove_protocol.events import Packet
 from neurove_service.streams.activity import Activity

@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from neurove_core.estimator import WindowEstimate
+from neurove_core.stream_state import WindowEstimate
 from neurove_protocol import CameraInfo, Flag
 from neurove_service.streams.lane import OpenWindow
 

@@ -4,10 +4,11 @@ from collections.abc import Callable
 from typing import Final
 
 from neurove_core.aided import aided
-from neurove_core.estimator import Estimator, WindowEstimate
+from neurove_core.estimator import Estimator
 from neurove_core.inertial import state as inertial
 from neurove_core.inertial.gyro import EXTRAPOLATED_US
 from neurove_core.inertial.state import InertialState, Learned
+from neurove_core.stream_state import WindowEstimate
 from neurove_protocol import CameraInfo
 from neurove_protocol.control import ImuStatus
 from neurove_protocol.errors import InvalidField, NeuroVEError

@@ -7,9 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from neurove_core.carried import Carried
-from neurove_core.estimator import Estimator, StreamState, WindowEstimate
+from neurove_core.estimator import Estimator
 from neurove_core.ingest.windows import Window
 from neurove_core.networks.arrays import ArrayState
+from neurove_core.stream_state import StreamState, WindowEstimate
 from neurove_service.guard import Guard
 from neurove_service.streams.comparison import WindowResult
 from neurove_service.streams.ring import PackedWindow

@@ -2,8 +2,8 @@
 
 from typing import NamedTuple
 
-from neurove_core.estimator import WindowEstimate
 from neurove_core.ingest.windows import Pushed, WindowsState
+from neurove_core.stream_state import WindowEstimate
 from neurove_protocol.events import Packet
 from neurove_service import logs
 from neurove_service.guard import Guard

@@ -15,9 +15,10 @@ import torch
 
 import neurove_core
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from neurove_core.estimator import Estimator, Push, PushResult, StreamState, WindowEstimate
+from neurove_core.estimator import Estimator, Push, PushResult
 from neurove_core.models import bundle
 from neurove_core.models.bundle import Bundle
+from neurove_core.stream_state import StreamState, WindowEstimate
 from neurove_protocol import CameraInfo, Events, Sensor
 from neurove_protocol.errors import BadModel, InvalidField
 from tests.builders import SENSOR, make_events

@@ -9,12 +9,13 @@ import torch
 from pydantic import ValidationError
 
 from neurove_core.config import CanonicalConfig, ModelConfig, NetworkConfig, WindowConfig
-from neurove_core.estimator import Estimator, WindowEstimate
+from neurove_core.estimator import Estimator
 from neurove_core.geometry.camera import lookup_table
 from neurove_core.ingest import windows
 from neurove_core.ingest.windows import Window, WindowsState
 from neurove_core.models import bundle
 from neurove_core.models.bundle import PER_HEIGHT
+from neurove_core.stream_state import WindowEstimate
 from neurove_core.timescales import STEPS, Answer, Longer, chosen, merged, watched
 from neurove_core.training.calibration import collect_errors
 from neurove_core.training.data import Sequences

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
-from neurove_core.estimator import Estimator, WindowEstimate
+from neurove_core.estimator import Estimator
 from neurove_core.io.packets import slices
 from neurove_core.models import find
 from neurove_core.refine.stages import State
 from neurove_core.sim.motion.trajectory import Trajectory, rotation, slider
 from neurove_core.sim.render.camera import named_camera
 from neurove_core.sim.simulate import Simulation, simulate
+from neurove_core.stream_state import WindowEstimate
 
 SECONDS = 1.0
 

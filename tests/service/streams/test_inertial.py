@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from neurove_core import carried
-from neurove_core.estimator import WindowEstimate
+from neurove_core.stream_state import WindowEstimate
 from neurove_protocol import ImuPacket
 from neurove_protocol.events import PacketLimits
 from neurove_protocol.imu import encode_imu
