@@ -247,7 +247,7 @@ def collect_errors(
             counted = np.stack([network_input(seen, bundle.config) for seen, _ in variants], 1)
             spikes = to_spikes(torch.from_numpy(counted), bundle.config.network.encoding)
             state, inputs, outputs = step.network.initial_state(len(variants)), [], []
-            for window in spikes.split(1):
+            for window in torch.split(spikes, 1):
                 output, potential, state = step(window, state)
                 inputs.append(potential)
                 outputs.append(output)
