@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from neurove_core.ingest.sample import Sample
 from neurove_core.refine import ground_kernels as kernels
-from neurove_core.refine import ground_pitch
+from neurove_core.refine import ground_newest, ground_pitch
+from neurove_core.refine.ground_image import FAR_UP, image_of, own_sharpness
 from neurove_core.refine.ground_kernels import Image, Rays
 from neurove_core.refine.ground_search import UNKNOWNS, Prior, climb, motion_of, objective
 from neurove_core.refine.ground_sway import Sway, steady, swayed
@@ -84,14 +85,9 @@ MAX_RATE_SIGMAS: Final = 1.0
 """Greatest distance from an angular velocity that the events of the window gave without the ground."""
 
 _FAR_ASIDE: Final = 0.4  # greatest |x/z| of far events
-_FAR_UP: Final = 0.4  # the same for -y/z
 _FAR_WEIGHT: Final = 0.5  # of a far event; that of one on the ground is its height / depth
 _WALL: Final = 0.15  # inverse distance of a wall, when nothing is known [1/m]
 _WALL_SPAN: Final = (0.02, 0.4)  # bounds of what is learned [1/m]
-_CELLS: Final = 100.0  # cells per focal length, at most one per pixel
-_MARGIN: Final = 0.25  # of the image, on each side, as a share of the sensor's side
-_NARROW, _WIDE = 1.0, 2.0  # smoothings [cells]
-_REACH: Final = 2.5  # of a smoothing [sigma]
 _NEAREST_HORIZON: Final = 0.08  # least height / depth: farther ground is too near to the horizon
 _ASIDE: Final = 2.0  # greatest distance to the side [heights]
 _CROWD: Final = 2  # [cells]
@@ -103,7 +99,6 @@ _SIGMA_SHARE: Final = 0.1  # the same as a share of the speed, above 10 m/s
 _SIGMA_YAW: Final = (0.05, 0.1)  # bounds of the sigma of the yaw rate [rad/s]
 _SIGMA_TILT: Final = (0.02, 0.016, 0.1)  # of the rates of pitch and roll: at rest, growth by the speed, most [rad/s]
 _SIGMA_WALL: Final = 0.1  # of the inverse distance of a wall [1/m]
-_DRAWN: Final = 4 / 9  # mean square of the weights of an event that is drawn into four cells, two axes
 _STEPS: Final = 14  # evaluations of a search
 _TOLERANCE: Final = 0.02  # of a search [sigma]
 _CALIBRATION: Final = np.array([0.6, 0.5, 1.0, 0.42, 0.7, 0.4, 0.7, 0.7, 0.7])  # of sigma
@@ -233,7 +228,7 @@ def refine(
     if max(near, far) < LEAST_EVENTS:
         return Answer("few events", None, state._replace(last=None))
     begin_us = end_us - window_us * len(used)
-    found, unknowns, by_events = _searched(seen, (begin_us + end_us) // 2, camera, twist, sigma_rad_s, state)
+    found, motion, unknowns, by_events = _searched(seen, (begin_us + end_us) // 2, camera, twist, sigma_rad_s, state)
     if found.structure < MIN_STRUCTURE[0] + MIN_STRUCTURE[1] * (found.events / EVENTS) ** 2:
         return Answer("noise", found, state._replace(last=None))
     if found.distance > MAX_SIGMAS or _distance(found, twist, measured) > MAX_RATE_SIGMAS:
@@ -245,13 +240,14 @@ def refine(
         return Answer("turning", found._replace(twist=twist), state._replace(last=None, sway=sway))
     known = ground_pitch.Pitch(state.pitch, state.pitch_sigma)
     pitch, pitch_sigma = ground_pitch.learned(known, by_events, 1 / len(used), PITCH_SIGMA)
-    twist, sway = swayed(found.twist, found.pitch, state.sway, height_m)
+    twist = found.twist if speed < SLOW else _newest_roll(camera, unknowns, found, state, window_us)
+    twist, sway = swayed(twist, found.pitch, state.sway, height_m)
     found, answers = _on_time(found._replace(twist=twist), state.answers, begin_us, end_us, window_us)
     ahead = math.sqrt(found.covariance[2, 2]) / height_m
-    standing = answered(state.standing, end_us, float(np.linalg.norm(unknowns[:3])), ahead)
-    walls = np.clip(np.array(state.walls) + unknowns[7:] / height_m, *_WALL_SPAN)
+    standing = answered(state.standing, end_us, float(np.linalg.norm(motion[:3])), ahead)
+    walls = np.clip(np.array(state.walls) + motion[7:] / height_m, *_WALL_SPAN)
     state = state._replace(
-        last=unknowns[:6],
+        last=motion[:6],
         pitch=pitch,
         pitch_sigma=pitch_sigma,
         walls=(float(walls[0]), float(walls[1])),
@@ -302,7 +298,7 @@ def _kept(new: GroundEvents, pitch: float) -> GroundEvents:
 
 
 def _ahead(events: GroundEvents) -> NDArray[np.bool_]:
-    return (np.abs(events.x) < _FAR_ASIDE) & (events.y > -_FAR_UP)
+    return (np.abs(events.x) < _FAR_ASIDE) & (events.y > -FAR_UP)
 
 
 def _joined(*parts: GroundEvents) -> GroundEvents:
@@ -327,11 +323,10 @@ def on_ground(recent: Sequence[GroundEvents], pitch: float) -> GroundEvents:
 
 def _searched(
     seen: GroundEvents, reference_us: int, camera: CameraInfo, twist: Array, sigma_rad_s: Array, state: GroundState
-) -> tuple[GroundMotion, Array, ground_pitch.Pitch]:
-    """The most probable motion, as a motion (9,) of `sharpness` too, and the pitch for the next window."""
+) -> tuple[GroundMotion, Array, Array, ground_pitch.Pitch]:
+    """The most probable motion, as a motion (9,) of `sharpness` and as unknowns (9,) too, and the pitch it teaches."""
     height_m = camera.height_m or 1.0
-    image = image_of(camera)
-    rays = rays_of(seen, reference_us, state.pitch, image, (state.walls[0] * height_m, state.walls[1] * height_m))
+    rays, image = _rays_of(seen, reference_us, camera, state)
     prior = _prior(twist, height_m, sigma_rad_s, state)
     z, information = _search(rays, image, prior, state.last)
     unknowns = prior.mean + prior.sigma * z
@@ -347,21 +342,27 @@ def _searched(
         pitch=prior.pitch + float(unknowns[6]),
         gain=sharp - before,
         gain_moving=sharp - still,
-        structure=sharp - _own(rays, image),
+        structure=sharp - own_sharpness(rays, image),
         distance=float(np.linalg.norm(z[:6])),
         events=rays.x.size,
     )
-    return found, motion, ground_pitch.by_events(z, information, prior)
+    return found, motion, unknowns, ground_pitch.by_events(z, information, prior)
 
 
-def image_of(camera: CameraInfo) -> Image:
-    """The image of moved events: what the camera sees of the ground and ahead, with a margin."""
-    focal = min(_CELLS, camera.fx)
-    half_x = max(camera.cx, camera.width - camera.cx) / camera.fx * (1 + _MARGIN)
-    half_y = max(camera.cy, camera.height - camera.cy) / camera.fy
-    bottom, top = half_y * (1 + _MARGIN), -min(_FAR_UP, half_y) - 0.1
-    width, height = int(2 * half_x * focal), max(int((bottom - top) * focal), 1) + 1
-    return Image(focal, half_x * focal, -top * focal, width, height, _bell(_NARROW), _bell(_WIDE))
+def _newest_roll(camera: CameraInfo, unknowns: Array, found: GroundMotion, state: GroundState, window_us: int) -> Array:
+    """The twist of a search (6,) with the roll rate of the newest events, see `ground_newest`."""
+    used = state.recent[-_windows(ground_newest.NEWEST_US, window_us) :]
+    assert state.end_us is not None  # there is a window
+    rays, image = _rays_of(on_ground(used, state.pitch), state.end_us - window_us * len(used) // 2, camera, state)
+    newest_rad_s = ground_newest.rates(rays, image, unknowns, state.pitch, camera.height_m or 1.0)
+    return ground_newest.with_roll(found.twist, newest_rad_s, found.pitch)
+
+
+def _rays_of(seen: GroundEvents, reference_us: int, camera: CameraInfo, state: GroundState) -> tuple[Rays, Image]:
+    """Some events before the walls that are known, and the image that they are moved into."""
+    height_m, image = camera.height_m or 1.0, image_of(camera)
+    walls = state.walls[0] * height_m, state.walls[1] * height_m
+    return rays_of(seen, reference_us, state.pitch, image, walls), image
 
 
 def rays_of(
@@ -393,18 +394,6 @@ def rays_of(
         time=(seen.t_us - reference_us) / 1e6,
         weight=weight,
     )
-
-
-def _bell(sigma: float) -> NDArray[np.float32]:
-    reach = math.ceil(_REACH * sigma)
-    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
-    return np.asarray(weights / weights.sum(), np.float32)
-
-
-def _own(rays: Rays, image: Image) -> float:
-    """The logarithm of the part of the sharpness that each event has by itself."""
-    middle = (float(kernel[kernel.size // 2]) ** 2 for kernel in (image.narrow, image.wide))
-    return math.log(float((rays.weight**2).sum()) * (next(middle) - next(middle)) * _DRAWN)
 
 
 def _prior(twist: Array, height_m: float, sigma_rad_s: Array, state: GroundState) -> Prior:

@@ -1,9 +1,9 @@
 """Pitch and roll rates of a vehicle, from those that the events of some windows show.
 
 The tilt of a vehicle stays bounded, so its rates of pitch and roll have no mean: a slow mean is an error, as of the
-distance of what the camera sees, and most of it is taken out. Both rates are then drawn towards zero, by the share of
-their power that is noise (a Wiener filter whose power of the signal is learned), but not below PITCH_KEPT and
-ROLL_KEPT. The errors grow with the speed.
+distance of what the camera sees, and most of it is taken out. That of the roll rate is slower. Both rates are then
+drawn towards zero, by the share of their power that is noise (a Wiener filter whose power of the signal is learned),
+but not below PITCH_KEPT and ROLL_KEPT. The errors grow with the speed.
 
 A camera that moves many heights in a second shows its yaw rate too fast, by TOO_FAST_S.
 
@@ -37,8 +37,9 @@ on own drives with the camera at 0.3 to 2.4 m; its cause is not known, see decis
 MOST_TOO_FAST: Final = 0.2
 """Greatest share that is taken out."""
 
-_MEAN_SHARE: Final = 0.2  # of a new window in the means of the rates
-_MEAN_TAKEN: Final = 0.85  # share of the mean that is taken out
+_PITCH_MEAN_SHARE: Final = 0.2  # of a new window in the mean of the rate
+_ROLL_MEAN_SHARE: Final = 0.03
+_MEAN_TAKEN: Final = 0.85  # share of the means that is taken out
 _POWER_SHARE: Final = 0.05  # of a new window in the power
 
 
@@ -68,8 +69,8 @@ def swayed(twist: Array, pitch: float, sway: Sway, height_m: float = math.inf) -
     swing = pitching - share * _MEAN_TAKEN * sway.pitch_mean
     roll = rolling - share * _MEAN_TAKEN * sway.roll_mean
     found = Sway(
-        sway.pitch_mean + _MEAN_SHARE * (pitching - sway.pitch_mean),
-        sway.roll_mean + _MEAN_SHARE * (rolling - sway.roll_mean),
+        sway.pitch_mean + _PITCH_MEAN_SHARE * (pitching - sway.pitch_mean),
+        sway.roll_mean + _ROLL_MEAN_SHARE * (rolling - sway.roll_mean),
         sway.pitch_power + _POWER_SHARE * (swing**2 - sway.pitch_power),
         sway.roll_power + _POWER_SHARE * (roll**2 - sway.roll_power),
     )

@@ -34,7 +34,7 @@ def filtered(
 
 
 def test_constant_rates_of_pitch_and_roll_are_errors_and_yaw_stays() -> None:
-    found = filtered(np.full(60, 0.05), np.full(60, -0.05))
+    found = filtered(np.full(200, 0.05), np.full(200, -0.05))
     assert np.abs(found[-1, [0, 2]]).max() < 0.01
     np.testing.assert_allclose(found[:, 1], 0.4, atol=1e-12)
 
