@@ -240,7 +240,9 @@ def refine(
         return Answer("turning", found._replace(twist=twist), state._replace(last=None, sway=sway))
     known = ground_pitch.Pitch(state.pitch, state.pitch_sigma)
     pitch, pitch_sigma = ground_pitch.learned(known, by_events, 1 / len(used), PITCH_SIGMA)
-    twist = found.twist if speed < SLOW else _newest_roll(camera, unknowns, found, state, window_us)
+    twist = found.twist
+    if speed >= SLOW and np.linalg.norm(twist[:3]) > ground_newest.FROM_M_S:
+        twist = _newest_roll(camera, unknowns, found, state, window_us)
     twist, sway = swayed(twist, found.pitch, state.sway, height_m)
     found, answers = _on_time(found._replace(twist=twist), state.answers, begin_us, end_us, window_us)
     ahead = math.sqrt(found.covariance[2, 2]) / height_m

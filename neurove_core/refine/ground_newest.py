@@ -21,6 +21,12 @@ Array = NDArray[np.float64]
 NEWEST_US: Final = 100_000
 """Time whose events are used. They are as many as those of a whole span: with half of them nothing is gained."""
 
+FROM_M_S: Final = 1.0
+"""Up to this speed the roll rate is that of the span: it is small there, and that of a short time has more noise."""
+
+FULL_M_S: Final = 4.0
+"""From this speed on it is that of the newest events alone; linear between."""
+
 WEIGHT: Final = 0.03
 """Weight of the distance from the motion of the span. That of a search counts .02, for twice the time."""
 
@@ -51,10 +57,12 @@ def rates(rays: Rays, image: Image, unknowns: Array, pitch: float, height_m: flo
 
 
 def with_roll(twist: Array, newest_rad_s: Array, pitch: float) -> Array:
-    """A twist (6,) with the roll rate of an angular velocity (3,), about the axis ahead along the ground.
+    """A twist (6,) with the roll rate of an angular velocity (3,), as far as its speed asks for it, see FULL_M_S.
 
-    Its yaw rate about the normal of the ground stays. `pitch` is that of the camera against the ground [rad].
+    The roll is about the axis ahead along the ground; the yaw rate about the normal of the ground stays. `pitch` is
+    that of the camera against the ground [rad].
     """
     c, s = math.cos(pitch), math.sin(pitch)
-    yaw, roll = c * twist[4] + s * twist[5], c * newest_rad_s[2] - s * newest_rad_s[1]
-    return np.array([*twist[:4], c * yaw - s * roll, s * yaw + c * roll])
+    share = min(max((float(np.linalg.norm(twist[:3])) - FROM_M_S) / (FULL_M_S - FROM_M_S), 0.0), 1.0)
+    more = share * ((c * newest_rad_s[2] - s * newest_rad_s[1]) - (c * twist[5] - s * twist[4]))
+    return np.array([*twist[:4], twist[4] - s * more, twist[5] + c * more])

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from neurove_core.refine.ground import PITCH, GroundEvents, GroundState, image_of, rays_of, refine
-from neurove_core.refine.ground_newest import rates, with_roll
+from neurove_core.refine.ground_newest import FROM_M_S, FULL_M_S, rates, with_roll
 from neurove_protocol import CameraInfo
 
 Array = NDArray[np.float64]
@@ -43,14 +43,20 @@ def seen(twist: Array, start_us: int, reference_us: int, seed: int) -> GroundEve
     return GroundEvents(*columns, t_us[inside])
 
 
-@pytest.mark.parametrize("roll", [-0.05, 0.0, 0.05])
-def test_one_step_from_a_motion_without_roll_finds_the_roll_rate(roll: float) -> None:
-    parts = [seen(moving(roll, 0.2), start_us, WINDOW_US, 1) for start_us in (0, WINDOW_US)]
+def stepped(roll_rad_s: float) -> float:
+    """The roll rate of one step, from a motion without roll."""
+    parts = [seen(moving(roll_rad_s, 0.2), start_us, WINDOW_US, 1) for start_us in (0, WINDOW_US)]
     events = GroundEvents(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
     image = image_of(CAMERA)
     unknowns = np.array([0.0, 0.0, SPEED_M_S, *0.2 * UP, 0.0, 0.0, 0.0])
-    found = rates(rays_of(events, WINDOW_US, PITCH, image), image, unknowns, PITCH, 1.0)
-    assert found @ AHEAD == pytest.approx(roll, abs=0.012)
+    return float(rates(rays_of(events, WINDOW_US, PITCH, image), image, unknowns, PITCH, 1.0) @ AHEAD)
+
+
+def test_one_step_goes_towards_the_roll_rate() -> None:
+    left, straight, right = (stepped(roll) for roll in (-0.05, 0.0, 0.05))
+    assert abs(straight) < 0.012
+    assert -0.06 < left < straight - 0.015
+    assert straight + 0.015 < right < 0.06
 
 
 @pytest.mark.parametrize("roll", [-0.06, 0.06])
@@ -69,10 +75,14 @@ def test_an_answer_has_the_roll_rate_of_the_newest_windows(roll: float) -> None:
     assert found.motion.twist[3:] @ AHEAD * np.sign(roll) > 0.02
 
 
-def test_another_roll_rate_changes_neither_velocity_nor_pitch_nor_yaw_rate() -> None:
+@pytest.mark.parametrize(
+    ("speed_m_s", "share"),
+    [(0.0, 0.0), (FROM_M_S, 0.0), ((FROM_M_S + FULL_M_S) / 2, 0.5), (FULL_M_S, 1.0), (12.0, 1.0)],
+)
+def test_another_roll_rate_changes_neither_velocity_nor_pitch_nor_yaw_rate(speed_m_s: float, share: float) -> None:
     rng = np.random.default_rng(2)
-    twist, newest = rng.normal(size=6), rng.normal(size=3)
+    twist, newest = np.concatenate([speed_m_s * AHEAD, rng.normal(size=3)]), rng.normal(size=3)
     found = with_roll(twist, newest, PITCH)
     np.testing.assert_array_equal(found[:4], twist[:4])
     assert found[3:] @ UP == pytest.approx(twist[3:] @ UP)
-    assert found[3:] @ AHEAD == pytest.approx(newest @ AHEAD)
+    assert found[3:] @ AHEAD == pytest.approx((1 - share) * twist[3:] @ AHEAD + share * newest @ AHEAD)
