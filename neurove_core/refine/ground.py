@@ -27,7 +27,7 @@ from neurove_core.refine import ground_kernels as kernels
 from neurove_core.refine import ground_newest, ground_pitch
 from neurove_core.refine.ground_image import FAR_UP, image_of, own_sharpness
 from neurove_core.refine.ground_kernels import Image, Rays
-from neurove_core.refine.ground_search import UNKNOWNS, Prior, climb, motion_of, objective
+from neurove_core.refine.ground_search import UNKNOWNS, Climbed, Prior, climb, motion_of, objective
 from neurove_core.refine.ground_sway import Sway, steady, swayed
 from neurove_core.refine.late import ANSWERS, Answers, change
 from neurove_core.refine.standing import Standing, answered, outweighs
@@ -330,14 +330,16 @@ def _searched(
     height_m = camera.height_m or 1.0
     rays, image = _rays_of(seen, reference_us, camera, state)
     prior = _prior(twist, height_m, sigma_rad_s, state)
-    z, information = _search(rays, image, prior, state.last)
+    climbed = _search(rays, image, prior, state.last)
+    z, information = climbed.z, climbed.information
     unknowns = prior.mean + prior.sigma * z
     motion = motion_of(unknowns, prior.pitch)
     covariance = _covariance(z, information, prior)
     metres = np.array([height_m] * 3 + [1.0] * 3)
     known = motion_of(np.append(prior.mean[:6], motion[6:]), prior.pitch)
     turning = np.concatenate([np.zeros(3), motion[3:]])
-    sharp, before, still = (kernels.sharpness(rays, one, image)[0] for one in (motion, known, turning))
+    sharp = climbed.value + 0.5 * prior.weight * float(z @ z)
+    before, still = (kernels.sharpness(rays, one, image)[0] for one in (known, turning))
     found = GroundMotion(
         twist=motion[:6] * metres,
         covariance=covariance[:6, :6] * np.outer(metres, metres),
@@ -412,8 +414,8 @@ def _prior(twist: Array, height_m: float, sigma_rad_s: Array, state: GroundState
     return Prior(mean, np.array(sigma), _WEIGHT, state.pitch)
 
 
-def _search(rays: Rays, image: Image, prior: Prior, last: Array | None) -> tuple[Array, Array]:
-    """The most probable distance from the prior's mean (9,) [sigma], and what the events say of it, see `climb`."""
+def _search(rays: Rays, image: Image, prior: Prior, last: Array | None) -> Climbed:
+    """The most probable distance from the prior's mean, and what the events say of it."""
     resting = np.concatenate([np.zeros(3), prior.mean[3:]])
     starts = [np.zeros(UNKNOWNS), (resting - prior.mean) / prior.sigma]
     if last is not None:
@@ -421,8 +423,7 @@ def _search(rays: Rays, image: Image, prior: Prior, last: Array | None) -> tuple
         along = np.array([last[0], c * last[1] + s * last[2], c * last[2] - s * last[1], *last[3:], 0.0, 0.0, 0.0])
         starts.append((along - prior.mean) / prior.sigma)
     values = [objective(start, rays, image, prior)[0] for start in starts]
-    found = climb(starts[int(np.argmax(values))], rays, image, prior, _STEPS, _TOLERANCE)
-    return found.z, found.information
+    return climb(starts[int(np.argmax(values))], rays, image, prior, _STEPS, _TOLERANCE)
 
 
 def _covariance(z: Array, information: Array, prior: Prior) -> Array:
