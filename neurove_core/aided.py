@@ -25,7 +25,7 @@ def aided(
             estimate.start_us,
             estimate.end_us,
             estimate.twists,
-            estimate.covariance,
+            estimate.covariance if estimate.compared is None else estimate.compared,
             estimate.low_activity,
             refined=estimate.source == "refined",
             scale_m=height_m or 1.0,
@@ -36,10 +36,15 @@ def aided(
     disagrees = state.disagrees
     if not found.used:
         return estimate._replace(gyro_disagrees=disagrees), state
-    uncertain = found.covariance is not None and estimator.is_uncertain(found.twists, found.covariance)
+    covariance = found.covariance
+    if covariance is not None and estimate.covariance is not None and not found.resting:
+        covariance = covariance.copy()
+        covariance[:3, :3] = estimate.covariance[:3, :3]
+    uncertain = covariance is not None and estimator.is_uncertain(found.twists, covariance)
     aided_estimate = estimate._replace(
         twists=found.twists,
-        covariance=found.covariance,
+        covariance=covariance,
+        compared=None,
         uncertain=uncertain,
         source="gyro",
         gyro_disagrees=disagrees,

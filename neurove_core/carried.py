@@ -19,9 +19,11 @@ from neurove_core.networks.arrays import ArrayState
 from neurove_core.refine.ground import GroundEvents, GroundState
 from neurove_core.refine.ground_sway import Sway
 from neurove_core.refine.rotation import Filter
+from neurove_core.refine.scatter import Scatter
 from neurove_core.refine.scene import Scene
 from neurove_core.refine.stages import State as Stages
 from neurove_core.refine.standing import Standing
+from neurove_core.refine.trembling import Trembling
 from neurove_core.stream_state import StreamState
 from neurove_core.timescales import Longer
 from neurove_protocol.errors import InvalidField, NeuroVEError
@@ -32,7 +34,7 @@ MAX_BYTES: Final = 32 << 20
 _KINDS: Final[dict[str, Any]] = {
     kind.__name__: kind
     for kind in (
-        *(ArrayState, Filter, GroundEvents, GroundState, Longer, Scene, Stages, Standing, Sway),
+        *(ArrayState, Filter, GroundEvents, GroundState, Longer, Scatter, Scene, Stages, Standing, Sway, Trembling),
         *(Agreement, Bias, Learned, Tilt, Track),
     )
 }

@@ -7,7 +7,7 @@ from neurove_core.ingest.windows import Window
 from neurove_core.refine import errors, ground, standing
 from neurove_core.refine import stages as refining
 from neurove_core.refine.ground import GroundState
-from neurove_core.refine.rotation import Given, Rate
+from neurove_core.refine.rotation import Given, Rate, with_rate
 from neurove_core.refine.rotation import Refined as RotationFound
 from neurove_core.stream_state import StreamState, WindowEstimate
 
@@ -58,7 +58,7 @@ def _turned(estimate: WindowEstimate, found: RotationFound, velocity: refining.V
     """The estimate with the angular part of the refinement, and the linear one if it has one, where it is accepted."""
     if estimate.covariance is None or found.outcome != "accepted":
         return estimate
-    twists, covariance = _with_rate(estimate.twists, estimate.covariance, found.rate, found.change_rad_s)
+    twists, covariance = with_rate(estimate.twists, estimate.covariance, found.rate, found.change_rad_s)
     if velocity is not None:
         twists[:, :3], covariance[:3, :3] = velocity
     return estimate._replace(twists=twists, covariance=covariance, source="refined")
@@ -68,14 +68,17 @@ def _with_errors(estimate: WindowEstimate, found: refining.Stages, height_m: flo
     """An estimate without the ground, with the terms of `refine.errors`, and less of a speed that is not seen."""
     if estimate.covariance is None:
         return estimate
-    twists, covariance, turn = estimate.twists, estimate.covariance.copy(), found.turn
+    twists, covariance, turn, compared = estimate.twists, estimate.covariance.copy(), found.turn, None
     if turn.errors is not None:
         covariance[3:, 3:] = (turn.errors + turn.errors.T) / 2
     if found.velocity is None:
         twists = standing.towards_zero(twists, estimate.covariance)
         rate_rad_s = float(np.linalg.norm(twists.mean(axis=0)[3:]))
         covariance = errors.of_unknown_depth(covariance, turn.shift, rate_rad_s, height_m)
-    return estimate._replace(twists=twists, covariance=covariance)
+    if turn.outcome == "accepted":
+        compared, covariance = covariance, covariance.copy()
+        covariance[3:, 3:] = found.state.trembled(covariance[3:, 3:], assumed=turn.errors is not None)
+    return estimate._replace(twists=twists, covariance=covariance, compared=compared)
 
 
 def _over_ground(
@@ -115,31 +118,26 @@ def _over_ground(
     twists = np.tile(twist, (len(estimate.twists), 1))
     if answer.outcome == "turning":
         rate = Rate(twist[3:], covariance[3:, 3:])
-        twists, covariance = _with_rate(estimate.twists, estimate.covariance, rate, np.zeros(3))
+        twists, covariance = with_rate(estimate.twists, estimate.covariance, rate, np.zeros(3))
     if state.stages.is_free:
-        twists, covariance = _without_rate(twists, covariance, _with_errors(estimate, found, height_m))
-    return estimate._replace(twists=twists, covariance=covariance, source="refined"), state
+        return _without_rate(twists, covariance, _with_errors(estimate, found, height_m)), state
+    estimate = estimate._replace(twists=twists, covariance=covariance, source="refined")
+    if answer.outcome == "turning":
+        return estimate, state
+    span_us = estimate.start_us, estimate.end_us
+    narrower, stages = state.stages.narrowed(covariance, twist, span_us, state.camera)
+    return estimate._replace(covariance=narrower, compared=covariance), state._replace(stages=stages)
 
 
 def _without_rate(
     twists: NDArray[np.float64], covariance: NDArray[np.float64], before: WindowEstimate
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> WindowEstimate:
     """The linear part of a motion over the ground, with the angular part of the estimate before it."""
-    joint = covariance.copy()
-    joint[:3, 3:], joint[3:, :3] = 0.0, 0.0
-    if before.covariance is not None:
-        joint[3:, 3:] = before.covariance[3:, 3:]
-    return np.hstack([twists[:, :3], before.twists[:, 3:]]), joint
-
-
-def _with_rate(
-    twists: NDArray[np.float64], covariance: NDArray[np.float64], rate: Rate, change_rad_s: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Twists (n, 6) and covariance (6, 6) with another angular part, which does not correlate with the linear part.
-
-    The angular part changes by `change_rad_s` (3,) within the window.
-    """
-    twists, joint = twists.copy(), np.zeros((6, 6))
-    twists[:, 3:] = rate.w_rad_s + np.outer((np.arange(len(twists)) + 0.5) / len(twists) - 0.5, change_rad_s)
-    joint[:3, :3], joint[3:, 3:] = covariance[:3, :3], (rate.covariance + rate.covariance.T) / 2
-    return twists, joint
+    joint = [covariance.copy(), covariance.copy()]
+    for one, angular in zip(joint, (before.covariance, before.compared), strict=True):
+        one[:3, 3:], one[3:, :3] = 0.0, 0.0
+        if angular is not None:
+            one[3:, 3:] = angular[3:, 3:]
+    twists = np.hstack([twists[:, :3], before.twists[:, 3:]])
+    compared = None if before.compared is None else joint[1]
+    return before._replace(twists=twists, covariance=joint[0], compared=compared, source="refined")

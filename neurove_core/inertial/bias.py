@@ -14,9 +14,13 @@ DRIFT_RAD_S: Final = 1e-4
 FLOOR_RAD_S: Final = 5e-4
 """Standard deviation that no number of samples falls below."""
 
-MOTION_SHARE: Final = 0.45
-"""Share of sigma of a bias that motion has taught well: the filter counts a window as a tenth of a measurement, and
-expects worse events than those that it gets. Measured on own drives, see decision 169."""
+MOTION_SHARE: Final = np.array([0.45, 0.25, 0.15])
+"""Share of sigma of a bias that motion has taught well, for the rates of pitch, yaw and roll: the filter counts a
+window as a tenth of a measurement, and expects worse events than those that it gets. Measured on own drives, see
+decisions 169 and 178."""
+
+REST_RAD_S: Final = 0.001
+"""Standard deviation of the turning of a camera that rest is taken for: a vehicle that stops still settles."""
 
 NOISE_RAD_S: Final = 0.004
 """Standard deviation of one sample before the first rest."""
@@ -47,8 +51,8 @@ class Bias(NamedTuple):
         """Variance (3,) of the error of `mean_rad_s` at a time [us]; that of the filter is larger, see MOTION_SHARE."""
         variance = self.variance_at(t_us)
         if self.rested:
-            return variance
-        share = MOTION_SHARE + (1 - MOTION_SHARE) * (variance / UNKNOWN_RAD_S**2)
+            return variance + REST_RAD_S**2
+        share = MOTION_SHARE + (1 - MOTION_SHARE) * np.square(variance / UNKNOWN_RAD_S**2)
         return np.asarray(variance * share**2)
 
 

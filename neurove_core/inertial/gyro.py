@@ -27,6 +27,12 @@ SCALE: Final = 0.01
 MOUNTING_RAD: Final = 0.03
 """Standard deviation of the mounting about each axis, if the driver gives no calibrated one."""
 
+LEAST_NOISE_RAD_S: Final = 0.001
+"""Least noise of a sample: a unit that filters its samples shows less by their differences than it has."""
+
+LEAST_OF_BIN_RAD_S: Final = 0.0004
+"""The same of a bin: the noise of such a unit does not shrink with the number of its samples."""
+
 Array = NDArray[np.float64]
 
 
@@ -37,6 +43,14 @@ class Rates(NamedTuple):
     variance: Array  # (3,) of each of them, without the variance of the bias [(rad/s)^2]
     samples: int  # in the window
     extrapolated_us: int  # time after the last sample
+    noise_variance: float = 0.0  # the part of `variance` that is the noise of the samples
+
+
+class Smooth(NamedTuple):
+    """The rates of the bins of one window with less noise."""
+
+    gyro_rad_s: Array  # (n, 3)
+    variance: Array  # (3,) of each of them, without the variance of the bias [(rad/s)^2]
 
 
 def rates(samples: Imu, edges_us: NDArray[np.int64], noise_rad_s: float) -> Rates | None:
@@ -61,31 +75,36 @@ def rates(samples: Imu, edges_us: NDArray[np.int64], noise_rad_s: float) -> Rate
     inside = int(samples.t.searchsorted(end_us)) - int(samples.t.searchsorted(start_us))
     bins = edges_us.size - 1
     bin_us = (end_us - start_us) / bins
-    variance = np.full(3, noise_rad_s**2 / max(1.0, inside / bins))
+    noise_variance = noise_rad_s**2 / max(1.0, inside / bins)
+    variance = np.full(3, noise_variance)
     longest_us = float(gaps_us.max())
     variance += (ACCELERATION_RAD_S2 * longest_us**2 / bin_us * 1e-6 / 8) ** 2
     variance += (ACCELERATION_RAD_S2 * extrapolated_us * min(1.0, extrapolated_us / bin_us) * 1e-6 / 2) ** 2
     mean_square = (means**2).mean(0)
     variance += SCALE**2 * mean_square + MOUNTING_RAD**2 * (mean_square.sum() - mean_square)
-    return Rates(means, variance, inside, extrapolated_us)
+    return Rates(means, variance, inside, extrapolated_us, noise_variance)
 
 
-def smooth_rates(samples: Imu, edges_us: NDArray[np.int64], found: Rates) -> Array:
-    """The rates (n, 3) with less noise, where the samples of an equal time before the bins are at hand; see `smooth`.
+def smooth_rates(samples: Imu, edges_us: NDArray[np.int64], found: Rates, *, rested: bool = False) -> Smooth:
+    """The rates with less noise, where the samples of an equal time before the bins are at hand; see `smooth`.
 
     Args:
         samples: see `rates`.
         edges_us: (n + 1,) the bins [us].
         found: the rates of these bins.
+        rested: whether their noise is what rest has shown; otherwise the samples show it while they move.
     """
     bins, start_us = edges_us.size - 1, int(edges_us[0])
     earlier_us = start_us - (edges_us[:0:-1] - start_us)
     longer = rates(samples, np.concatenate([earlier_us, edges_us]), 0.0)
     if longer is None or samples.t[0] > earlier_us[0] or not longer.samples:
-        return found.gyro_rad_s
+        return Smooth(found.gyro_rad_s, found.variance)
     first, stop = (int(samples.t.searchsorted(t_us)) for t_us in (earlier_us[0], edges_us[-1]))
-    variance = smooth.noise_of(samples.span(first, stop)) ** 2 / max(1.0, longer.samples / (2 * bins))
-    return smooth.smoothed(longer.gyro_rad_s, variance)[bins:]
+    noise_rad_s, of_bin = smooth.noise_of(samples.span(first, stop)), max(1.0, longer.samples / (2 * bins))
+    less = smooth.smoothed(longer.gyro_rad_s, noise_rad_s**2 / of_bin)
+    before = found.noise_variance if rested or not noise_rad_s else max(noise_rad_s, LEAST_NOISE_RAD_S) ** 2 / of_bin
+    left = max(before * float(less.left[bins:].mean()), LEAST_OF_BIN_RAD_S**2)
+    return Smooth(less.rates_rad_s[bins:], found.variance - found.noise_variance + left)
 
 
 def turned(samples: Imu, at_us: NDArray[np.int64]) -> Array:

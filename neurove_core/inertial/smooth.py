@@ -3,7 +3,7 @@
 Source: James and Stein, Estimation with quadratic loss (1961), with the positive part; here towards a polynomial.
 """
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,13 @@ _FEWEST: Final = 10  # samples that show the noise
 Array = NDArray[np.float64]
 
 
+class Smoothed(NamedTuple):
+    """Rates of bins in a row with less noise."""
+
+    rates_rad_s: Array  # (n, 3)
+    left: Array  # (n,) the share of the variance of their noise that is left
+
+
 def noise_of(samples: Imu) -> float:
     """Standard deviation of the noise of one sample, without the motion [rad/s]; 0 for fewer than 10 samples.
 
@@ -30,7 +37,7 @@ def noise_of(samples: Imu) -> float:
     return float(np.median(np.abs(np.diff(samples.gyro_rad_s, 2, axis=0))) / _SECOND_DIFFERENCE)
 
 
-def smoothed(rates_rad_s: Array, variance: float) -> Array:
+def smoothed(rates_rad_s: Array, variance: float) -> Smoothed:
     """Rates of bins in a row, with less noise.
 
     A polynomial in time stays. The rest shrinks by max(0, 1 - (p - 2) variance / its square), with its number p of
@@ -43,10 +50,11 @@ def smoothed(rates_rad_s: Array, variance: float) -> Array:
     n = len(rates_rad_s)
     free = rates_rad_s.shape[1] * (n - DEGREE - 1)
     if free <= 2:
-        return rates_rad_s
+        return Smoothed(rates_rad_s, np.ones(n))
     basis, _ = np.linalg.qr(np.vander(np.linspace(-1, 1, n), DEGREE + 1))
     smooth = basis @ (basis.T @ rates_rad_s)
     rest = rates_rad_s - smooth
     square = float((rest**2).sum())
     kept = max(0.0, 1 - (free - 2) * variance / square) if square > 0 else 0.0
-    return np.asarray(smooth + kept * rest)
+    left = np.square(basis).sum(axis=1)
+    return Smoothed(np.asarray(smooth + kept * rest), np.asarray(left + kept * (1 - left)))

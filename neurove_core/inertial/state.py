@@ -144,12 +144,13 @@ def aid(state: InertialState, window: Window) -> tuple[Aided, InertialState]:
         return Aided(window.twists, window.covariance, used=False, resting=False), state
     state = _learned_in_motion(state, window, known, found)
     twists = window.twists.copy()
-    twists[:, 3:] = gyro.smooth_rates(known, edges_us, found) - state.bias.mean_rad_s
+    smooth = gyro.smooth_rates(known, edges_us, found, rested=state.bias.rested)
+    twists[:, 3:] = smooth.gyro_rad_s - state.bias.mean_rad_s
     covariance = window.covariance
     if covariance is not None:
         covariance = covariance.copy()
         covariance[3:] = covariance[:, 3:] = 0.0
-        covariance[range(3, 6), range(3, 6)] = found.variance + state.bias.error_variance_at(window.end_us)
+        covariance[range(3, 6), range(3, 6)] = smooth.variance + state.bias.error_variance_at(window.end_us)
     return Aided(twists, covariance, used=True, resting=False), state
 
 

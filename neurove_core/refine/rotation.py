@@ -266,6 +266,17 @@ def _honest(motion: Array, covariance: Array, before: Filter | None) -> Array:
     return covariance[:3, :3] * np.outer(scale, scale) + np.diag(more * np.array([1.0, 1.0, _ROLL_SHARE**2]))
 
 
+def with_rate(twists: Array, covariance: Array, rate: Rate, change_rad_s: Array) -> tuple[Array, Array]:
+    """Twists (n, 6) and covariance (6, 6) with another angular part, which does not correlate with the linear part.
+
+    The angular part changes by `change_rad_s` (3,) within the window.
+    """
+    twists, joint = twists.copy(), np.zeros((6, 6))
+    twists[:, 3:] = rate.w_rad_s + np.outer((np.arange(len(twists)) + 0.5) / len(twists) - 0.5, change_rad_s)
+    joint[:3, :3], joint[3:, 3:] = covariance[:3, :3], (rate.covariance + rate.covariance.T) / 2
+    return twists, joint
+
+
 def spread(rays: Rays, grid: Grid) -> float:
     """Effective share of 16 x 16 tiles of the image that hold the events."""
     column = ((rays.x - grid.left) * (16 * grid.focal / grid.width)).astype(np.int64).clip(0, 15)

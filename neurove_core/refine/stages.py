@@ -14,11 +14,14 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from neurove_core.refine import errors, rotation, scene, search, vehicle
+from neurove_core.refine import errors, rotation, scatter, scene, search, trembling, vehicle
 from neurove_core.refine.alignment import Grid
 from neurove_core.refine.ground import Outcome
 from neurove_core.refine.rotation import MAX_AGAINST, MIN_SPREAD, Filter, Given, Rate, Refined, drives, floored, spread
+from neurove_core.refine.scatter import Scatter
 from neurove_core.refine.scene import Moved, Scene
+from neurove_core.refine.trembling import Trembling
+from neurove_protocol import CameraInfo
 
 Array = NDArray[np.float64]
 
@@ -60,6 +63,8 @@ class State(NamedTuple):
     idle: int = PATIENCE  # windows since a motion in the scene was accepted
     again: bool = False  # whether to look at the scene once more before it outweighs a rotation
     odds: float = vehicle.START  # that the camera is on a vehicle, see `vehicle`
+    scatter: Scatter = Scatter()  # of the answers over the ground
+    trembling: Trembling = Trembling()  # of the rates of these stages
 
     @property
     def is_free(self) -> bool:
@@ -75,6 +80,25 @@ class State(NamedTuple):
         """The state after the outcome over the ground of the same window."""
         return self._replace(odds=vehicle.judged(self.odds, outcome))
 
+    def narrowed(
+        self, covariance: Array, twist: Array, span_us: tuple[int, int], camera: CameraInfo
+    ) -> tuple[Array, "State"]:
+        """The covariance of an answer over the ground, narrower where such answers scatter little, and the state after.
+
+        Args:
+            covariance: (6, 6) by `errors.of_ground`.
+            twist: (6,) of the answer [m/s, rad/s].
+            span_us: start and end of its window.
+            camera: its lens.
+        """
+        seen = scatter.answered(self.scatter, twist, *span_us)
+        found = scatter.narrowed(covariance, seen, float(np.linalg.norm(twist[:3])), camera)
+        return found, self._replace(scatter=seen)
+
+    def trembled(self, covariance: Array, *, assumed: bool) -> Array:
+        """The covariance (3, 3) of an accepted rate of these stages, see `trembling.trembled`."""
+        return trembling.trembled(covariance, self.trembling, assumed=assumed)
+
 
 class Stages(NamedTuple):
     """Answer of both stages."""
@@ -87,10 +111,20 @@ class Stages(NamedTuple):
 
 def refine(given: Given, state: State) -> Stages:
     """Refine the motion of a window by its events; `given.before` is not used."""
+    found = _refined(given, state)
+    if found.turn.outcome != "accepted":
+        return found
+    span_us = given.start_us, given.start_us + given.window_us
+    after = trembling.turned(state.trembling, found.turn.rate.w_rad_s, *span_us)
+    return found._replace(state=found.state._replace(trembling=after))
+
+
+def _refined(given: Given, state: State) -> Stages:
     given = given._replace(before=state.filter)
+    kept = State(odds=state.odds, scatter=state.scatter, trembling=state.trembling)
     if given.knows_height and not state.is_free:
         alone = rotation.refine(given)
-        return Stages(alone, None, True, State(alone.filter, odds=state.odds))
+        return Stages(alone, None, True, kept._replace(filter=alone.filter))
     before, turn = state.scene, None
     found = None
     if given.knows_height and before is not None and before.moves and state.idle < PATIENCE:
@@ -105,10 +139,12 @@ def refine(given: Given, state: State) -> Stages:
     if found is not None and moved and not again:
         aside = ASIDE if _is_aside(found) else aside
         turn = _turn(given, found, before)
-        return Stages(turn, _velocity(given, found), aside == 0, State(turn.filter, scene, aside, 0, odds=state.odds))
+        kept = kept._replace(filter=turn.filter, scene=scene, aside=aside, idle=0)
+        return Stages(turn, _velocity(given, found), aside == 0, kept)
     assert turn is not None  # the rotation was searched
     idle = min(state.idle + 1, PATIENCE)
-    return Stages(turn, None, aside == 0, State(turn.filter, scene, aside, idle, again, state.odds))
+    kept = kept._replace(filter=turn.filter, scene=scene, aside=aside, idle=idle, again=again)
+    return Stages(turn, None, aside == 0, kept)
 
 
 def compile_kernels(grid: Grid) -> None:

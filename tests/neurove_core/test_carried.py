@@ -12,7 +12,9 @@ from neurove_core.ingest.windows import Window
 from neurove_core.models import bundle
 from neurove_core.refine import scene
 from neurove_core.refine.rotation import Filter
+from neurove_core.refine.scatter import Scatter
 from neurove_core.refine.stages import State as Stages
+from neurove_core.refine.trembling import Trembling
 from neurove_protocol import Sensor
 from neurove_protocol.errors import NeuroVEError
 from tests.bundles import CONFIG, make_bundle
@@ -52,14 +54,19 @@ def test_the_state_of_the_refinement_goes_along():
     size = 6 + scene.COLUMNS * scene.ROWS
     moving = scene.Scene(np.arange(float(size)), np.eye(size), 2_000_000, seen=True, moves=7)
     turning = Filter(np.arange(6.0), np.eye(6), 2_000_000, 1)
-    state = state._replace(stages=Stages(turning, moving, aside=12, idle=2, again=True, odds=-2.5))
+    scattered = Scatter(np.arange(18.0).reshape(3, 6), np.arange(6.0), 7, 2_000_000)
+    trembling = Trembling(np.arange(6.0).reshape(2, 3), np.arange(3.0), 5, 2_000_000)
+    state = state._replace(stages=Stages(turning, moving, 12, 2, True, -2.5, scattered, trembling))
     got = carried.decode(carried.encode(state), state).stages
     assert (got.aside, got.idle, got.again, got.odds, got.scene.seen, got.scene.moves) == (12, 2, True, -2.5, True, 7)
     assert (got.filter.end_us, got.filter.against, got.scene.end_us) == (2_000_000, 1, 2_000_000)
     for one, two in zip(
-        (got.filter.motion, got.scene.mean, got.scene.covariance), (turning.motion, *moving), strict=False
+        (*got.scatter[:2], *got.trembling[:2], got.filter.motion, got.scene.mean, got.scene.covariance),
+        (*scattered[:2], *trembling[:2], turning.motion, *moving),
+        strict=False,
     ):
         assert one.tobytes() == two.tobytes()
+    assert (got.scatter[2:], got.trembling[2:]) == (scattered[2:], trembling[2:])
 
 
 def test_every_truncation_and_the_state_of_another_model_are_refused():

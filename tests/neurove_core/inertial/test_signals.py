@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neurove_core.inertial import bias, buffer, gyro, rest
-from neurove_core.inertial.bias import UNKNOWN_RAD_S, Bias
+from neurove_core.inertial.bias import REST_RAD_S, UNKNOWN_RAD_S, Bias
 from neurove_protocol import Imu
 from tests.neurove_core.inertial import units
 
@@ -125,13 +125,14 @@ def test_the_bias_is_unknown_before_a_rest_and_less_certain_long_after():
     assert sigmas[0] < 0.001 < sigmas[1] * 2 < sigmas[2] == pytest.approx(UNKNOWN_RAD_S)
 
 
-def test_the_error_of_a_bias_that_motion_taught_is_smaller_than_the_filter_says_and_that_of_others_is_not():
+def test_the_error_of_a_bias_that_motion_taught_is_smaller_than_the_filter_says_and_of_a_rested_one_larger():
     unknown, taught = Bias(), Bias(variance=np.full(3, 0.01**2), at_us=0)
     np.testing.assert_allclose(unknown.error_variance_at(0), UNKNOWN_RAD_S**2)
     assert (taught.error_variance_at(0) < 0.5 * taught.variance_at(0)).all()
+    assert (np.diff(taught.error_variance_at(0)) < 0).all()  # pitch, yaw, roll
     assert (taught.error_variance_at(0) < taught.error_variance_at(10**9)).all()
     rested = taught._replace(rested=True)
-    np.testing.assert_array_equal(rested.error_variance_at(0), rested.variance_at(0))
+    np.testing.assert_allclose(rested.error_variance_at(0), rested.variance_at(0) + REST_RAD_S**2)
 
 
 def test_more_time_at_rest_makes_the_bias_more_exact():

@@ -55,6 +55,12 @@ def test_the_ground_gives_a_free_camera_its_velocity_but_no_turning_and_proves_a
     assert [one.vehicle for one in driving] == sorted(one.vehicle for one in driving)  # not before the events show it
     assert not driving[0].vehicle
     assert driving[-1].vehicle
+    steady = driving[-1]
+    assert steady.covariance is not None
+    assert steady.compared is not None  # what its rules compare
+    shares = np.diagonal(steady.covariance) / np.diagonal(steady.compared)
+    assert shares.max() < 1 + 1e-9
+    assert shares.min() < 0.7  # steady answers are more certain
     for one, other, third in zip(free[-4:], turning[-4:], driving[-4:], strict=True):
         np.testing.assert_array_equal(one.twists[:, 3:], other.twists[:, 3:])
         assert not np.array_equal(one.twists[:, 3:], third.twists[:, 3:])
