@@ -68,17 +68,17 @@ def _with_errors(estimate: WindowEstimate, found: refining.Stages, height_m: flo
     """An estimate without the ground, with the terms of `refine.errors`, and less of a speed that is not seen."""
     if estimate.covariance is None:
         return estimate
-    twists, covariance, turn, compared = estimate.twists, estimate.covariance.copy(), found.turn, None
+    twists, covariance, turn = estimate.twists, estimate.covariance.copy(), found.turn
     if turn.errors is not None:
         covariance[3:, 3:] = (turn.errors + turn.errors.T) / 2
     if found.velocity is None:
         twists = standing.towards_zero(twists, estimate.covariance)
         rate_rad_s = float(np.linalg.norm(twists.mean(axis=0)[3:]))
         covariance = errors.of_unknown_depth(covariance, turn.shift, rate_rad_s, height_m)
+    served = covariance.copy()
     if turn.outcome == "accepted":
-        compared, covariance = covariance, covariance.copy()
-        covariance[3:, 3:] = found.state.trembled(covariance[3:, 3:], assumed=turn.errors is not None)
-    return estimate._replace(twists=twists, covariance=covariance, compared=compared)
+        served[3:, 3:] = found.state.trembled(covariance[3:, 3:], assumed=turn.errors is not None)
+    return estimate._replace(twists=twists, covariance=served, compared=covariance)
 
 
 def _over_ground(

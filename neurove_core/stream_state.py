@@ -54,4 +54,4 @@ class WindowEstimate(NamedTuple):
     source: Source = "network"  # of the angular part
     gyro_disagrees: bool = False  # the events and the gyroscope of the camera disagree
     vehicle: bool = False  # the camera is on a vehicle by the events of many windows
-    compared: NDArray[np.float64] | None = None  # (6, 6) what rules compare, where `covariance` is another
+    compared: NDArray[np.float64] | None = None  # (6, 6) what rules compare; None if it is `covariance`
