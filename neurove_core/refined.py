@@ -99,7 +99,7 @@ def _over_ground(
         return estimate, state
     if window.sample is None or state.view is None or state.camera is None or estimate.covariance is None:
         return estimate, state
-    height_m = state.camera.height_m
+    camera, height_m = state.camera, state.camera.height_m
     if height_m is None:
         return estimate, state  # nothing says that the camera looks at level ground
     events = ground.events_of(state.view, window.sample, window.start_us)
@@ -108,7 +108,7 @@ def _over_ground(
     known = estimate.twists.mean(axis=0), sigma, state.ground
     turned = estimate.source == "refined" and not estimate.low_activity
     measured = estimate.covariance[3:, 3:] if turned else None
-    answer = ground.refine(events, estimate.start_us, estimate.end_us, state.camera, *known, measured)
+    answer = ground.refine(events, estimate.start_us, estimate.end_us, camera, *known, measured)
     state = state._replace(ground=answer.state, stages=state.stages.after_ground(answer.outcome))
     if answer.outcome not in ("accepted", "turning") or answer.motion is None:
         return estimate, state
@@ -125,7 +125,7 @@ def _over_ground(
     if answer.outcome == "turning":
         return estimate, state
     span_us = estimate.start_us, estimate.end_us
-    narrower, stages = state.stages.narrowed(covariance, twist, span_us, state.camera)
+    narrower, stages = state.stages.narrowed(covariance, twist, span_us, camera)
     return estimate._replace(covariance=narrower, compared=covariance), state._replace(stages=stages)
 
 

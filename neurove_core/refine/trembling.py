@@ -61,4 +61,5 @@ def trembled(covariance: Array, known: Trembling, *, assumed: bool) -> Array:
     if not known.windows:
         return covariance
     shown = np.maximum(SHARE**2 * known.square, LEAST_RAD_S**2)
-    return covariance + np.diag(shown - TREMBLE_RAD_S**2 if assumed else shown)
+    more: Array = np.diag(shown - TREMBLE_RAD_S**2 if assumed else shown)
+    return covariance + more
