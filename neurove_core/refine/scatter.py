@@ -40,6 +40,9 @@ SPEED: Final = np.array([0.002, 0.011, 0.015, 0.0014, 0.0008, 0.0011])
 FAST_M_S: Final = 4.0
 """From this speed on; a slower vehicle hardly pitches, so that the error falls with the square of the speed."""
 
+LEAST: Final = np.array([0.0, 0.008, 0.012, 0.0, 0.0, 0.0])
+"""Least share of the speed: an error of the pitch that a slow vehicle has from the start of its stream lasts too."""
+
 NARROW: Final = np.array([0.0, 0.04, 0.2, 0.0, 0.0, 0.0])
 """The same, at each speed, for a lens that shows little of the ground, by 1 / (tangent of half its vertical view) above
 WIDE: there pitch and speed look alike."""
@@ -84,7 +87,7 @@ def shares(scatter: Scatter, sigma: Array, speed_m_s: float, narrow: float) -> A
         speed_m_s: of the answer.
         narrow: 1 / (tangent of half the vertical view of the lens).
     """
-    by_speed = SPEED * speed_m_s * min(1.0, speed_m_s / FAST_M_S)
+    by_speed = np.maximum(SPEED * min(1.0, speed_m_s / FAST_M_S), LEAST) * speed_m_s
     lasting = np.square(by_speed) + np.square(NARROW * max(narrow - WIDE, 0.0) * speed_m_s)
     known = np.square(SEARCH * sigma) + np.square(DIFFERENCE) * scatter.square + lasting
     unseen = (BELIEVED / (scatter.windows + BELIEVED)) ** 2
