@@ -34,6 +34,11 @@ Result = TypeVar("Result")
 _CONNECT_S: Final = 10.0
 _WORKERS_S: Final = 60.0  # until the first worker must be there
 _SILENT_S: Final = 30.0  # without a result, until the workers are counted
+ATTEMPTS: Final = 3
+"""How often a task is given to the scheduler at most; one whose worker is lost is given to another worker by itself."""
+
+_DROPPED: Final = ("cancelled", "lost")  # status of a task that the scheduler no longer has
+
 _AT_ONCE: Final = 256  # tasks that the scheduler has at once; their jobs and results take memory
 _PACKAGES: Final = ("numpy", "numba", "distributed")
 _ASK: Final = "__import__('neurove_core.cluster', fromlist=['about']).about()"
@@ -166,6 +171,7 @@ class Cluster:
             ClusterError: the scheduler is lost.
         """
         names, running, failed = iter(jobs), dict[Any, str](), dict[str, str]()
+        attempts = dict.fromkeys(jobs, 1)
         try:
             while True:
                 while len(running) < _AT_ONCE and (name := next(names, None)) is not None:
@@ -173,7 +179,12 @@ class Cluster:
                 if not running:
                     break
                 for future in self._done(list(running)):
-                    name, done = running.pop(future), self._result(future)
+                    name = running.pop(future)
+                    if self._is_given_up(future, attempts[name]):
+                        running[self._submit(work, jobs[name], attempts[name])] = name
+                        attempts[name] += 1
+                        continue
+                    done = self._result(future)
                     future.release()
                     if done.failed:
                         failed[name] = done.failed
@@ -185,10 +196,18 @@ class Cluster:
         if failed:
             raise FailedTasks(failed, len(jobs))
 
-    def _submit(self, work: Callable[[Job], Result], job: Job) -> Any:
+    def _is_given_up(self, future: Any, attempts: int) -> bool:
+        """Whether a scheduler that is there has dropped a task, which it gets ATTEMPTS times at most."""
+        if future.status not in _DROPPED or self._client.status != "running" or attempts >= ATTEMPTS:
+            return False
+        log.warning("the scheduler dropped a task and gets it again: address=%s task=%s", self._address, future.key)
+        return True
+
+    def _submit(self, work: Callable[[Job], Result], job: Job, attempts: int = 0) -> Any:
         named = f"{work.__module__}.{work.__qualname__}".encode()
         digest = hashlib.sha256(pickle.dumps((about(), named, job), protocol=5)).hexdigest()[:32]
-        return self._client.submit(checked, about(), work, job, key=f"{work.__name__.strip('_')}-{digest}")
+        again = f"-{attempts}" if attempts else ""  # a dropped key is not run again
+        return self._client.submit(checked, about(), work, job, key=f"{work.__name__.strip('_')}-{digest}{again}")
 
     def _done(self, futures: list[Any]) -> set[Any]:
         """The futures that are done, at least one of them."""
@@ -205,12 +224,15 @@ class Cluster:
                 if not self._client.scheduler_info()["workers"]:
                     log.warning("no worker at the scheduler, waiting: address=%s tasks=%d", self._address, len(futures))
             except Exception as error:
+                dropped = {one for one in futures if one.status in _DROPPED}
+                if dropped and self._client.status == "running":
+                    return dropped
                 if self._client.status != "running" or isinstance(error, OSError):
                     raise ClusterError(self._address, f"the scheduler is lost ({error})") from error
                 raise
 
     def _result(self, future: Any) -> Done[Any]:
-        if future.status in ("cancelled", "lost"):
+        if future.status in _DROPPED:
             raise ClusterError(self._address, "the scheduler is lost")
         if future.status == "error":  # nothing that the task raised: see `guarded`
             error = future.exception()

@@ -6,8 +6,10 @@ import shutil
 import socket
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import distributed
 import pytest
 
 from neurove_core import cluster
@@ -91,6 +93,22 @@ def test_a_lost_worker_costs_its_task_and_a_failed_task_is_named(machines, tmp_p
     assert content(tmp_path / "there") == content(tmp_path / "here")
     again = run(*series, "--out", tmp_path / "there", "--dask", machines.address)
     assert again.stdout == f"{tmp_path / 'there'}: 3 recordings, 0 of them new\n"
+
+
+def test_a_task_that_the_scheduler_drops_is_given_to_it_again(machines, tmp_path):
+    machines.worker()
+    jobs = {"number 3": (tmp_path, 3)}
+    with (
+        cluster.connected(machines.address) as pool,
+        distributed.Client(machines.address) as other,
+        ThreadPoolExecutor() as threads,
+    ):
+        results = threads.submit(dict, pool.run(works.square_when_told, jobs))
+        wait_until((tmp_path / "begun").exists)
+        keys = other.run_on_scheduler(lambda dask_scheduler: list(dask_scheduler.tasks))
+        other.cancel([distributed.Future(key, other) for key in keys], force=True)
+        (tmp_path / "go").write_text("")
+        assert results.result(timeout=60) == {"number 3": 9}
 
 
 def test_workers_without_neurove_or_with_other_code_are_named(machines, tmp_path):
