@@ -31,15 +31,14 @@ log = logging.getLogger(__name__)
 Job = TypeVar("Job")
 Result = TypeVar("Result")
 
+ATTEMPTS: Final = 3
+"""How often a task is given to the scheduler at most; the scheduler itself gives that of a lost worker to another."""
+
 _CONNECT_S: Final = 10.0
 _WORKERS_S: Final = 60.0  # until the first worker must be there
 _SILENT_S: Final = 30.0  # without a result, until the workers are counted
-ATTEMPTS: Final = 3
-"""How often a task is given to the scheduler at most; one whose worker is lost is given to another worker by itself."""
-
-_DROPPED: Final = ("cancelled", "lost")  # status of a task that the scheduler no longer has
-
 _AT_ONCE: Final = 256  # tasks that the scheduler has at once; their jobs and results take memory
+_DROPPED: Final = ("cancelled", "lost")  # status of a task that the scheduler no longer has
 _PACKAGES: Final = ("numpy", "numba", "distributed")
 _ASK: Final = "__import__('neurove_core.cluster', fromlist=['about']).about()"
 """Text that a worker evaluates: unlike a function of ours, it arrives where neurove is not installed."""
@@ -181,6 +180,7 @@ class Cluster:
                 for future in self._done(list(running)):
                     name = running.pop(future)
                     if self._is_given_up(future, attempts[name]):
+                        future.release()
                         running[self._submit(work, jobs[name], attempts[name])] = name
                         attempts[name] += 1
                         continue
